@@ -52,7 +52,7 @@ class TooLarge(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class Decoded:
+class DecodedFrame:
     """One frame of a video."""
 
     index: int  # its place among all frames of the video, in the order of their times
@@ -90,7 +90,7 @@ class _Timeline:
     def place(self, pts: int | None, frame_ns: int) -> tuple[int, int]:
         """Returns the index and the time in ns of the next frame: indices grow, times never fall."""
         pts = self.waiting[0] if pts is None and self.waiting else pts
-        index, time_ns = self._place_behind() if pts is None else self._place_by_time(pts)
+        index, time_ns = self._place_after_last() if pts is None else self._place_by_time(pts)
         if time_ns < self.last_ns - _MAX_DISORDER_NS:
             self.shift_ns += self.end_ns - time_ns
             time_ns = self.end_ns
@@ -110,7 +110,7 @@ class _Timeline:
         self.before += taken
         return index, self._ns(pts - self.begins) + self.shift_ns
 
-    def _place_behind(self) -> tuple[int, int]:
+    def _place_after_last(self) -> tuple[int, int]:
         """A frame without a time is the next one: at the time that decoding had for it, or when the last one ends."""
         index = self.last_index + 1
         if self.begins is None and index < len(self.decoding_times):
@@ -138,7 +138,7 @@ class Video:
         """Closes the file."""
         self._container.close()
 
-    def frames(self, from_ns: int, to_ns: int | None, every: int, max_pixels: int) -> Iterator[Decoded]:
+    def frames(self, from_ns: int, to_ns: int | None, every: int, max_pixels: int) -> Iterator[DecodedFrame]:
         """Yields every `every`-th frame from one time to before another; what cannot be decoded is counted in `lost`.
 
         A part is read without decoding what lies before it, where the video can be sought: its frames have the numbers,
@@ -192,7 +192,7 @@ class Video:
         """When it is shown; None where the container does not tell: an AVI has the times of decoding alone."""
         return each.pts if self._has_pts else None
 
-    def _note(self, packet: av.Packet, timeline: _Timeline) -> None:
+    def _record_packet(self, packet: av.Packet, timeline: _Timeline) -> None:
         self._num_packets += 1
         if packet.dts is not None:
             self._decoded_until = packet.dts
@@ -202,7 +202,7 @@ class Video:
     def _decode(self, packets: Iterator[av.Packet], timeline: _Timeline) -> Iterator[av.VideoFrame]:
         for packet in chain(packets, [None]):  # None: what the decoder still holds
             if packet is not None:
-                self._note(packet, timeline)
+                self._record_packet(packet, timeline)
             try:
                 frames = self._stream.codec_context.decode(packet)
             except FFmpegError:
@@ -220,7 +220,7 @@ class Video:
         key, num_before = None, 0
         for packet in self._packets():
             decoded_until, pts = self._decoded_until, self._pts(packet)
-            self._note(packet, scan)
+            self._record_packet(packet, scan)
             if pts is None or (decoded_until - self._decoded_until) * self._unit_s * 10**9 > _MAX_DISORDER_NS:
                 key = None
                 break
@@ -255,7 +255,7 @@ class Video:
     def _duration_ns(self, frame: av.VideoFrame) -> int:
         return round(frame.duration * self._unit_s * 10**9) if frame.duration else self._frame_ns
 
-    def _convert(self, frame: av.VideoFrame, index: int, time_ns: int, max_pixels: int) -> Decoded:
+    def _convert(self, frame: av.VideoFrame, index: int, time_ns: int, max_pixels: int) -> DecodedFrame:
         aspect = self._pixel_aspect()
         width = max(1, round(frame.width * aspect))
         for each in (frame.width, width):
@@ -263,7 +263,7 @@ class Video:
         size = {"width": width, "height": frame.height}
         rgb = self._reformatter.reformat(frame, **size, format="rgb24", interpolation="BICUBIC", threads=1).to_ndarray()
         image = np.ascontiguousarray(_turn_upright(rgb.astype(np.uint8, copy=False), self._display_matrix(frame)))
-        return Decoded(index, time_ns, image, float(aspect) if width != frame.width else 1.0)
+        return DecodedFrame(index, time_ns, image, float(aspect) if width != frame.width else 1.0)
 
     def _display_matrix(self, frame: av.VideoFrame) -> npt.NDArray[np.int32] | None:
         """(2, 2), by which a stored picture's right and down are turned to a player's; None: as they are stored.
@@ -298,7 +298,7 @@ class Video:
 
 
 def _is_cover(stream: av.VideoStream) -> bool:
-    """Whether it is the one picture on the cover of a piece of music."""
+    """True for the one picture on the cover of a piece of music."""
     return bool(stream.disposition & Disposition.attached_pic)
 
 

@@ -18,14 +18,14 @@ from splatnode.capture.last_run import last_run
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import load_config, merged, parse_changes, read_yaml, typed
+from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config, read_yaml
 from splatnode.capture.process.logs import use_structured_lines
-from splatnode.capture.process.progress import counted, telling, waiting
+from splatnode.capture.process.progress import report_items, show_progress, show_waiting
 from splatnode.capture.process.terminal import say
-from splatnode.capture.reader import Reader, State
+from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
-from splatnode.capture.status import heartbeats, say_seen
-from splatnode.capture.status_words import described
+from splatnode.capture.status import heartbeats, mark_problems_seen
+from splatnode.capture.status_words import describe_heartbeat
 
 log = logging.getLogger(__name__)
 
@@ -45,9 +45,9 @@ def record(args: argparse.Namespace) -> int:
     config = _config(args)
     with Recorder(args.out) as recorder:
         camera = config.camera
-        with Reader(camera_opener(camera), is_live(camera), config.reader) as reader, telling() as tell:
+        with Reader(camera_opener(camera), is_live(camera), config.reader) as reader, show_progress() as tell:
             try:
-                for item in counted(_until(reader, args.seconds), tell, "recording", 0, "frame"):
+                for item in report_items(_read_until(reader, args.seconds), tell, "recording", 0, "frame"):
                     recorder.write(item)
             finally:
                 late = f", {reader.skipped} came while the disk was busy and are missing" if reader.skipped else ""
@@ -59,13 +59,15 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
     if args.intrinsics is None:
         return load_config(args.config, CaptureConfig, args.set)
     lens = {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
-    return typed(merged(merged(read_yaml(args.config), lens), parse_changes(args.set)), CaptureConfig)
+    return parse_config(
+        merge_config(merge_config(read_yaml(args.config), lens), parse_changes(args.set)), CaptureConfig
+    )
 
 
-def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
+def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
     """The reader's items until its end; with `seconds`, until a frame whose stamp is so much later than the first."""
     last_ns = math.inf
-    while reader.state is not State.FINISHED:
+    while reader.state is not ReaderState.FINISHED:
         item = reader.next(0.1)
         if isinstance(item, Frame) and seconds is not None:
             last_ns = min(last_ns, item.stamp_ns + seconds * 1e9)
@@ -81,7 +83,7 @@ def find(args: argparse.Namespace) -> int:
     for module in pkgutil.iter_modules(cameras.__path__):
         source = import_module(f"splatnode.capture.cameras.{module.name}")
         if hasattr(source, "find"):
-            with waiting("looking for cameras"):
+            with show_waiting("looking for cameras"):
                 found[module.name] = source.find()
     if args.json:
         print(json.dumps(found, indent=1))
@@ -114,8 +116,10 @@ def status(args: argparse.Namespace) -> int:
 
     A capture that has come to the end of its recording is not silent.
     """
-    network = typed(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
-    with waiting("listening for capture and recon"):
+    network = (
+        parse_config(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
+    )
+    with show_waiting("listening for capture and recon"):
         found = heartbeats(network)
     ended = last_run(network) if found["capture"] is None else None
     if args.json:
@@ -125,10 +129,10 @@ def status(args: argparse.Namespace) -> int:
             silent = f"{room}: nothing heard of it; is `splatnode {room}` running, with the same `network` as here?"
             if room == "capture" and ended is not None:
                 silent = f"{room}: {ended}"
-            for line in [silent] if fields is None else described(room, fields):
+            for line in [silent] if fields is None else describe_heartbeat(room, fields):
                 say(line)
     if args.seen:
-        for room, answer in say_seen(network, [room for room, fields in found.items() if fields]).items():
+        for room, answer in mark_problems_seen(network, [room for room, fields in found.items() if fields]).items():
             say(f"{room}: {answer}")
     heard = {room: bool(fields) for room, fields in found.items()} | ({"capture": True} if ended else {})
     return EXIT_GOOD if all(heard.values()) else EXIT_SILENT

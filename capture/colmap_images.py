@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 _POINT2D_BYTES = 24
 _LONGEST_NAME = 4096  # bytes
@@ -35,7 +35,7 @@ def each_line(text: str) -> Iterator[str]:
 
 
 def text_images(text: str) -> Iterator[ImageRow]:
-    """Of images.txt: two lines each, of which the second, its points, may be empty. Raises ValueError."""
+    """Parses images.txt: two lines an image, of which the second, its points, may be empty. Raises ValueError."""
     lines = content_lines(text)
     for line in lines:
         if line.strip():
@@ -45,7 +45,7 @@ def text_images(text: str) -> Iterator[ImageRow]:
 
 
 def binary_images(data: bytes) -> Iterator[ImageRow]:
-    """Of images.bin. Raises ValueError, struct.error."""
+    """Parses images.bin. Raises ValueError, struct.error."""
     (count,), position = struct.unpack_from("<Q", data), 8
     for _ in range(count):  # ends at the latest where the bytes do
         _, *motion, camera_id = struct.unpack_from("<I7dI", data, position)
@@ -53,5 +53,5 @@ def binary_images(data: bytes) -> Iterator[ImageRow]:
         (points,) = struct.unpack_from("<Q", data, end + 1)
         name, position = data[position + 64 : end].decode(), end + 9 + _POINT2D_BYTES * points
         if position > len(data):
-            raise ValueError(f"{printable(name, 100)} has {points} points, which are not there")
+            raise ValueError(f"{sanitize_text(name, 100)} has {points} points, which are not there")
         yield ImageRow(name, tuple(motion), camera_id)

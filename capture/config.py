@@ -10,16 +10,16 @@ import msgspec
 
 from splatnode.capture import preview, reader, selection
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.masks import all_masked, constant
+from splatnode.capture.masks import mask_frames, open_single_mask
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.nothing_new import NothingNew
+from splatnode.capture.nothing_new import KeepAlive
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.quality import Limits
 
 
 class Camera(Plugin):
-    """Where frames come from: a module of capture/cameras."""
+    """The source of frames: a module of capture/cameras."""
 
     package = "splatnode.capture.cameras"
 
@@ -38,14 +38,14 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def camera_opener(
     camera: Camera, body_mask: Path | None = None
-) -> Callable[[], Iterator[Frame | DroppedFrame | NothingNew]]:
+) -> Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]]:
     """Opens the camera that is configured, and opens it again after a loss; without what `body_mask` hides.
 
     What it returns raises CameraUnavailable, when it is called or later; UnusableMask, FileNotFoundError.
     """
     remembering = getattr(camera.module, "opener", None)
     opened = partial(camera.module.stream, camera.config) if remembering is None else remembering(camera.config)
-    return opened if body_mask is None else lambda: all_masked(opened(), constant(body_mask))
+    return opened if body_mask is None else lambda: mask_frames(opened(), open_single_mask(body_mask))
 
 
 def is_live(camera: Camera) -> bool:

@@ -15,23 +15,23 @@ from splatnode.capture.config import CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.last_run import begin_run, end_run
 from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
+from splatnode.capture.messaging.commands import Answer, CommandServer, MarkProblemsSeen
 from splatnode.capture.messaging.keyframes import KeyframeServer
 from splatnode.capture.messaging.network import files_for_strangers
 from splatnode.capture.messaging.services import CAPTURE_CONTROL, CAPTURE_PREVIEW, CAPTURE_STATUS
 from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.preview import encode_preview
-from splatnode.capture.process.after_ready import after_ready
+from splatnode.capture.process.after_ready import wrap_late_errors
 from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory import keep_freed, resident_mb
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage, raise_shortage
-from splatnode.capture.process.printable import printable
-from splatnode.capture.process.problems import Problems, is_said
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.problems import Problems, is_logged
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.process.unfailing import Unfailing
-from splatnode.capture.reader import Reader, State
+from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.selection import Decision, Selector
 from splatnode.capture.status import HEARTBEAT_S, NAMED, CaptureStatus
 
@@ -66,15 +66,15 @@ def capture(config: CaptureConfig) -> None:
         if why := server.spool.shortage():
             event(log, logging.WARNING, "disk_space", problem=why)
         sound_s = math.inf if is_live(camera) else time.monotonic() + SOUND_S  # a live camera proves it by a frame
-        while session.is_waiting or not (reader.state is State.FINISHED and server.queued == 0):
-            with after_ready(manager):
+        while session.is_waiting or not (reader.state is ReaderState.FINISHED and server.num_queued == 0):
+            with wrap_late_errors(manager):
                 item = None if session.waits(POLL_S) else reader.next(POLL_S)
                 if item is not None or time.monotonic() > sound_s:
                     manager.ready()
                     session.say_started()
                 session.handle(item, reader.state)
                 session.serve()
-                session.beat(reader)
+                session.send_heartbeat(reader)
                 manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
         event(log, logging.INFO, "finished", frames=session.frames, keyframes=session.keyframes)
         try:
@@ -95,7 +95,7 @@ class _Session:
         self._server = server
         self._selector = Selector(config.selection, config.quality)
         self._problems = Problems()
-        self._commands = resources.enter_context(CommandServer(CAPTURE_CONTROL, config.network, Seen))
+        self._commands = resources.enter_context(CommandServer(CAPTURE_CONTROL, config.network, MarkProblemsSeen))
         self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW, config.network))
         self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS, config.network))
         self._preview_numbers = Numbering(server.numbering.session)
@@ -127,9 +127,9 @@ class _Session:
         """Logs, once, that the camera is open and gives frames."""
         if not self._started:
             self._started = True
-            event(log, logging.INFO, "started", camera=self.config.camera.kind, waiting=self._server.queued)
+            event(log, logging.INFO, "started", camera=self.config.camera.kind, waiting=self._server.num_queued)
 
-    def handle(self, item: Frame | DroppedFrame | None, state: State) -> None:
+    def handle(self, item: Frame | DroppedFrame | None, state: ReaderState) -> None:
         """Takes or drops what came, if something did. Whatever a frame's content makes fail costs that frame alone."""
         if isinstance(item, Frame):
             self._attempt(item.name, lambda: self.take(item, state))
@@ -144,9 +144,9 @@ class _Session:
             why = f"{name}: {type(error).__name__}: {error}"
             if is_shortage(error):
                 self._postponed = name, step
-                if is_said(self._problems.add(f"times that a frame had to wait ({SHORT_OF_MEMORY})", why)):
+                if is_logged(self._problems.add(f"times that a frame had to wait ({SHORT_OF_MEMORY})", why)):
                     event(log, logging.WARNING, "waits", frame=name, why=why)
-            elif is_said(self._problems.add("frames that could not be handled", why)):
+            elif is_logged(self._problems.add("frames that could not be handled", why)):
                 log.exception("%s could not be handled", name)
 
     def serve(self) -> None:
@@ -154,9 +154,9 @@ class _Session:
         self._server.serve(0)
         self._commands.serve(0, self._answer)
 
-    def take(self, frame: Frame, state: State) -> None:
+    def take(self, frame: Frame, state: ReaderState) -> None:
         """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
-        decision = self._selector.decide(frame, waiting=self._server.queued)
+        decision = self._selector.decide(frame, waiting=self._server.num_queued)
         self.frames += 1
         self._rate.count()
         self.unusable += decision.candidate and not decision.take
@@ -172,13 +172,13 @@ class _Session:
         A live camera's next frame makes up for one that it could not give: these are counted.
         """
         live = is_live(self.config.camera)
-        if not live and self._server.queued < self.config.spool.max_frames // 2:
+        if not live and self._server.num_queued < self.config.spool.max_frames // 2:
             self._deliver(dropped)
         self.dropped += 1
-        if not live or is_said(self.dropped):
+        if not live or is_logged(self.dropped):
             event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason, number=self.dropped)
 
-    def beat(self, reader: Reader) -> None:
+    def send_heartbeat(self, reader: Reader) -> None:
         """Sends a heartbeat, when one is due; none where what it tells cannot be had."""
         if time.monotonic() < self._next_beat:
             return
@@ -190,7 +190,7 @@ class _Session:
         return CaptureStatus(
             **self._heartbeat_numbers.next(),
             state=reader.state.value,
-            why=printable(reader.why or self._spool_full or self._shortage()),
+            why=sanitize_text(reader.why or self._spool_full or self._shortage()),
             camera=self.config.camera.kind,
             pid=os.getpid(),
             uptime_s=time.monotonic() - self._began,
@@ -201,11 +201,11 @@ class _Session:
             dropped=self.dropped,
             skipped=reader.skipped,
             not_taken=self.not_taken,
-            last_decision=printable(self.last_decision),
-            waiting=self._server.queued,
+            last_decision=sanitize_text(self.last_decision),
+            waiting=self._server.num_queued,
             waiting_mb=self._server.spool.size_bytes / 2**20,
             acknowledged=self._server.acknowledged,
-            recon_connected=self._server.connected,
+            recon_connected=self._server.is_connected,
             refused_messages=self._server.refused + self._commands.refused,
             set_aside=len(quarantine),
             newest_set_aside=quarantine.newest(NAMED),
@@ -219,12 +219,16 @@ class _Session:
         self._problems.count("requests that were refused", server.refused, server.why_refused)
         self._problems.count("commands that were refused", self._commands.refused, self._commands.why_refused)
         told = [f"{quarantine.unseen} keyframes were set aside, the last: {newest}"] if quarantine.unseen else []
-        told += [f"{server.turned_away} further recons ask for keyframes; stop them"] if server.turned_away else []
-        return printable("; ".join((*told, *filter(None, [str(self._problems)]))))
+        told += (
+            [f"{server.num_rejected_consumers} further recons ask for keyframes; stop them"]
+            if server.num_rejected_consumers
+            else []
+        )
+        return sanitize_text("; ".join((*told, *filter(None, [str(self._problems)]))))
 
-    def _answer(self, _: Seen) -> Answer:
-        self._problems.seen()
-        self._server.spool.quarantine.seen()
+    def _answer(self, _: MarkProblemsSeen) -> Answer:
+        self._problems.mark_seen()
+        self._server.spool.quarantine.mark_seen()
         return Answer(True, "the problems are not told again")
 
     def _shortage(self) -> str:
@@ -238,7 +242,7 @@ class _Session:
             self._selector.forget_last()
             return
         self.keyframes += 1
-        event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.queued)
+        event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.num_queued)
 
     def _deliver(self, item: Frame | DroppedFrame) -> bool:
         """Puts a frame into the spool; False where there is no room, which is logged once until there is room again.
@@ -249,7 +253,7 @@ class _Session:
             self._server.offer(item)
         except WireError as error:
             self.not_taken += 1
-            if is_said(self._problems.add("keyframes too large to be sent", error)):
+            if is_logged(self._problems.add("keyframes too large to be sent", error)):
                 event(log, logging.ERROR, "too_large", why=error)
             return False
         except (SpoolFull, OSError) as error:
@@ -264,7 +268,7 @@ class _Session:
             self._spool_full = ""
         return True
 
-    def _send_preview(self, frame: Frame, decision: Decision, state: State) -> None:
+    def _send_preview(self, frame: Frame, decision: Decision, state: ReaderState) -> None:
         rate = self.config.preview.per_second
         if rate == 0 or frame.stamp_ns < self._next_preview_ns:
             return

@@ -15,8 +15,8 @@ from importlib import resources
 from pathlib import Path
 
 from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.folders import made
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.folders import make_folder
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.terminal import say
 
 _PATTERNS = ("*.yaml", "systemd/*.service", "udev/*.rules")
@@ -53,7 +53,7 @@ def write(folder: Path, contents: dict[str, bytes]) -> None:
     """
     staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.tmp") if folder.name else folder
     try:
-        with made(folder.parent), contextlib.ExitStack() as failing:
+        with make_folder(folder.parent), contextlib.ExitStack() as failing:
             staged.mkdir()
             failing.callback(shutil.rmtree, staged, ignore_errors=True)
             for name, content in contents.items():
@@ -64,7 +64,7 @@ def write(folder: Path, contents: dict[str, bytes]) -> None:
     except OSError as error:
         if error.errno in _IS_THERE and os.path.lexists(folder):
             raise ValueError(
-                f"{printable(folder)} is there already, and nothing was written. Name a folder that is new or empty"
+                f"{sanitize_text(folder)} is there already, and nothing was written. Name a folder that is new or empty"
             ) from error
         raise OSError(error.errno, error.strerror, str(folder)) from error
 

@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Iterator, Mapping
 
-from splatnode.capture.exposure_settings import ExposureSettings, as_told
+from splatnode.capture.exposure_settings import ExposureSettings, parse_exposure
 from splatnode.capture.frame import Intrinsics
 
 IMAGE_WIDTH, IMAGE_LENGTH = 0x0100, 0x0101
@@ -113,7 +113,7 @@ def _entries(tiff: bytes, offset: int, order: str) -> Iterator[tuple[int, int, i
 
 
 def _start(tiff: bytes, entry: int, size: int, order: str) -> int:
-    """Where the values of an entry begin: in it if they have room there. Raises struct.error."""
+    """Returns the offset of an entry's values: in the entry if they have room there. Raises struct.error."""
     return entry + 8 if size <= 4 else struct.unpack_from(order + "I", tiff, entry + 8)[0]
 
 
@@ -138,7 +138,7 @@ def exif_exposure(tags: Tags) -> ExposureSettings | None:
     sensitivity = first(tags, PHOTOGRAPHIC_SENSITIVITY)
     if sensitivity == _MOST_SENSITIVE:
         return None
-    return as_told(first(tags, EXPOSURE_TIME), sensitivity, first(tags, F_NUMBER))
+    return parse_exposure(first(tags, EXPOSURE_TIME), sensitivity, first(tags, F_NUMBER))
 
 
 def _focal_from_35mm(tags: Tags, width: int, height: int) -> float | None:

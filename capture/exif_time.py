@@ -41,7 +41,7 @@ def _sub_seconds_ns(text: str) -> int:
 
 
 def _offset(text: str) -> timedelta | None:
-    """Of the camera's time zone from UTC; None where the camera does not state it."""
+    """Parses the offset of the camera's time zone from UTC; None where the camera does not state it."""
     found = _OFFSET.fullmatch(text)
     if found is None:
         return None

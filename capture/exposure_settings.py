@@ -12,7 +12,7 @@ _F_NUMBERS = (0.1, 1000.0)  # up to a pinhole's
 
 @dataclass(frozen=True)
 class ExposureSettings:
-    """What a camera says of one exposure. Raises ValueError where no camera could have it."""
+    """A camera's settings of one exposure. Raises ValueError where no camera could have them."""
 
     time_s: float  # seconds for which light was gathered
     iso: float  # sensitivity, as an ISO speed: 200 is twice as sensitive as 100
@@ -28,13 +28,13 @@ class ExposureSettings:
                 raise ValueError(f"the {what} of an exposure must be {least:g} to {most:g}{unit}, got {number:g}")
 
     @property
-    def log_light(self) -> float:
+    def log_exposure(self) -> float:
         """Natural logarithm of how bright a surface was recorded, against other frames of the same camera."""
         aperture = 1.0 if self.f_number is None else self.f_number
         return math.log(self.time_s * self.iso / 100.0 / aperture**2)
 
 
-def as_told(time_s: float | None, iso: float | None, f_number: float | None = None) -> ExposureSettings | None:
+def parse_exposure(time_s: float | None, iso: float | None, f_number: float | None = None) -> ExposureSettings | None:
     """The settings that a camera or a file tells; None where it tells too little, or what cannot be, as 0 often is.
 
     An f-number that cannot be is left out alone.

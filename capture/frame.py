@@ -13,7 +13,7 @@ from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
 from splatnode.capture.motion import Motion
-from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 from splatnode.capture.right_image import RightImage
 from splatnode.capture.stamp import Stamp
 
@@ -102,7 +102,7 @@ class Frame:
     )
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
+        object.__setattr__(self, "name", sanitize_text(self.name, LONGEST_NAME))
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}")
         if not 1 <= self.width <= LARGEST_SIDE or not 1 <= self.height <= LARGEST_SIDE:
@@ -128,14 +128,14 @@ class Frame:
         return self.image.shape[1]
 
 
-def reduced(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
+def reduce_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
     """`image` (H, W, 3) by the largest whole factor that leaves its longer side at least `longer_side` pixels.
 
     Averages whole blocks, halving where it can, which is ten times as fast as resampling to an exact size.
     """
     factor = max(1, max(image.shape[:2]) // longer_side)
     if factor % 2 == 0 and factor > 2:
-        return reduced(reduced(image, max(image.shape[:2]) // 2), longer_side)
+        return reduce_image(reduce_image(image, max(image.shape[:2]) // 2), longer_side)
     size = max(1, image.shape[1] // factor), max(1, image.shape[0] // factor)
     whole = image[: size[1] * factor, : size[0] * factor]
     return cv2.resize(whole, size, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
@@ -150,11 +150,11 @@ class DroppedFrame:
 
     def __post_init__(self) -> None:
         """Both are shown to people, and what a decoder says of a stranger's file is a stranger's text."""
-        object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
-        object.__setattr__(self, "reason", printable(self.reason, LONGEST_TEXT))
+        object.__setattr__(self, "name", sanitize_text(self.name, LONGEST_NAME))
+        object.__setattr__(self, "reason", sanitize_text(self.reason, LONGEST_TEXT))
 
 
-def framed(
+def make_frame(
     frame_id: int,
     name: str,
     stamp_ns: int,
@@ -170,7 +170,7 @@ def framed(
     exposure: ExposureSettings | None = None,
     camera: str = "",
 ) -> Frame | DroppedFrame:
-    """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
+    """Makes a Frame of what a camera or a file gave; drops it, with the reason, where it is out of a Frame's bounds."""
     try:
         came = given_pose, motion, gravity, right, exposure, camera
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
@@ -178,8 +178,8 @@ def framed(
         return DroppedFrame(name, f"it cannot be used: {error}")
 
 
-def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
+def rename_frame(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
     known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
     came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure, frame.camera
-    return framed(frame_id, name, stamp_ns, *known, *came)
+    return make_frame(frame_id, name, stamp_ns, *known, *came)

@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.process.printable import LONGEST_NAME, printable
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
 
 ALL = "*"  # the key of a lens that is of all images
 _AFTER_CAMERA = "/_-. "  # what may follow the name of a camera in the name of an image
@@ -38,11 +38,11 @@ class Lenses:
         if not isinstance(each, Frame) or (key := self.find_key(each.name, each.camera)) is None:
             return each
         lens = self.by_key[key]
-        seen = seen_through(each, lens)
+        seen = assign_lens(each, lens)
         if seen is each or len(set(self.by_key.values())) == 1:
             return seen
         first = next(other for other, known in self.by_key.items() if known == lens)
-        return replace(seen, camera=printable(first, LONGEST_NAME))
+        return replace(seen, camera=sanitize_text(first, LONGEST_NAME))
 
     def check(self, images: Iterable[tuple[str, str, int, int]]) -> None:
         """Raises ValueError where a lens is of no image, or of none of its aspect ratio.
@@ -60,8 +60,8 @@ class Lenses:
                 check_fits(self.by_key[key], found)
             elif names:
                 raise ValueError(
-                    f"intrinsics has a lens of {printable(key, 100)!r}, which is no photograph's: they are called "
-                    f"{printable(min(names), 100)} to {printable(max(names), 100)}. Name a photograph, a camera with "
+                    f"intrinsics has a lens of {sanitize_text(key, 100)!r}, which is no photograph's: they are called "
+                    f"{sanitize_text(min(names), 100)} to {sanitize_text(max(names), 100)}. Name a photograph, a camera with "
                     "which names begin, or a pattern such as left*.png"
                 )
 
@@ -86,7 +86,7 @@ def same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
     return abs(intrinsics.width * height - intrinsics.height * width) <= max(width, height)
 
 
-def seen_through(each: Any, known: Intrinsics) -> Any:
+def assign_lens(each: Any, known: Intrinsics) -> Any:
     """The frame with this lens, if it can be one of its images."""
     if not isinstance(each, Frame) or not same_aspect(known, each.width, each.height):
         return each

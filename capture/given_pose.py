@@ -45,7 +45,7 @@ class GivenPose:
 
 
 def rigid_problem(numbers: Sequence[float]) -> str:
-    """What 16 numbers, a matrix row by row in metres, must be and are not; empty where nothing is wrong with them."""
+    """Returns what 16 numbers, a matrix row by row in metres, must be; empty where they are a rigid motion."""
     if len(numbers) != 16 or not all(map(math.isfinite, numbers)):
         return "a matrix of 16 finite numbers row by row"
     matrix = np.array(numbers, np.float64).reshape(4, 4)
@@ -68,7 +68,7 @@ def are_rigid(matrices: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     return within & (off <= _SURELY * _RIGID) & (np.linalg.det(rotations) > 0) & in_place
 
 
-def given_pose(
+def make_given_pose(
     T_world_camera: npt.NDArray[np.floating], sigma_m: float = SIGMA_M, sigma_deg: float = SIGMA_DEG
 ) -> GivenPose:
     """The pose of a matrix (4, 4), metres and degrees. Raises ValueError."""

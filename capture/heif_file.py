@@ -38,8 +38,8 @@ def is_heif(data: bytes) -> bool:
     return first[:4] in _BRANDS or any(first[i : i + 4] in _BRANDS for i in range(8, len(first), 4))
 
 
-def lacking() -> str | None:
-    """What is to be installed before such a file can be decoded; None where nothing is."""
+def installation_advice() -> str | None:
+    """Says what to install before such a file can be decoded; None where nothing is missing."""
     there = all(importlib.util.find_spec(package) for package in ("pi_heif", "PIL"))
     return None if there else f"{remedy('pi_heif')}, or convert it to JPEG"
 
@@ -66,7 +66,7 @@ def check_whole(data: bytes) -> None:
 
 def decode(data: bytes, max_pixels: int) -> HeifImage:
     """The file's primary image, 8 bits a channel, without alpha. Raises UnusableImage."""
-    if (needed := lacking()) is not None:
+    if (needed := installation_advice()) is not None:
         raise UnusableImage(f"HEIC and AVIF need a further package. {needed}")
     check_whole(data)
     child = subprocess.Popen(
@@ -78,12 +78,12 @@ def decode(data: bytes, max_pixels: int) -> HeifImage:
     )
     with child:
         try:
-            return _decoded(child, data, max_pixels)
+            return _receive_image(child, data, max_pixels)
         finally:
             child.kill()
 
 
-def _decoded(child: subprocess.Popen[bytes], data: bytes, max_pixels: int) -> HeifImage:
+def _receive_image(child: subprocess.Popen[bytes], data: bytes, max_pixels: int) -> HeifImage:
     assert child.stdin is not None and child.stdout is not None
     try:
         child.stdin.write(data)  # it reads all before it writes anything

@@ -25,10 +25,10 @@ from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_header import ImageHeader, UnusableImage, read_header
 from splatnode.capture.orientation import ON_ITS_SIDE, ORIENTATION, upright
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import outlast
 from splatnode.capture.stamp import Stamp
-from splatnode.capture.value_range import Extent, ValueRange, find_range, measure_extent, to_eight_bits
+from splatnode.capture.value_range import Extent, ValueRange, convert_to_eight_bits, find_range, measure_extent
 
 # Of what can be decoded, HEIC and AVIF with the extra heic.
 _JPEG_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".mpo"}
@@ -61,15 +61,15 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
     return read_bounded(path, _FILE_BYTES_A_PIXEL * max_pixels + _FURTHER_FILE_BYTES, UnusableImage)
 
 
-def decode_photograph(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | None = None) -> DecodedImage:
+def decode_any_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | None = None) -> DecodedImage:
     """As `decode_image`, of a file that a person put there: HEIC, AVIF and JPEG 2000, too, in a process of their own.
 
     What another process sent goes to `decode_image`. Raises UnusableImage.
     """
     if heif_file.is_heif(data):
-        return _with_exif(*heif_file.decode(data, max_pixels))
+        return _attach_exif(*heif_file.decode(data, max_pixels))
     if jpeg2000.is_jpeg2000(data):
-        return _with_exif(jpeg2000.decode(data, max_pixels), b"")
+        return _attach_exif(jpeg2000.decode(data, max_pixels), b"")
     return decode_image(data, max_pixels, used)
 
 
@@ -99,7 +99,7 @@ def decode_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | N
     beneath it are kept as stored. Of a file with several pages, the first. It takes at most BYTES_A_PIXEL of memory for
     each of `max_pixels`, whatever the file says. Raises UnusableImage.
     """
-    with foreign(UnusableImage):
+    with guard_untrusted(UnusableImage):
         header = read_header(data)
         if header.width * header.height > max_pixels:
             raise UnusableImage(f"{header.width} x {header.height}: more than {max_pixels} pixels; make it smaller")
@@ -110,13 +110,13 @@ def decode_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | N
             stated = f"{header.width} x {header.height}"
             raise UnusableImage(f"damaged: it states {stated} pixels and is decoded to {width} x {height}")
         image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-        return _with_exif(image, header.exif)._replace(mask=mask)
+        return _attach_exif(image, header.exif)._replace(mask=mask)
 
 
 def measure_values(data: bytes, max_pixels: int = MAX_PIXELS) -> Extent | None:
     """The extent of the values of an image file of 16 bits; None of another one, or one that cannot be decoded."""
     try:
-        with foreign(UnusableImage):
+        with guard_untrusted(UnusableImage):
             header = read_header(data)
             if header.bits <= 8 or header.width * header.height > max_pixels:
                 return None
@@ -126,7 +126,7 @@ def measure_values(data: bytes, max_pixels: int = MAX_PIXELS) -> Extent | None:
 
 
 def find_common_range(paths: Sequence[Path], max_pixels: int = MAX_PIXELS) -> ValueRange | None:
-    """What the images of 16 bits among these files use of them, all together; None: the upper 8 bits show it.
+    """Finds the value range that the 16-bit images among these files share; None where the upper 8 bits show it.
 
     Of many files, evenly spread ones are looked at. What cannot be read says nothing.
     """
@@ -134,16 +134,16 @@ def find_common_range(paths: Sequence[Path], max_pixels: int = MAX_PIXELS) -> Va
     extents = []
     for path in deep[:: math.ceil(len(deep) / _MAX_MEASURED) or 1]:
         with contextlib.suppress(OSError, UnusableImage):
-            extents.append(outlast(lambda path=path: _measured(path, max_pixels), path.name))
+            extents.append(outlast(lambda path=path: _measure_file(path, max_pixels), path.name))
     return find_range(extent for extent in extents if extent is not None)
 
 
-def _measured(path: Path, max_pixels: int) -> Extent | None:
+def _measure_file(path: Path, max_pixels: int) -> Extent | None:
     """Raises UnusableImage, OSError."""
     return measure_values(read_image_file(path, max_pixels), max_pixels)
 
 
-def _with_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
+def _attach_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
     """The image (H, W, 3) RGB with what its EXIF tells, whose bytes begin with a TIFF header."""
     tags = exif.read_tags(tiff)
     intrinsics = exif.exif_intrinsics(tags, image.shape[1], image.shape[0])
@@ -156,7 +156,7 @@ def _decode(header: ImageHeader, used: ValueRange | None) -> npt.NDArray[np.uint
     if header.bits <= 8 or used is None:
         return np.asarray(_decode_as(header, cv2.IMREAD_COLOR), np.uint8)
     deep = _decode_as(header, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    return to_eight_bits(deep, used) if deep.dtype == np.uint16 else np.asarray(deep, np.uint8)
+    return convert_to_eight_bits(deep, used) if deep.dtype == np.uint16 else np.asarray(deep, np.uint8)
 
 
 def _decode_alpha(header: ImageHeader) -> npt.NDArray[np.bool_] | None:

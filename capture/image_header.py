@@ -251,7 +251,7 @@ def _tiff_header(data: bytes) -> ImageHeader:
     of_colours = values.get(_TIFF_PHOTOMETRIC, (_TIFF_RGB,))[0] == _TIFF_RGB and sizes.get("SamplesPerPixel", 1) == 4
     alpha = int(extra[0]) if len(extra) == 1 else (_UNASSOCIATED if of_colours and _TIFF_EXTRA not in kinds else 0)
     if extra and alpha == _UNASSOCIATED and sizes.get("BitsPerSample", 8) <= 8:
-        decodable = _as_associated(data, offset, order)  # libtiff would multiply the colours by alpha
+        decodable = _mark_alpha_associated(data, offset, order)  # libtiff would multiply the colours by alpha
     else:
         decodable = data
     return ImageHeader(
@@ -266,7 +266,7 @@ def _tiff_header(data: bytes) -> ImageHeader:
     )
 
 
-def _as_associated(data: bytes, offset: int, order: str) -> bytes:
+def _mark_alpha_associated(data: bytes, offset: int, order: str) -> bytes:
     """The TIFF whose directory at `offset` says of its one extra sample that colours are multiplied by it already."""
     changed = bytearray(data)
     (entries,) = struct.unpack_from(order + "H", data, offset)

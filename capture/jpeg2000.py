@@ -36,7 +36,7 @@ def check_whole(data: bytes) -> None:
         raise UnusableImage("truncated: the JPEG 2000 file has no end-of-codestream marker")
 
 
-def stated_size(data: bytes) -> tuple[int, int]:
+def read_size(data: bytes) -> tuple[int, int]:
     """Width and height, as the codestream's first marker states them. Raises UnusableImage."""
     start = data.find(_CODESTREAM)
     stated = data[start + 8 : start + 8 + _EXTENT.size]
@@ -52,7 +52,7 @@ def stated_size(data: bytes) -> tuple[int, int]:
 def decode(data: bytes, max_pixels: int) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB, 8 bits a channel, without alpha. Raises UnusableImage."""
     check_whole(data)
-    width, height = stated_size(data)
+    width, height = read_size(data)
     if width * height > max_pixels:
         raise UnusableImage(f"{width} x {height}: more than {max_pixels} pixels; make it smaller")
     wanted = _SIZE.size + 3 * width * height

@@ -9,11 +9,11 @@ from msgspec import UNSET, UnsetType
 T = TypeVar("T")
 
 
-def or_left_out(value: T | None) -> T | UnsetType:
+def make_optional_field(value: T | None) -> T | UnsetType:
     """The value as a field; left out where it is None."""
     return UNSET if value is None else value
 
 
-def or_none(field: T | UnsetType) -> T | None:
+def read_optional_field(field: T | UnsetType) -> T | None:
     """The value of a field; None where it was left out."""
     return None if isinstance(field, UnsetType) else field

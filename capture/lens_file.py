@@ -17,8 +17,8 @@ from splatnode.capture.frame import Intrinsics
 from splatnode.capture.given_lens import ALL, Lenses
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import record_of
 
 # What each of COLMAP's models holds, in its order. f is fx and fy.
@@ -47,7 +47,7 @@ def read_lens(path: Path) -> Intrinsics:
     lenses = read_lenses(path).by_key
     if len(lenses) > 1:
         raise UnusableLens(
-            f"{printable(str(path))} must be of one camera here, it has {', '.join(map(printable, list(lenses)[:5]))}; "
+            f"{sanitize_text(str(path))} must be of one camera here, it has {', '.join(map(sanitize_text, list(lenses)[:5]))}; "
             "leave the one that took the photographs"
         )
     return next(iter(lenses.values()))
@@ -63,14 +63,14 @@ def read_lenses(path: Path) -> Lenses:
     """
     if path.is_dir():
         path = path / "cameras.txt"
-    shown = printable(str(path))
+    shown = sanitize_text(str(path))
     try:
         text = read_bounded(path, MAX_BYTES, UnusableLens, shown).decode("utf-8-sig")
     except OSError as error:
         raise UnusableLens(f"{shown}: {error.strerror}; give a file with {_READ}") from error
     except UnicodeDecodeError as error:
         raise UnusableLens(f"{shown} is no text; it must give {_READ}") from error
-    with foreign(UnusableLens, shown):
+    with guard_untrusted(UnusableLens, shown):
         return _parse(path, shown, text)
 
 
@@ -94,7 +94,9 @@ def _parse(path: Path, shown: str, text: str) -> Lenses:
         return _name_lenses({str(name): _parse_kalibr(shown, name, each) for name, each in cameras.items()})
     several = content.get("cameras")
     if isinstance(several, dict) and several and all(isinstance(each, dict) for each in several.values()):
-        return Lenses({str(name): _parse_own(f"{shown}: {printable(name)}", each) for name, each in several.items()})
+        return Lenses(
+            {str(name): _parse_own(f"{shown}: {sanitize_text(name)}", each) for name, each in several.items()}
+        )
     return Lenses({ALL: _parse_own(shown, content)})
 
 
@@ -116,7 +118,7 @@ def _parse_own(shown: str, content: Mapping[str, Any]) -> Intrinsics:
         raise UnusableLens(f"{shown} must give {_READ}: {error}") from error
     if unknown := sorted(set(told) - known):
         raise UnusableLens(
-            f"{shown}: a lens has no {', '.join(map(printable, unknown))}; there are {', '.join(sorted(known))}"
+            f"{shown}: a lens has no {', '.join(map(sanitize_text, unknown))}; there are {', '.join(sorted(known))}"
         )
     return lens
 
@@ -129,8 +131,8 @@ def _parse_colmap(path: Path, shown: str, lines: Sequence[Sequence[str]]) -> Len
     for name, parse in (("images.txt", lambda data: text_images(data.decode())), ("images.bin", binary_images)):
         beside = path.parent / name
         if beside.is_file():
-            data = read_bounded(beside, MAX_BYTES, UnusableLens, printable(str(beside)))
-            with foreign(UnusableLens, printable(str(beside))):
+            data = read_bounded(beside, MAX_BYTES, UnusableLens, sanitize_text(str(beside)))
+            with guard_untrusted(UnusableLens, sanitize_text(str(beside))):
                 taken = {row.name: row.camera_id for row in parse(data)}
             if lost := sorted(set(taken.values()) - set(lenses)):
                 raise UnusableLens(f"{shown} must have all cameras of {name}, it lacks {lost[:5]}")
@@ -150,7 +152,7 @@ def _shorten_names(lenses: Mapping[str, Intrinsics]) -> dict[str, Intrinsics]:
 def _parse_colmap_lens(shown: str, words: Sequence[str]) -> Intrinsics:
     _, model, width, height, *numbers = words
     if model not in _COLMAP:
-        raise UnusableLens(f"{shown}: the lens must be one of {', '.join(_COLMAP)}, got {printable(model, 40)}")
+        raise UnusableLens(f"{shown}: the lens must be one of {', '.join(_COLMAP)}, got {sanitize_text(model, 40)}")
     kind, names = _COLMAP[model][0], _COLMAP[model][1].split()
     if len(numbers) != len(names):
         raise UnusableLens(f"{shown}: {model} must have {len(names)} numbers ({' '.join(names)}), got {len(numbers)}")
@@ -158,7 +160,9 @@ def _parse_colmap_lens(shown: str, words: Sequence[str]) -> Intrinsics:
         given = dict(zip(names, map(float, numbers), strict=True))
         size = int(width), int(height)
     except ValueError as error:
-        raise UnusableLens(f"{shown}: {model} must have a size in pixels and numbers: {printable(error)}") from error
+        raise UnusableLens(
+            f"{shown}: {model} must have a size in pixels and numbers: {sanitize_text(error)}"
+        ) from error
     fx, fy = given.get("fx", given.get("f", 0.0)), given.get("fy", given.get("f", 0.0))
     terms = tuple(number for name, number in given.items() if name[0] in "kp")
     if model == "RADIAL":
@@ -170,8 +174,8 @@ def _parse_kalibr(shown: str, name: object, given: Mapping[str, Any]) -> Intrins
     projection, bending = given["camera_model"], given.get("distortion_model", "none")
     if projection != "pinhole" or str(bending) not in _KALIBR:
         raise UnusableLens(
-            f"{shown}: {printable(name)} must have camera_model pinhole and distortion_model {', '.join(_KALIBR)}, got "
-            f"{printable(projection, 40)} and {printable(bending, 40)}; calibrate with pinhole-radtan or pinhole-equi"
+            f"{shown}: {sanitize_text(name)} must have camera_model pinhole and distortion_model {', '.join(_KALIBR)}, got "
+            f"{sanitize_text(projection, 40)} and {sanitize_text(bending, 40)}; calibrate with pinhole-radtan or pinhole-equi"
         )
     try:
         width, height = (int(side) for side in given["resolution"])
@@ -179,12 +183,12 @@ def _parse_kalibr(shown: str, name: object, given: Mapping[str, Any]) -> Intrins
         terms = tuple(float(number) for number in given.get("distortion_coeffs", ()))
     except (KeyError, TypeError, ValueError) as error:
         raise UnusableLens(
-            f"{shown}: {printable(name)} must have resolution [width, height], intrinsics [fx, fy, cx, cy] and "
-            f"distortion_coeffs, four numbers: {printable(error)}"
+            f"{shown}: {sanitize_text(name)} must have resolution [width, height], intrinsics [fx, fy, cx, cy] and "
+            f"distortion_coeffs, four numbers: {sanitize_text(error)}"
         ) from error
     terms = () if bending == "none" else terms
     if len(terms) not in (0, 4):
-        raise UnusableLens(f"{shown}: {printable(name)} must have four distortion_coeffs, got {len(terms)}")
+        raise UnusableLens(f"{shown}: {sanitize_text(name)} must have four distortion_coeffs, got {len(terms)}")
     # Kalibr has the centre of the top-left pixel at (0, 0).
     return _lens(shown, width, height, fx, fy, cx + 0.5, cy + 0.5, "calibration", terms, _KALIBR[bending])
 

@@ -17,12 +17,12 @@ import numpy.typing as npt
 
 from splatnode.capture import exif
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file
+from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_any_image, read_image_file
 from splatnode.capture.image_header import read_header
 from splatnode.capture.orientation import ORIENTATION, upright
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.printable import printable_name
+from splatnode.capture.process.printable import sanitize_name
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]  # (H, W), True where the photograph is used
@@ -41,7 +41,7 @@ class UnusableMask(ValueError):
     """A mask that cannot be one of its photograph; the text says what was expected."""
 
 
-def masked(frame: Frame, mask: Mask) -> Frame | DroppedFrame:
+def apply_mask(frame: Frame, mask: Mask) -> Frame | DroppedFrame:
     """The frame without what `mask` (H, W) hides, beside what a mask of its own hides already.
 
     Left out where hardly anything remains. Raises UnusableMask for a mask of another size.
@@ -58,10 +58,10 @@ def masked(frame: Frame, mask: Mask) -> Frame | DroppedFrame:
         return DroppedFrame(frame.name, f"its mask leaves {shown} of it: in a mask {CONVENTION}; is it inverted?")
     if used.all():
         return frame
-    return replace(frame, image=filled(frame.image, used), mask=used, encoded=None)
+    return replace(frame, image=fill_masked(frame.image, used), mask=used, encoded=None)
 
 
-def all_masked(
+def mask_frames(
     frames: Iterable[Frame | _Other], find: Find, tell: Callable[[str], None] = lambda line: None
 ) -> Iterator[Frame | DroppedFrame | _Other]:
     """The frames, each with its mask, and all else as it is; `tell` hears which have none. Raises UnusableMask."""
@@ -70,28 +70,28 @@ def all_masked(
         mask = find(frame) if isinstance(frame, Frame) else None
         if isinstance(frame, Frame) and mask is None:
             whole.append(frame.name)
-        yield masked(frame, mask) if isinstance(frame, Frame) and mask is not None else frame
+        yield apply_mask(frame, mask) if isinstance(frame, Frame) and mask is not None else frame
     if whole:
         more = f" and {len(whole) - 5} more" if len(whole) > 5 else ""
         tell(f"used whole, because there is no mask of it: {', '.join(whole[:5])}{more}")
 
 
-def in_files(path: Path) -> Find:
+def open_masks(path: Path) -> Find:
     """Finds masks in a folder, by the name of the photograph or its stem; a file is the mask of all photographs.
 
     Raises FileNotFoundError and UnusableMask where there is none, or two of one name.
     """
     if path.is_file():
-        return constant(path)
+        return open_single_mask(path)
     if not path.is_dir():
         raise FileNotFoundError(f"{str(path)!r} is not there; give a folder of masks: {CONVENTION}")
     by_stem: dict[str, Path] = {}
     for file in sorted(path.iterdir()):
         if file.name.startswith(".") or file.suffix.lower() not in SUFFIXES:
             continue
-        stem = printable_name(file.stem)
+        stem = sanitize_name(file.stem)
         if stem in by_stem:
-            both = f"{by_stem[stem].name} and {printable_name(file.name)}"
+            both = f"{by_stem[stem].name} and {sanitize_name(file.name)}"
             raise UnusableMask(f"{str(path)!r} has two masks of one photograph, {both}; remove one")
         by_stem[stem] = file
     if not by_stem:
@@ -104,7 +104,7 @@ def in_files(path: Path) -> Find:
     return find
 
 
-def constant(path: Path) -> Find:
+def open_single_mask(path: Path) -> Find:
     """The mask in this file for every frame, read once for each of its sizes. Raises UnusableMask."""
     known: dict[tuple[int, int], Mask] = {}
 
@@ -123,10 +123,10 @@ def read_mask(path: Path, frame: Frame) -> Mask:
     A mask that has the size of the photograph as it is stored, not turned yet, is turned as the photograph's EXIF says.
     """
     try:
-        image = outlast(lambda: decode_photograph(read_image_file(path)).image, printable_name(path.name))
+        image = outlast(lambda: decode_any_image(read_image_file(path)).image, sanitize_name(path.name))
     except (UnusableImage, OSError) as error:
         why = error.strerror if isinstance(error, OSError) else error
-        raise UnusableMask(f"the mask {printable_name(path.name)} cannot be read: {why}") from error
+        raise UnusableMask(f"the mask {sanitize_name(path.name)} cannot be read: {why}") from error
     level = LOSSY_LEVEL if path.suffix.lower() in _LOSSY else 1
     mask = image.max(2) >= level
     if mask.shape != (frame.height, frame.width) and mask.shape == (frame.width, frame.height):
@@ -134,7 +134,7 @@ def read_mask(path: Path, frame: Frame) -> Mask:
     return mask
 
 
-def as_mask(given: object) -> Mask:
+def parse_mask(given: object) -> Mask:
     """A mask (H, W) as a program has it: an array of bool or of any numbers, above 0 where the photograph is used.
 
     Raises TypeError.
@@ -147,7 +147,7 @@ def as_mask(given: object) -> Mask:
     return array > 0
 
 
-def filled(image: Image, mask: Mask) -> Image:
+def fill_masked(image: Image, mask: Mask) -> Image:
     """The image (H, W, 3) with a smooth fill of what is used around it where `mask` (H, W) is False.
 
     It is found from coarse to fine on a small copy: each gap takes the mean of the nearest level that has any.
@@ -173,9 +173,9 @@ def filled(image: Image, mask: Mask) -> Image:
 
 
 def _orientation(frame: Frame) -> int:
-    """Of the frame's file, as its EXIF tells; 1 where it does not."""
+    """Returns the orientation that the EXIF of the frame's file tells; 1 where it tells none."""
     if frame.encoded is None:
         return 1
-    with foreign(UnusableMask, frame.name):
+    with guard_untrusted(UnusableMask, frame.name):
         tags = exif.read_tags(read_header(frame.encoded).exif)
     return int(exif.first(tags, ORIENTATION) or 1)

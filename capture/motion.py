@@ -47,8 +47,8 @@ class Motion:
         """T_start_current (4, 4)."""
         return np.array(self.T_start_current, np.float64).reshape(4, 4)
 
-    def then(self, T_previous_current: npt.NDArray[np.floating], sigma_m: float, sigma_deg: float) -> Motion:
-        """With one step more: T_previous_current (4, 4), metres, and the standard deviations of this step alone.
+    def append_step(self, T_previous_current: npt.NDArray[np.floating], sigma_m: float, sigma_deg: float) -> Motion:
+        """Returns the motion with one more step: T_previous_current (4, 4), metres, and that step's sigmas.
 
         Raises ValueError where the step is no rigid motion, or a sigma is not above 0.
         """

@@ -35,15 +35,15 @@ def name_time(name: str) -> Stamp | None:
     found = [*_SECONDS.finditer(stem), *_DATE_TIME.finditer(stem)]
     if len(found) != 1 or _DIGIT.search(stem, found[0].end()):
         return None
-    return _since_1970(found[0]) if found[0].re is _SECONDS else _of_date(found[0])
+    return _parse_unix_time(found[0]) if found[0].re is _SECONDS else _parse_date(found[0])
 
 
-def _since_1970(found: re.Match[str]) -> Stamp:
+def _parse_unix_time(found: re.Match[str]) -> Stamp:
     seconds, fraction, digits = found.groups()
     return Stamp(int(seconds) * _NS + _fraction_ns(fraction or digits), Clock.UTC)
 
 
-def _of_date(found: re.Match[str]) -> Stamp | None:
+def _parse_date(found: re.Match[str]) -> Stamp | None:
     year, _, month, day, hour, _, minute, second, fraction, zone = found.groups()
     try:
         shown = datetime(*map(int, (year, month, day, hour, minute, second)), tzinfo=timezone.utc)

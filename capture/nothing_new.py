@@ -6,5 +6,5 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class NothingNew:
+class KeepAlive:
     """A loss is over with it as with a frame. Nobody but the reader gets it (capture/reader.py)."""

@@ -14,7 +14,7 @@ FramesPerSecond = Annotated[float, msgspec.Meta(ge=0.001, le=1000)]
 Pace = Literal["recorded", "fastest"]  # by the stamps, or as fast as the consumer reads
 
 
-def paced(items: Iterable[Frame | DroppedFrame], pace: Pace) -> Iterator[Frame | DroppedFrame]:
+def pace_frames(items: Iterable[Frame | DroppedFrame], pace: Pace) -> Iterator[Frame | DroppedFrame]:
     """The items, each frame not before its time after the first one's; the stamps stay as they are."""
     start_s, first_ns = 0.0, None
     for item in items:

@@ -19,8 +19,8 @@ from splatnode.capture.colmap_images import ImageRow, binary_images, each_line, 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_pose import are_rigid, rigid_problem
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import record_in
 from splatnode.capture.stamp import Clock
 
@@ -57,20 +57,20 @@ class Trajectory:
     seconds: Array = field(default_factory=lambda: np.zeros(0))  # (M,) rising
     Ts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (M, 4, 4)
 
-    def of(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
+    def find_poses(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
         """The poses of the frames that have one, by their names."""
         found = {each.name: self.pose_of(each) for each in frames if isinstance(each, Frame)}
         return {name: T for name, T in found.items() if T is not None}
 
     def pose_of(self, frame: Frame) -> Array | None:
-        """That of one frame, T_world_camera (4, 4); None where it has none."""
+        """Returns the pose of one frame, T_world_camera (4, 4); None where it has none."""
         if self.by_name:
             return self.by_name[known] if (known := self.names(frame.name)) else None
         if frame.captured_at is not None:
-            found = self._at(frame.captured_at.ns / 1e9)
+            found = self._interpolate_pose(frame.captured_at.ns / 1e9)
             if found is not None or frame.captured_at.clock is Clock.RECORDING:
                 return found  # whole seconds of a recording are seconds, and no numbers of frames
-        return self._at(float(frame.frame_id)) if self._are_numbers else None
+        return self._interpolate_pose(float(frame.frame_id)) if self._are_numbers else None
 
     @cached_property
     def _are_numbers(self) -> bool:
@@ -81,7 +81,7 @@ class Trajectory:
         """The name by which it knows the photograph, which may lack the suffix; empty where it does not."""
         return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in self.by_name), "")
 
-    def _at(self, seconds: float) -> Array | None:
+    def _interpolate_pose(self, seconds: float) -> Array | None:
         """The pose at this time, between its two neighbours; None where they are too far away."""
         after = int(np.searchsorted(self.seconds, seconds))
         near = [index for index in (after - 1, after) if 0 <= index < len(self.seconds)]
@@ -99,11 +99,11 @@ class Trajectory:
 
 def poses_of(trajectory: Trajectory, frames: Sequence[Frame | DroppedFrame], where: str) -> dict[str, Array]:
     """The poses of the frames that have one, by their names. Raises PosesFileError, `where` in it, where none has."""
-    found = trajectory.of(frames)
+    found = trajectory.find_poses(frames)
     if not found and any(isinstance(each, Frame) for each in frames):
-        first = printable(next(each.name for each in frames if isinstance(each, Frame)), 100)
+        first = sanitize_text(next(each.name for each in frames if isinstance(each, Frame)), 100)
         has = (
-            f"photographs such as {printable(min(trajectory.by_name), 100)}"
+            f"photographs such as {sanitize_text(min(trajectory.by_name), 100)}"
             if trajectory.by_name
             else (f"the times {trajectory.seconds[0]:.3f} to {trajectory.seconds[-1]:.3f} s")
         )
@@ -129,7 +129,7 @@ def read_poses(path: Path) -> Trajectory:
         raise PosesFileError(
             f"{where} is not there; give a TUM trajectory, nerfstudio's transforms.json, or a COLMAP model's folder"
         )
-    with foreign(PosesFileError, where):
+    with guard_untrusted(PosesFileError, where):
         data = read_bounded(path, _MAX_BYTES, PosesFileError, where)
         try:
             return _read(path, data)
@@ -138,7 +138,7 @@ def read_poses(path: Path) -> Trajectory:
         except (ValueError, struct.error) as error:  # msgspec's errors are ValueErrors, too
             raise PosesFileError(
                 f"{where} must be a TUM trajectory (time x y z qx qy qz qw), nerfstudio's transforms.json, or COLMAP's "
-                f"images.txt or images.bin: {printable(str(error), 200)}"
+                f"images.txt or images.bin: {sanitize_text(str(error), 200)}"
             ) from error
 
 
@@ -147,25 +147,25 @@ def _read(path: Path, data: bytes) -> Trajectory:
         content = record_in(data, _Transforms)
         _check_count(len(content.frames))
         matrices = np.array([each.transform_matrix for each in content.frames], np.float64).reshape(-1, 4, 4)
-        return _named([each.file_path for each in content.frames], matrices @ _OPENGL)
+        return _make_named_trajectory([each.file_path for each in content.frames], matrices @ _OPENGL)
     if path.suffix == ".bin":
-        return _of_colmap(binary_images(data))
+        return _parse_colmap(binary_images(data))
     text = data.decode()
     if path.name.startswith("images"):
-        return _of_colmap(text_images(text))
-    return _tum(text)
+        return _parse_colmap(text_images(text))
+    return _parse_tum(text)
 
 
-def named(poses: Iterable[tuple[str, Array]]) -> Trajectory:
+def create_trajectory(poses: Iterable[tuple[str, Array]]) -> Trajectory:
     """Poses by the names of their photographs. Raises ValueError where one is no rigid motion or comes twice."""
     names, matrices = [], []
     for name, T in poses:
         names.append(name)
         matrices.append(np.asarray(T, np.float64))
-    return _named(names, np.stack(matrices) if matrices else np.zeros((0, 4, 4)))
+    return _make_named_trajectory(names, np.stack(matrices) if matrices else np.zeros((0, 4, 4)))
 
 
-def _named(paths: Sequence[str], Ts: Array) -> Trajectory:
+def _make_named_trajectory(paths: Sequence[str], Ts: Array) -> Trajectory:
     """As `named`; Ts (M, 4, 4)."""
     names = [PurePosixPath(path).name for path in paths]
     if not names:
@@ -173,23 +173,23 @@ def _named(paths: Sequence[str], Ts: Array) -> Trajectory:
     by_name: dict[str, Array] = {}
     for name, T in zip(names, Ts, strict=True):
         if name in by_name:
-            raise ValueError(f"there are two poses of {printable(name, 100)}")
+            raise ValueError(f"there are two poses of {sanitize_text(name, 100)}")
         by_name[name] = T
     _check(names, Ts)
     return Trajectory(by_name)
 
 
-def _of_colmap(rows: Iterable[ImageRow]) -> Trajectory:
+def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
     names, numbers = [], array("d")
     for name, motion, _ in rows:
         _add(names, name)
         numbers.extend((*motion[4:], *motion[:4]))
     Ts_camera_world = _motions(numbers)
     _check(names, Ts_camera_world)
-    return _named(names, np.asarray(np.linalg.inv(Ts_camera_world), np.float64))
+    return _make_named_trajectory(names, np.asarray(np.linalg.inv(Ts_camera_world), np.float64))
 
 
-def _tum(text: str) -> Trajectory:
+def _parse_tum(text: str) -> Trajectory:
     names, numbers = [], array("d")
     for line in each_line(text):
         if line.strip() and not line.lstrip().startswith("#"):
@@ -205,7 +205,7 @@ def _tum(text: str) -> Trajectory:
     try:
         seconds = np.array([float(name) for name in names])
     except ValueError:  # names of photographs in place of times
-        return _named(names, Ts)
+        return _make_named_trajectory(names, Ts)
     _check(names, Ts)
     if not np.isfinite(seconds).all():
         raise ValueError("times must be finite")
@@ -248,4 +248,4 @@ def _check(names: Sequence[str], Ts: Array) -> None:
         if not is_near[index]:
             problem = f"at finite coordinates within {_FARTHEST_M:g} m"
         if problem:
-            raise ValueError(f"the pose of {printable(names[int(index)], 100)} must be {problem}")
+            raise ValueError(f"the pose of {sanitize_text(names[int(index)], 100)} must be {problem}")

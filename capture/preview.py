@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import Frame, reduced
-from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
+from splatnode.capture.frame import Frame, reduce_image
+from splatnode.capture.messaging.jpeg import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.values import Name, Sequential, Text
 from splatnode.capture.messaging.wire import Header, Message, Numbering, WireError
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.stamp import Stamp
 
 _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gigabytes
@@ -39,14 +39,14 @@ class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 def encode_preview(
     frame: Frame, numbering: Numbering, config: Config, *, state: str, taken: bool, reason: str
 ) -> tuple[PreviewHeader, list[npt.NDArray[np.uint8]]]:
-    jpeg = to_jpeg(reduced(frame.image, config.longer_side), config.jpeg_quality)
+    jpeg = make_jpeg_array(reduce_image(frame.image, config.longer_side), config.jpeg_quality)
     header = PreviewHeader(
         **numbering.next(),
         name=frame.name,
         stamp_ns=frame.stamp_ns,
         state=state,
         taken=taken,
-        reason=printable(reason),
+        reason=sanitize_text(reason),
         captured_at=frame.captured_at,
     )
     return header, [jpeg]
@@ -56,4 +56,4 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB. Raises WireError where the message holds no JPEG."""
     if len(message.arrays) != 1:
         raise WireError(f"a preview has one JPEG, got {len(message.arrays)} arrays")
-    return from_jpeg(message.arrays[0], _LARGEST_SIDE)
+    return decode_jpeg(message.arrays[0], _LARGEST_SIDE)

@@ -56,7 +56,7 @@ def assess(image: Image) -> Quality:
         blur_px=_blur_width(grey),
         dark=cv2.countNonZero(cv2.inRange(image, (0,) * 3, (BLACK,) * 3)) / pixels,
         bright=cv2.countNonZero(cv2.inRange(image, (WHITE,) * 3, (255,) * 3)) / pixels,
-        contrast=float(_shrunk(grey, THUMBNAIL_SIDE).std()),
+        contrast=float(_shrink(grey, THUMBNAIL_SIDE).std()),
     )
 
 
@@ -71,7 +71,7 @@ def blur_width(image: Image) -> float | None:
 
 
 def _blur_width(grey: Plane) -> float | None:
-    small = _shrunk(grey, MEASURED_SIDE)
+    small = _shrink(grey, MEASURED_SIDE)
     if min(small.shape) < 2:
         return None
     widths = [_edge_width(small, step) for step in ((0, 1), (1, 1), (1, 0), (1, -1))]
@@ -172,10 +172,10 @@ def why_redundant(measured: float, limits: Limits) -> str | None:
 
 def _grey(image: Image, longer_side: int) -> npt.NDArray[np.float32]:
     """(h, w) grey levels, area-resampled to at most `longer_side`."""
-    return _shrunk(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), longer_side).astype(np.float32)
+    return _shrink(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), longer_side).astype(np.float32)
 
 
-def _shrunk(grey: Plane, longer_side: int) -> Plane:
+def _shrink(grey: Plane, longer_side: int) -> Plane:
     """Area-resampled to at most `longer_side`."""
     scale = min(1.0, longer_side / max(grey.shape))
     size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))

@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.nothing_new import NothingNew
+from splatnode.capture.nothing_new import KeepAlive
 from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     give_up_s: Seconds = 300.0
 
 
-class State(Enum):
+class ReaderState(Enum):
     STARTING = "starting"
     STREAMING = "streaming"
     DEGRADED = "degraded"  # the camera is lost, or silent
@@ -53,14 +53,14 @@ class Reader:
     """Frames of one session, numbered through all losses. Close it, or use it as a context manager."""
 
     def __init__(
-        self, open_camera: Callable[[], Iterator[Frame | DroppedFrame | NothingNew]], live: bool, config: Config
+        self, open_camera: Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]], live: bool, config: Config
     ) -> None:
         self.config = config
         self.why = ""  # of a degraded state
         self.skipped = 0  # frames of a live camera that a newer one replaced before they were read
         self._open_camera = open_camera
         self._live = live
-        self._state = State.STARTING
+        self._state = ReaderState.STARTING
         self._last = time.monotonic()
         self._stop = threading.Event()
         self._items: queue.Queue[Frame | DroppedFrame | Failure] = queue.Queue(maxsize=CAPACITY)
@@ -79,11 +79,11 @@ class Reader:
         self._thread.join(timeout=CLOSE_S)
 
     @property
-    def state(self) -> State:
-        if self._state is State.STREAMING and self._live and self.silent_s > self.config.silence_s:
-            return State.DEGRADED
-        if self._state is State.FINISHED and not self._items.empty():
-            return State.STREAMING
+    def state(self) -> ReaderState:
+        if self._state is ReaderState.STREAMING and self._live and self.silent_s > self.config.silence_s:
+            return ReaderState.DEGRADED
+        if self._state is ReaderState.FINISHED and not self._items.empty():
+            return ReaderState.STREAMING
         return self._state
 
     @property
@@ -110,7 +110,7 @@ class Reader:
         except Exception as error:  # the thread's end is told to the reader, whatever it was
             self._hand_over(Failure(error))
         else:
-            self._state = State.FINISHED
+            self._state = ReaderState.FINISHED
 
     def _frames(self) -> Iterator[Frame | DroppedFrame]:
         """The frames; the camera is opened again after a loss.
@@ -120,14 +120,14 @@ class Reader:
         count, pause, lost_at, was_there = 0, self.config.first_pause_s, None, False
         while not self._stop.is_set():
             try:
-                for item in self._numbered(count):
+                for item in self._number_frames(count):
                     if not isinstance(item, DroppedFrame):
                         pause, lost_at, was_there, self.why = self.config.first_pause_s, None, True, ""
                     if isinstance(item, Frame):
                         count += 1
-                        self._last, self._state = time.monotonic(), State.STREAMING
-                    elif isinstance(item, NothingNew):
-                        self._state = State.STREAMING if count else State.STARTING
+                        self._last, self._state = time.monotonic(), ReaderState.STREAMING
+                    elif isinstance(item, KeepAlive):
+                        self._state = ReaderState.STREAMING if count else ReaderState.STARTING
                         continue
                     yield item
                 return
@@ -135,12 +135,12 @@ class Reader:
                 lost_at = lost_at or time.monotonic()
                 if not was_there or time.monotonic() - lost_at > self.config.give_up_s:
                     raise
-                self._state, self.why = State.DEGRADED, str(error)
+                self._state, self.why = ReaderState.DEGRADED, str(error)
                 log.warning("camera lost: %s; opening it again in %.0f s", error, pause)
                 self._stop.wait(pause)
                 pause = min(2 * pause, self.config.longest_pause_s)
 
-    def _numbered(self, count: int) -> Iterator[Frame | DroppedFrame | NothingNew]:
+    def _number_frames(self, count: int) -> Iterator[Frame | DroppedFrame | KeepAlive]:
         """The camera's frames from one opening to its loss. A frame from before the last one is dropped.
 
         Several frames of one time are frames of a recording, whose clock is coarse; a live camera has given one twice.

@@ -21,17 +21,17 @@ import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
-from splatnode.capture.left_out import or_left_out, or_none
+from splatnode.capture.left_out import make_optional_field, read_optional_field
 from splatnode.capture.motion import Motion
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
+from splatnode.capture.process.printable import LONGEST_NAME, digest_name, is_printable, sanitize_text
 from splatnode.capture.process.records import record_in
 from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.stamp import Stamp
@@ -108,9 +108,13 @@ class Recorder:
         content = _file_of(item)
         path = self.folder / f"{self.frames:06d}{'.jpg' if content.startswith(_JPEG) else '.png'}"
         digest = _write(path, content)
-        moved = or_left_out(item.given_pose), or_left_out(item.motion), or_left_out(item.gravity)
+        moved = (
+            make_optional_field(item.given_pose),
+            make_optional_field(item.motion),
+            make_optional_field(item.gravity),
+        )
         right = UNSET if item.right is None else self._write_right(item.right)
-        known = path.name, digest, item.captured_at, *moved, right, or_left_out(item.exposure)
+        known = path.name, digest, item.captured_at, *moved, right, make_optional_field(item.exposure)
         self._append(_Line(item.name, item.stamp_ns, item.intrinsics, *known))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
@@ -136,7 +140,7 @@ def _file_of(frame: Frame) -> bytes:
 
 
 def _png(image: npt.NDArray[np.uint8]) -> bytes:
-    """Of an image (H, W, 3) BGR, or (H, W)."""
+    """Encodes an image (H, W, 3) BGR, or (H, W), as PNG."""
     written, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not written:
         raise AssertionError("PNG takes every uint8 image")
@@ -157,13 +161,13 @@ def _write(path: Path, content: bytes) -> str:
 
 
 @dataclass(frozen=True)
-class Recording:
+class FrameRecording:
     folder: Path
     lines: tuple[_Line | _DroppedLine, ...]
 
     @property
     def names(self) -> list[str]:
-        """Of the frames that were seen, in their order."""
+        """Returns the names of the recorded frames, in their order."""
         return [line.name for line in self.lines if isinstance(line, _Line)]
 
     def frames(self, names: tuple[str, ...] = (), max_pixels: int = MAX_PIXELS) -> Iterator[Frame | DroppedFrame]:
@@ -189,8 +193,14 @@ class Recording:
         except OSError as error:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         known = image, line.intrinsics, content, line.captured_at
-        moved = or_none(line.given_pose), or_none(line.motion), or_none(line.gravity)
-        return framed(frame_id, line.name, line.stamp_ns, *known, None, *moved, right, or_none(line.exposure))
+        moved = (
+            read_optional_field(line.given_pose),
+            read_optional_field(line.motion),
+            read_optional_field(line.gravity),
+        )
+        return make_frame(
+            frame_id, line.name, line.stamp_ns, *known, None, *moved, right, read_optional_field(line.exposure)
+        )
 
     def _images(self, line: _Line, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8], RightImage | None]:
         """The file's bytes, its image, and what the right camera saw. Raises UnusableImage, OSError."""
@@ -209,9 +219,9 @@ class Recording:
         return content, image
 
 
-def _shown(name: str) -> str:
+def _sanitize_recorded_name(name: str) -> str:
     """The recorded name, which is printable if it is ours; another one is changed, into one that no other becomes."""
-    return name if name and is_printable(name, LONGEST_NAME) else marked_name(name)
+    return name if name and is_printable(name, LONGEST_NAME) else digest_name(name)
 
 
 def _files_of(line: _Line | _DroppedLine) -> tuple[str, ...]:
@@ -224,19 +234,19 @@ def is_recording(folder: Path) -> bool:
     return (folder / INDEX).is_file()
 
 
-def read(folder: Path) -> Recording:
+def read(folder: Path) -> FrameRecording:
     """Raises RecordingError where the index is damaged other than at its end, where a recorder may have been killed."""
     lines: list[_Line | _DroppedLine] = []
     content = read_bounded(folder / INDEX, MAX_INDEX_BYTES, RecordingError, str(folder / INDEX))
     whole, _, _unfinished = content.rpartition(b"\n")
     for number, text in enumerate(whole.splitlines(), start=1):
         where = f"{folder / INDEX}, line {number}"
-        with foreign(RecordingError, where):
+        with guard_untrusted(RecordingError, where):
             line = record_in(text, _Line | _DroppedLine)
         for file in _files_of(line):
             if Path(file).name != file or not is_printable(file, LONGEST_NAME):
-                raise RecordingError(f"{where}: {printable(file, LONGEST_NAME)!r} is not a file of this folder")
-        lines.append(msgspec.structs.replace(line, name=_shown(line.name)))
+                raise RecordingError(f"{where}: {sanitize_text(file, LONGEST_NAME)!r} is not a file of this folder")
+        lines.append(msgspec.structs.replace(line, name=_sanitize_recorded_name(line.name)))
     if not lines:
         raise RecordingError(f"the recording {str(folder)!r} is empty")
-    return Recording(folder, tuple(lines))
+    return FrameRecording(folder, tuple(lines))

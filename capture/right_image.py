@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 LONGEST_M = 100.0  # between two cameras that see one thing
 SIGMA_M = 0.0003  # standard deviation of a baseline where nobody tells any
@@ -53,7 +53,7 @@ def partners(lefts: Sequence[str], rights: Sequence[str]) -> dict[str, str]:
     right_of = {_stem(name): name for name in rights}
     found = {name: right_of[_stem(name)] for name in lefts if _stem(name) in right_of}
     if not found:
-        first = printable(lefts[0] if lefts else "none", 100)
+        first = sanitize_text(lefts[0] if lefts else "none", 100)
         raise ValueError(f"no right photograph has the name of a left one, such as {first}; name both of a pair alike")
     return found
 

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import Frame, reduced
+from splatnode.capture.frame import Frame, reduce_image
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 
 TRACKED_SIDE = 320  # pixels: the longer side of the images in which corners are tracked is at least this
@@ -69,7 +69,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Motion:
+class CornerMotion:
     """How the corners of the last keyframe have moved since."""
 
     lost: float  # share that has left the image, or could not be tracked
@@ -78,7 +78,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class _View:
+class _Candidate:
     """A candidate as it is compared with others, and remembered where it becomes a keyframe."""
 
     name: str
@@ -93,7 +93,7 @@ class Selector:
     def __init__(self, config: Config, limits: Limits) -> None:
         self.config = config
         self.limits = limits
-        self._views: list[_View] = []  # newest last
+        self._views: list[_Candidate] = []  # newest last
         self._files: dict[bytes, None] = {}  # digests of the keyframes' files, newest last
         self._start: Image | None = None  # the last keyframe, small and grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
@@ -118,13 +118,13 @@ class Selector:
 
     def _examine(self, frame: Frame, waiting: int) -> Decision:
         self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
-        small = reduced(frame.image, TRACKED_SIDE)
+        small = reduce_image(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-        reason, adds = self._what_it_adds(grey, strictness=1 + waiting / self.config.backlog)
+        reason, adds = self._explain_decision(grey, strictness=1 + waiting / self.config.backlog)
         if not adds:
             return Decision(False, reason, False)
-        view = _View(frame.name, small, _thumbnail(small), _digest(frame.encoded))
-        fault = self._fault(frame, view)
+        view = _Candidate(frame.name, small, _thumbnail(small), _digest(frame.encoded))
+        fault = self._find_fault(frame, view)
         if fault is not None:
             self._next_ns = frame.stamp_ns + round(1e9 * self.config.patience_s)
             return Decision(False, fault, True)
@@ -139,7 +139,7 @@ class Selector:
         self._start = None
         self._next_ns += round(1e9 * RETRY_S)
 
-    def _what_it_adds(self, grey: Image, strictness: float) -> tuple[str, bool]:
+    def _explain_decision(self, grey: Image, strictness: float) -> tuple[str, bool]:
         if self.config.every_frame:
             return "every frame is taken", True
         if self._start is None or self._start.shape != grey.shape:
@@ -148,9 +148,9 @@ class Selector:
             return "the last keyframe has too few corners to track", True
         self._now, tracked = track(self._start, grey, self._corners, self._now)
         motion = measure(self._corners, self._now, tracked, max(grey.shape))
-        return what_it_adds(motion, self.config, strictness)
+        return explain_decision(motion, self.config, strictness)
 
-    def _fault(self, frame: Frame, seen: _View) -> str | None:
+    def _find_fault(self, frame: Frame, seen: _Candidate) -> str | None:
         """Why the frame is unusable, or a copy of a keyframe; None where it is neither."""
         if seen.file in self._files:
             return "duplicate: this very file came before"
@@ -167,7 +167,7 @@ class Selector:
             self._blurs_px.append((size, quality.blur_px))
         return fault
 
-    def _remember(self, view: _View, grey: Image) -> None:
+    def _remember(self, view: _Candidate, grey: Image) -> None:
         found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, qualityLevel=CORNER_QUALITY, minDistance=CORNER_DISTANCE)
         self._views = [*self._views[1 - REMEMBERED_VIEWS :], view]
         if view.file is not None:
@@ -188,7 +188,7 @@ def track(
     corners: Points,  # in `start`
     guess: Points,  # where they were in the frame before
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
-    """Where the corners are now, and which of them were tracked: in the image, and back to where they started."""
+    """Tracks the corners into the new image; returns their positions, and which were found there and back."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **LUCAS_KANADE)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(now, start, there, corners.copy(), **LUCAS_KANADE)
     consistent = np.linalg.norm(back - corners, axis=2).ravel() < FORWARD_BACKWARD_PX
@@ -197,21 +197,21 @@ def track(
     return np.where(tracked[:, None, None], there, guess), tracked
 
 
-def measure(corners: Points, now: Points, tracked: npt.NDArray[np.bool_], longer_side: int) -> Motion:
+def measure(corners: Points, now: Points, tracked: npt.NDArray[np.bool_], longer_side: int) -> CornerMotion:
     """Displacement and parallax of the corners that were tracked; with too few of them the view counts as lost."""
     lost = 1 - float(tracked.mean())
     if tracked.sum() < MIN_CORNERS:
-        return Motion(1.0, 0.0, 0.0)
+        return CornerMotion(1.0, 0.0, 0.0)
     before, after = corners[tracked], now[tracked]
     displacement = np.linalg.norm(after - before, axis=2)
     homography, _ = cv2.findHomography(before, after, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_TRIALS)
     if homography is None:
-        return Motion(lost, float(np.median(displacement)) / longer_side, 0.0)
+        return CornerMotion(lost, float(np.median(displacement)) / longer_side, 0.0)
     residuals = np.linalg.norm(after - cv2.perspectiveTransform(before, homography), axis=2)
-    return Motion(lost, float(np.median(displacement)) / longer_side, float(np.median(residuals)) / longer_side)
+    return CornerMotion(lost, float(np.median(displacement)) / longer_side, float(np.median(residuals)) / longer_side)
 
 
-def what_it_adds(motion: Motion, config: Config, strictness: float = 1.0) -> tuple[str, bool]:
+def explain_decision(motion: CornerMotion, config: Config, strictness: float = 1.0) -> tuple[str, bool]:
     """The reason to take a frame, or not to, and which of the two it is. Limits are multiplied by `strictness`."""
     measured = {
         "coverage": (

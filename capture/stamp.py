@@ -15,7 +15,7 @@ _READINGS = 5  # of both clocks, of which the one that was disturbed least count
 
 
 class Clock(Enum):
-    """What the time is counted from. Times of two clocks cannot be compared."""
+    """The clock that a time is read from. Times of two clocks cannot be compared."""
 
     UTC = "utc"
     LOCAL = "local"
@@ -58,7 +58,7 @@ def nearest_stamp(ns: int, clock: Clock) -> Stamp:
 
 
 def wall_clock(mono_ns: int) -> Stamp:
-    """What the wall clock showed at a time of this machine's monotonic clock, if nobody has set it since."""
+    """Converts a time of this machine's monotonic clock to the wall clock, if nobody has set it since."""
     return nearest_stamp(mono_ns + min(_reading() for _ in range(_READINGS))[1], Clock.UTC)
 
 

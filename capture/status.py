@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import msgspec
 
 from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.commands import Answer, NoAnswer, Seen, ask
+from splatnode.capture.messaging.commands import Answer, MarkProblemsSeen, NoAnswer, ask
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.quarantine import SetAside
+from splatnode.capture.messaging.quarantine import QuarantinedKeyframe
 from splatnode.capture.messaging.services import (
     CAPTURE_CONTROL,
     CAPTURE_STATUS,
@@ -54,7 +54,7 @@ class CaptureStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     recon_connected: bool
     refused_messages: Count
     set_aside: Count  # keyframes in the quarantine
-    newest_set_aside: Annotated[tuple[SetAside, ...], msgspec.Meta(max_length=NAMED)]
+    newest_set_aside: Annotated[tuple[QuarantinedKeyframe, ...], msgspec.Meta(max_length=NAMED)]
     rss_mb: Amount
     problem: Text  # what went wrong and nobody has seen yet; empty where nothing did
 
@@ -81,13 +81,13 @@ def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, 
         return found
 
 
-def say_seen(network: Network, rooms: list[str]) -> dict[str, str]:
+def mark_problems_seen(network: Network, rooms: list[str]) -> dict[str, str]:
     """Tells these processes that their problems have been seen; what they answered. Raises NotAllowed."""
     services = {"capture": CAPTURE_CONTROL, "recon": RECON_CONTROL}
     answers = {}
     for room in rooms:
         try:
-            answers[room] = ask(services[room], network, Seen(), Answer, ANSWER_S).message
+            answers[room] = ask(services[room], network, MarkProblemsSeen(), Answer, ANSWER_S).message
         except (NoAnswer, WireError) as error:
             answers[room] = str(error)
     return answers

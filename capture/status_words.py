@@ -15,17 +15,17 @@ def _megabytes(value: Any) -> str:
     return f"{value:.1f} MB"
 
 
-def _plain(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, dict) and {"name", "reason"} <= value.keys():  # a keyframe that was set aside
         return f"{value['name']}: {value['reason']}"
     if isinstance(value, dict) and {"scene_id", "keyframes"} <= value.keys():
-        return _place(value)
+        return _format_submap(value)
     return f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
-def _place(value: Mapping[str, Any]) -> str:
+def _format_submap(value: Mapping[str, Any]) -> str:
     """`scene-0002: left, OK, 12 photographs, 1 left out, 43 s of work, 512 MB`."""
     kept, out = value["keyframes"], value.get("left_out")
     parts = [
@@ -43,35 +43,35 @@ _WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "uptime_s": ("running for", _seconds),
     "rss_mb": ("memory", _megabytes),
     # capture's
-    "pid": ("process", _plain),
-    "unusable": ("blurred, dark or copied", _plain),
-    "dropped": ("frames not readable", _plain),
-    "skipped": ("frames passed over", _plain),
-    "not_taken": ("keyframes without room", _plain),
-    "waiting": ("keyframes not at recon", _plain),
+    "pid": ("process", _format_value),
+    "unusable": ("blurred, dark or copied", _format_value),
+    "dropped": ("frames not readable", _format_value),
+    "skipped": ("frames passed over", _format_value),
+    "not_taken": ("keyframes without room", _format_value),
+    "waiting": ("keyframes not at recon", _format_value),
     "waiting_mb": ("size of those", _megabytes),
-    "acknowledged": ("keyframes at recon", _plain),
+    "acknowledged": ("keyframes at recon", _format_value),
     # recon's
-    "scene_id": ("scene", _plain),
+    "scene_id": ("scene", _format_value),
     "keyframe": ("last keyframe", lambda number: f"number {number}"),
-    "queue": ("keyframes waiting", _plain),
-    "num_gaussians": ("Gaussians", _plain),
-    "iterations": ("steps of refinement", _plain),
-    "bounds": ("cameras known", _plain),
+    "queue": ("keyframes waiting", _format_value),
+    "num_gaussians": ("Gaussians", _format_value),
+    "iterations": ("steps of refinement", _format_value),
+    "bounds": ("cameras known", _format_value),
     "keyframe_s": ("last shown after", _seconds),
     "delay_s": ("delay", _seconds),
-    "delay": ("because", _plain),
-    "unfinished": ("places to finish", _plain),
-    "newest_places": ("places", _plain),
-    "refused": ("refused messages", _plain),
-    "duplicates": ("keyframes come again", _plain),
+    "delay": ("because", _format_value),
+    "unfinished": ("places to finish", _format_value),
+    "newest_places": ("places", _format_value),
+    "refused": ("refused messages", _format_value),
+    "duplicates": ("keyframes come again", _format_value),
 }
 _NOT_PRINTED = {"session", "sequence", "mono_ns", "type", "state", "tracked"}  # they tell a user nothing
 _NOTHING = ("", None, [])
 _LOADING = "loading"  # recon's state in which it knows nothing yet: zeros would pass for what there is
 
 
-def described(room: str, fields: Mapping[str, Any]) -> list[str]:
+def describe_heartbeat(room: str, fields: Mapping[str, Any]) -> list[str]:
     """Lines about the process of this room, by its heartbeat."""
     state = fields.get("state", "running")
     lines = [f"{room}: {state}"]
@@ -80,8 +80,8 @@ def described(room: str, fields: Mapping[str, Any]) -> list[str]:
             continue
         if state == _LOADING and not value:
             continue
-        name, written = _WORDS.get(key, (key.replace("_", " "), _plain))
-        shown = map(_plain, value) if isinstance(value, list) else [written(value)]
+        name, written = _WORDS.get(key, (key.replace("_", " "), _format_value))
+        shown = map(_format_value, value) if isinstance(value, list) else [written(value)]
         lines += [
             f"  {told:24}{each}"
             for told, each in zip(itertools.chain([name], itertools.repeat("")), shown, strict=False)

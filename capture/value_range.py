@@ -46,7 +46,7 @@ class ValueRange:
 
 
 def measure_extent(values: Deep) -> Extent:
-    """Of an image (H, W) or (H, W, C)."""
+    """Measures the extent of the values of an image (H, W) or (H, W, C)."""
     step = max(1, round((values.size / _MAX_SAMPLES) ** 0.5))
     some = values[::step, ::step]
     low, high = np.percentile(some, [_OUTLIERS_PERCENT, 100 - _OUTLIERS_PERCENT], method="nearest")
@@ -54,7 +54,7 @@ def measure_extent(values: Deep) -> Extent:
 
 
 def find_range(extents: Iterable[Extent]) -> ValueRange | None:
-    """What all images of these extents use together; None where the upper 8 bits show it, or there are no images."""
+    """Finds the range that images of these extents share; None without images, or where the upper 8 bits show it."""
     known = list(extents)
     if not known:
         return None
@@ -66,7 +66,7 @@ def find_range(extents: Iterable[Extent]) -> ValueRange | None:
     return ValueRange(0, (1 << bits) - 1) if bits <= MAX_STRETCHED_BITS else None
 
 
-def to_eight_bits(values: Deep, used: ValueRange | None) -> npt.NDArray[np.uint8]:
+def convert_to_eight_bits(values: Deep, used: ValueRange | None) -> npt.NDArray[np.uint8]:
     """The image with `used` stretched to 0 to 255; None: the upper 8 bits."""
     if used is None:
         return (values >> 8).astype(np.uint8)

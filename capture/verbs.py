@@ -8,7 +8,7 @@ from pathlib import Path
 from splatnode.capture.calibration.verb import CALIBRATE
 from splatnode.capture.process.arguments import add_json, natural, positive, seconds
 from splatnode.capture.process.lengths import metres_argument
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 
 
 def _camera_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,29 +67,37 @@ def _status_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("capture", "run the camera's process", _camera_arguments, lazily("splatnode.capture.cli", "capture")),
+    Verb("capture", "run the camera's process", _camera_arguments, import_lazily("splatnode.capture.cli", "capture")),
     Verb(
-        "record", "write what a camera sees into a folder", _record_arguments, lazily("splatnode.capture.cli", "record")
+        "record",
+        "write what a camera sees into a folder",
+        _record_arguments,
+        import_lazily("splatnode.capture.cli", "record"),
     ),
     Verb(
         "config",
         "list the example configurations, or write them into a folder",
         _config_arguments,
-        lazily("splatnode.capture.examples", "config"),
+        import_lazily("splatnode.capture.examples", "config"),
     ),
     CALIBRATE,
-    Verb("find", "list the cameras that are connected", add_json, lazily("splatnode.capture.cli", "find")),
+    Verb("find", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")),
     Verb(
         "keys",
         "make this machine's keys; say who may connect",
         _keys_arguments,
-        lazily("splatnode.capture.cli", "keys"),
+        import_lazily("splatnode.capture.cli", "keys"),
     ),
     Verb(
         "marker",
         "write markers of known size as a PDF to print: in a scene, they give it metres",
         _marker_arguments,
-        lazily("splatnode.capture.calibration.marker_page", "command"),
+        import_lazily("splatnode.capture.calibration.marker_page", "command"),
     ),
-    Verb("status", "tell how the running processes are", _status_arguments, lazily("splatnode.capture.cli", "status")),
+    Verb(
+        "status",
+        "tell how the running processes are",
+        _status_arguments,
+        import_lazily("splatnode.capture.cli", "status"),
+    ),
 )

@@ -58,7 +58,7 @@ class Span:
         return f"{self.from_ns / 1e9:g} s and {end}"
 
 
-def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Iterator[VideoFrame]:
+def decode_video(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Iterator[VideoFrame]:
     """Yields every `every`-th frame of `span`, each of its own size. Those that cannot be decoded are left out.
 
     Of what is no video that is read here there are none.
@@ -66,18 +66,18 @@ def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Ite
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
     command = python.command("splatnode.capture.video_process", os.fsdecode(file.absolute()), *map(str, numbers))
-    child = apart.started(command, subprocess.DEVNULL)
+    child = apart.start_process(command, subprocess.DEVNULL)
     with child, contextlib.ExitStack() as cleanup:
         cleanup.callback(child.kill)
         assert child.stdout is not None
-        has_ended = yield from _received(child.stdout, max_pixels)
+        has_ended = yield from _receive_frames(child.stdout, max_pixels)
         if child.wait() != 0 or not has_ended:
             raise VideoError(
                 f"its decoder ended ({child.returncode}); is it whole, with frames of {max_pixels} pixels?"
             )
 
 
-def _received(stream: IO[bytes], max_pixels: int) -> Generator[VideoFrame, None, bool]:
+def _receive_frames(stream: IO[bytes], max_pixels: int) -> Generator[VideoFrame, None, bool]:
     """The frames that `main` writes; returns whether it came to its end. Raises VideoError for what it reports."""
     while len(head := stream.read(_HEAD.size)) == _HEAD.size:
         kind, index, time_ns, width, height, aspect = _HEAD.unpack(head)

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from splatnode.recon.config import Config
-from splatnode.recon.result.export.formats.ply import ply_bytes
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene.scene import Scene
 
@@ -22,7 +22,7 @@ WINDOW = 0.2  # of the iterations, at the end, from which the slope of the loss 
 
 
 @dataclass(frozen=True)
-class Hit:
+class BudgetHit:
     """A limit that bound the scene."""
 
     limit: str  # its name in the configuration
@@ -45,9 +45,13 @@ class Hit:
         return {"code": code, **asdict(self), "message": message}
 
 
-def hits(
-    config: Config, begun: Scene | None, scene: Scene | None, seconds: Mapping[str, float], ended_early: bool = False
-) -> tuple[Hit, ...]:
+def find_budget_hits(
+    config: ReconstructionConfig,
+    begun: Scene | None,
+    scene: Scene | None,
+    seconds: Mapping[str, float],
+    ended_early: bool = False,
+) -> tuple[BudgetHit, ...]:
     """The limits of `config` that bound `scene`, if there is one, which was refined from `begun` in these seconds.
 
     `ended_early`: the refinement came to its end by a verdict, and not for want of time.
@@ -58,7 +62,7 @@ def hits(
     return tuple(hit for hit in found if hit is not None)
 
 
-def _gaussians(config: Config, begun: Scene, scene: Scene) -> Hit | None:
+def _gaussians(config: ReconstructionConfig, begun: Scene, scene: Scene) -> BudgetHit | None:
     most, count = config.most_gaussians, len(scene.gaussians)
     if most is None or begun.num_unlimited <= most:
         return None
@@ -69,12 +73,14 @@ def _gaussians(config: Config, begun: Scene, scene: Scene) -> Hit | None:
     gain = _gain(float(np.log2(would_take / count)), FEWER)
     basis = f"{begun.num_unlimited} pieces of equal colour and depth, of which {share:.0%} stay as a rule"
     if most == config.max_gaussians:
-        return Hit("max_gaussians", most, would_take, gain, basis)
+        return BudgetHit("max_gaussians", most, would_take, gain, basis)
     assert config.max_mb is not None  # it is the only other limit
-    return Hit("max_mb", config.max_mb, round(ply_bytes(would_take, 1) / 1e6, 2), gain, basis)
+    return BudgetHit("max_mb", config.max_mb, round(compute_ply_bytes(would_take, 1) / 1e6, 2), gain, basis)
 
 
-def _seconds(config: Config, begun: Scene, scene: Scene, seconds: Mapping[str, float]) -> Hit | None:
+def _seconds(
+    config: ReconstructionConfig, begun: Scene, scene: Scene, seconds: Mapping[str, float]
+) -> BudgetHit | None:
     done, planned = scene.iterations - begun.iterations, config.optimize.steps
     if config.budget_s is None or done >= planned:
         return None
@@ -87,11 +93,11 @@ def _seconds(config: Config, begun: Scene, scene: Scene, seconds: Mapping[str, f
         taken = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
         beyond = seconds["total"] - config.budget_s
         basis = f"the least took {beyond:.1f} s too long ({taken}), nothing was refined, and refining takes time on top"
-        return Hit("budget_s", config.budget_s, round(seconds["total"], 1), gain, basis, at_least=True)
+        return BudgetHit("budget_s", config.budget_s, round(seconds["total"], 1), gain, basis, at_least=True)
     each = seconds.get("optimise", 0.0) / done
     would_take = round(seconds["total"] + each * (planned - done), 1)
     fall = loss_fall(scene.losses) / each
-    return Hit(
+    return BudgetHit(
         "budget_s",
         config.budget_s,
         would_take,

@@ -20,40 +20,40 @@ from splatnode.capture.given_lens import Lenses
 from splatnode.capture.lens_file import read_lenses
 from splatnode.capture.poses_file import poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.progress import Step, Tell, telling
+from splatnode.capture.process.progress import ProgressStep, Tell, show_progress
 from splatnode.capture.process.terminal import say
 from splatnode.recon import cost
-from splatnode.recon.config import Config, overlaid, preset
+from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import Entrants, Plan, run_bench, run_line
-from splatnode.recon.evaluate.demo import largest_capture_bytes, write_held_out, write_photographs
+from splatnode.recon.evaluate.bench import MethodRunner, Plan, format_run, run_bench
+from splatnode.recon.evaluate.demo import compute_max_capture_bytes, write_held_out_images, write_training_images
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
 from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Run, Settings, evaluate
-from splatnode.recon.evaluate.records import Bench, merged, read_bench
+from splatnode.recon.evaluate.records import Bench, merge_benches, read_bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.timing import untimed
+from splatnode.recon.evaluate.timing import explain_missing_seconds
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric.arguments import metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.stereo_pairs import pairs_of, rights_in
-from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
+from splatnode.recon.metric.stereo_pairs import make_pairs, stream_right_images
+from splatnode.recon.offline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
-from splatnode.recon.rasterize.dispatch import rasterizer
-from splatnode.recon.replay_source import Request, Source, asked_for, source, with_poses
+from splatnode.recon.rasterize.dispatch import make_rasterizer
+from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_paths
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export.manifest import LIVE_PICTURE
-from splatnode.recon.result.folder import result_folder
-from splatnode.recon.result.moving_in_words import moving_in_words
-from splatnode.recon.result.size import largest_result_bytes
+from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.moving_in_words import describe_moving
+from splatnode.recon.result.size import bound_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.whole import FILE, is_whole
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.whole import FILE, is_map_set
+from splatnode.recon.result.write import write_result_folder
 from splatnode.recon.viewer_process import Show, viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -65,46 +65,46 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
-    path, listed = asked_for(args.source)
+    path, listed = parse_paths(args.source)
     request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args))
     _check_apart(args.out, path)
-    if not args.map and is_whole(args.out):
+    if not args.map and is_map_set(args.out):
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
     if args.map and args.only_seen:
         raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, request, config)
-    with telling(quiet=args.json) as tell:
+    with show_progress(quiet=args.json) as tell:
         return _replay(args, request, config, tell)
 
 
-def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Tell) -> int:
-    given = source(request, tell)
+def _replay(args: argparse.Namespace, request: Request, config: ReconstructionConfig, tell: Tell) -> int:
+    given = load_source(request, tell)
     if given.choice is not None:
         tell(str(given.choice))
         if given.choice.left_out.get(THINNED):
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
-    if not args.json and (taken := cost.in_words(given.sizes)) is not None:
+    if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
         say(taken, error=True)
     check_baseline(config, given)
-    known = _known_of_metres(args, given)
+    known = _load_scale_evidence(args, given)
     if known.poses is not None and trusts_poses(args):
-        given = with_poses(given, known.poses, config.metric.poses_sigma_m, config.metric.poses_sigma_deg)
+        given = add_poses(given, known.poses, config.metric.poses_sigma_m, config.metric.poses_sigma_deg)
         known = replace(known, poses=None)  # they are the photographs' own now
-    needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
-    with result_folder(args.out, needed_bytes), _viewer(args) as show:
-        config = with_looks(config, LOOK_EVERY) if args.view else config
+    needed_bytes = bound_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
+    with hold_result_folder(args.out, needed_bytes), _viewer(args) as show:
+        config = set_preview_interval(config, LOOK_EVERY) if args.view else config
         preset_name = args.preset or "balanced"
-        made = reconstructed(
+        made = reconstruct_source(
             given, config, preset_name, without_guesses=args.only_seen, given=known, show=show, tell=tell
         )
         del given  # and with it photographs that lie in a folder
-        tell(Step("writing the results"))
+        tell(ProgressStep("writing the results"))
         snapshot, report = made.snapshot, made.write(args.out)
         if args.json:
             print(json.dumps(report))
         else:
-            _tell(snapshot, args.out)
+            _print_summary(snapshot, args.out)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
@@ -112,7 +112,7 @@ def _viewer(args: argparse.Namespace) -> contextlib.AbstractContextManager[Show]
     """A viewer with --view, else nobody. The picture that an earlier run showed is none of this one: it is removed."""
     pictures = args.out / "view"
     (pictures / LIVE_PICTURE).unlink(missing_ok=True)
-    return viewer(pictures) if args.view else contextlib.nullcontext(shown_to_nobody)
+    return viewer(pictures) if args.view else contextlib.nullcontext(ignore_snapshot)
 
 
 def _check_apart(out: Path, photographs: Path) -> None:
@@ -123,41 +123,41 @@ def _check_apart(out: Path, photographs: Path) -> None:
 
 def demo(args: argparse.Namespace) -> int:
     """Writes the built-in capture, reconstructs it, and then measures the result on views that it has not seen."""
-    with telling(quiet=args.json) as tell:
+    with show_progress(quiet=args.json) as tell:
         return _demo(args, tell)
 
 
 def _demo(args: argparse.Namespace, tell: Tell) -> int:
     seed = args.seed or 0
-    config = overlaid(preset("balanced"), {"seed": seed, "device": args.device or "cpu"})
+    config = apply_changes(preset("balanced"), {"seed": seed, "device": args.device or "cpu"})
     place = synthetic.Config(seed=seed)
-    needed_bytes = largest_result_bytes([(place.width, place.height)] * place.views, config.size, None)
-    with result_folder(args.out, needed_bytes + largest_capture_bytes(place)):
+    needed_bytes = bound_result_bytes([(place.width, place.height)] * place.views, config.size, None)
+    with hold_result_folder(args.out, needed_bytes + compute_max_capture_bytes(place)):
         capture = args.out / "capture"
         tell(f"photographing the built-in place, {place.views} times")
-        split = write_photographs(capture, place)
+        split = write_training_images(capture, place)
         photographs = folder.stream(folder.Config(folder=capture / "images", names=split.train))
         snapshot = run(photographs, config, tell=tell)
-        write = partial(finish, snapshot, args.out, seed=seed, preset_name="balanced")
-        tell(Step("writing the results"))
+        write = partial(write_result_folder, snapshot, args.out, seed=seed, preset_name="balanced")
+        tell(ProgressStep("writing the results"))
         report = write()
         if not args.json:
-            _tell(snapshot, args.out)
+            _print_summary(snapshot, args.out)
         if snapshot.verdict.publishable:
             tell(f"measuring it on {len(split.test)} views that it has not seen")
-            write_held_out(capture, place)
-            report = write(told={"held_out": held_out_quality(snapshot, capture, split, config.device, tell)})
+            write_held_out_images(capture, place)
+            report = write(told={"held_out": evaluate_held_out_views(snapshot, capture, split, config.device, tell)})
         if args.json:
             print(json.dumps(report))
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
-def held_out_quality(
+def evaluate_held_out_views(
     snapshot: Snapshot, capture: Path, split: Split, on: Device = "cpu", tell: Callable[[str], None] = say
 ) -> dict[str, float | None]:
     """Mean scores over the test views, each of which is told, and the errors of the estimated cameras."""
 
-    def measured(name: str, truth: Tensor, image: Tensor) -> None:
+    def report_view(name: str, truth: Tensor, image: Tensor) -> None:
         tell(f"{name}: {psnr(image, truth):.1f} dB")
 
     row = evaluate(
@@ -165,10 +165,10 @@ def held_out_quality(
         load_scene(capture),
         split,
         Run("balanced", 0, None, snapshot.seconds, None),
-        rasterize=rasterizer(device.chosen(on)),
-        networks=Networks(alex=None, vgg=None),
+        rasterize=make_rasterizer(device.choose_device(on)),
+        networks=PerceptualNetworks(alex=None, vgg=None),
         settings=Settings(alignment_steps=DEMO_STEPS, alignment_levels=2),
-        show=measured,
+        show=report_view,
     )
     tell(f"held-out views: {row.psnr:.1f} dB PSNR, {row.ssim:.3f} SSIM")
     wanted = ("psnr", "ssim", "rotation_error_deg", "centre_error_pct", "focal_error_pct")
@@ -180,27 +180,27 @@ def bench(args: argparse.Namespace) -> int:
     if bool(args.scenes) == bool(args.redraw):
         raise ValueError("bench must get scenes to measure, or --redraw with what was measured")
     if args.redraw:
-        found = merged([read_bench(path) for path in args.redraw])
+        found = merge_benches([read_bench(path) for path in args.redraw])
     else:
-        found = _benched(args)
+        found = _run_bench(args)
         for row in found.rows:
             if row.final:
-                say(run_line(row))
-        if why := untimed([row.others for row in found.rows if row.final]):
+                say(format_run(row))
+        if why := explain_missing_seconds([row.others for row in found.rows if row.final]):
             say(why)
     redraw(found, args.out)
     say(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
     return EXIT_GOOD
 
 
-def _benched(args: argparse.Namespace) -> Bench:
+def _run_bench(args: argparse.Namespace) -> Bench:
     wanted = args.device or "cpu"
-    on = device.chosen(wanted)
+    on = device.choose_device(wanted)
     one_gpu = on.type != "cpu" and (args.ray is not None or (args.cores or 1) > 1)
     plan = Plan(
         tuple(args.scenes),
         args.views,
-        methods.chosen(args.methods),
+        methods.expand_method_names(args.methods),
         tuple(range(args.seeds)),
         args.checkpoints,
         args.timeout_s,
@@ -208,7 +208,7 @@ def _benched(args: argparse.Namespace) -> Bench:
         timed=not one_gpu,
     )
     scoring = Scoring(
-        rasterizer(on),
+        make_rasterizer(on),
         partial(load_networks, args.weights_dir and args.weights_dir.absolute()),
         replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
         args.by_region,
@@ -216,7 +216,7 @@ def _benched(args: argparse.Namespace) -> Bench:
     with opened(args.cores, args.ray) as engine:
         return run_bench(
             plan,
-            Entrants(partial(methods.by_name, device=wanted), methods.start_of, on.type),
+            MethodRunner(partial(methods.run_method, device=wanted), methods.select_start_config, on.type),
             args.out,
             scoring=scoring,
             command=shlex.join(["splatnode", *sys.argv[1:]]),
@@ -225,10 +225,10 @@ def _benched(args: argparse.Namespace) -> Bench:
         )
 
 
-def _known_of_metres(args: argparse.Namespace, given: Source) -> Evidence:
-    """What is known of metres beside the photographs. Raises ValueError where it is of none of them."""
+def _load_scale_evidence(args: argparse.Namespace, given: Source) -> Evidence:
+    """Loads the scale evidence that the options name. Raises ValueError where it fits none of the images."""
     poses = None if args.poses is None else poses_of(read_poses(args.poses), given.frames, str(args.poses))
-    pairs = () if args.stereo is None else pairs_of(given.frames, rights_in(args.stereo, given.frames))
+    pairs = () if args.stereo is None else make_pairs(given.frames, stream_right_images(args.stereo, given.frames))
     return Evidence(poses=poses, pairs=pairs)
 
 
@@ -237,16 +237,16 @@ def _lenses(args: argparse.Namespace) -> Lenses | None:
     return None if args.intrinsics is None else read_lenses(args.intrinsics)
 
 
-def _config(args: argparse.Namespace) -> Config:
+def _config(args: argparse.Namespace) -> ReconstructionConfig:
     """The preset, then the configuration file, then the flags: what comes later wins."""
     config = preset(args.preset or "balanced")
     if args.config is not None:
-        config = overlaid(config, read_yaml(args.config))
+        config = apply_changes(config, read_yaml(args.config))
     if args.prior is not None and args.prior != config.prior.kind:
-        config = overlaid(config, {"prior": {"kind": args.prior}})
-    config = overlaid(config, {"metric": metric_changes(args)})
+        config = apply_changes(config, {"prior": {"kind": args.prior}})
+    config = apply_changes(config, {"metric": collect_metric_changes(args)})
     if trusts_poses(args):
-        config = overlaid(config, {"registration": {"trust_poses": True}})
+        config = apply_changes(config, {"registration": {"trust_poses": True}})
     flags = {
         "size": args.size,
         "device": args.device,
@@ -257,22 +257,22 @@ def _config(args: argparse.Namespace) -> Config:
         "quick": args.quick or None,
         "decision": None if args.require is None else {"require_percent": args.require},
     }
-    return overlaid(config, {key: value for key, value in flags.items() if value is not None})
+    return apply_changes(config, {key: value for key, value in flags.items() if value is not None})
 
 
-def _tell(snapshot: Snapshot, out: Path) -> None:
+def _print_summary(snapshot: Snapshot, out: Path) -> None:
     verdict = snapshot.verdict
     say(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
     for frame in snapshot.dropped:
         say(f"left out: {frame.name}: {frame.reason}")
-    if moved := moving_in_words(snapshot.moving):
+    if moved := describe_moving(snapshot.moving):
         say(moved)
     for hit in snapshot.budget:
         say(hit["message"])
     if verdict.publishable:
         counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
         say(f"{snapshot.seconds['total']:.1f} s, {counts}")
-        if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
+        if known := bounds_in_words.format_widest_bounds(snapshot.cameras, snapshot.scale):
             say(f"how well the cameras are known: {known}")
         if snapshot.scale.source is not None:
             say(f"lengths: {snapshot.scale.sentence}")

@@ -33,6 +33,6 @@ class Clock:
         self.started, self.last = self.started + seconds, self.last + seconds
 
     @property
-    def booked(self) -> dict[str, float]:
+    def stage_seconds(self) -> dict[str, float]:
         """Seconds by stage, and from the start on as "total"."""
         return {**self.seconds, "total": time.monotonic() - self.started}

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from splatnode.capture.process.config import Plugin, merged, typed
+from splatnode.capture.process.config import Plugin, merge_config, parse_config
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.metric import config as metric
@@ -19,13 +19,13 @@ from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
 from splatnode.recon.result import consistent_depth
-from splatnode.recon.result.export.formats.ply import most_in_ply
+from splatnode.recon.result.export.formats.ply import compute_max_gaussians
 from splatnode.recon.scene import background, completion, denied, initialisation, light, pixelwise, seeding
 from splatnode.recon.verification import decision, verify
 
 
 class PriorChoice(Plugin):
-    """What gives depth, and matches that plain features miss: a module of recon/priors."""
+    """A module of recon/priors, which gives depth, and matches that plain features miss."""
 
     package = "splatnode.recon.priors"
     needs = ("Config", "load")
@@ -33,19 +33,19 @@ class PriorChoice(Plugin):
 
 
 # After each keyframe, for a look at once: nothing is pruned or left out.
-PREVIEW = refinement.Config(
+PREVIEW = refinement.RefinementConfig(
     iterations=20,
     half_resolution_share=1.0,
     dssim=0.2,
     first_opacity=None,
-    dropout=dropout.Config(share=0.0),
+    dropout=dropout.DropoutConfig(share=0.0),
     rates=refinement.CAUTIOUS,
     control=None,
 )
 
 
-class Ladder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is tried before photographs are refused or left out for want of matches."""
+class FallbackConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The fallbacks, tried before images are rejected or left out for want of matches."""
 
     # Within which further work begins; what has begun is finished. A second of one core that does nothing else is about
     # 1, but it is counted by what is done, not by a clock: the same photographs get the same work on any machine
@@ -54,7 +54,7 @@ class Ladder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     most_s: Annotated[float, Meta(ge=0)] | None = None
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     # Of the generators of random numbers: the same seed and photographs give the same scene
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
@@ -62,24 +62,24 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     quick: bool = False  # the first answer stands, also where it is no: nothing that takes longer is tried
     # What gives depth, and matches that plain features miss
     prior: PriorChoice = PriorChoice("classical", classical.Config())
-    screening: screening.Config = screening.Config()
-    matching: matching.Config = matching.Config()
-    registration: registration.Config = registration.Config()
-    verification: verify.Config = verify.Config()
-    decision: decision.Config = decision.Config()
-    ladder: Ladder = Ladder()
-    light: light.Config = light.Config()
-    denied: denied.Config = denied.Config()
-    completion: completion.Config = completion.Config()
-    seeding: seeding.Config = seeding.Config()
-    background: background.Config = background.Config()
+    screening: screening.ScreeningConfig = screening.ScreeningConfig()
+    matching: matching.MatchingConfig = matching.MatchingConfig()
+    registration: registration.RegistrationConfig = registration.RegistrationConfig()
+    verification: verify.VerificationConfig = verify.VerificationConfig()
+    decision: decision.DecisionConfig = decision.DecisionConfig()
+    ladder: FallbackConfig = FallbackConfig()
+    light: light.ExposureConfig = light.ExposureConfig()
+    denied: denied.TransientMaskConfig = denied.TransientMaskConfig()
+    completion: completion.DepthCompletionConfig = completion.DepthCompletionConfig()
+    seeding: seeding.GaussianInitializationConfig = seeding.GaussianInitializationConfig()
+    background: background.BackgroundConfig = background.BackgroundConfig()
     # In place of completion, seeding and background: a Gaussian a pixel, for comparison
-    pixelwise: pixelwise.Config | None = None
-    preview: refinement.Config = PREVIEW  # the refinement after each keyframe
-    optimize: refinement.Config = refinement.Config()  # the refinement after the last keyframe
-    metric: metric.Config = metric.Config()  # the scale in metres of what is published
+    pixelwise: pixelwise.PixelwiseConfig | None = None
+    preview: refinement.RefinementConfig = PREVIEW  # the refinement after each keyframe
+    optimize: refinement.RefinementConfig = refinement.RefinementConfig()  # the refinement after the last keyframe
+    metric: metric.MetricConfig = metric.MetricConfig()  # the scale in metres of what is published
     # From how much depth that other views confirm a scene counts as seen, also away from the cameras
-    consistent_depth: consistent_depth.Config = consistent_depth.Config()
+    consistent_depth: consistent_depth.ConsistentDepthConfig = consistent_depth.ConsistentDepthConfig()
     # At most so many in the scene; None: as many as it calls for
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets
@@ -90,7 +90,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def most_gaussians(self) -> int | None:
         """How many the scene may have, by both limits; None: there is none."""
-        by_size = None if self.max_mb is None else most_in_ply(round(self.max_mb * 1e6))
+        by_size = None if self.max_mb is None else compute_max_gaussians(round(self.max_mb * 1e6))
         limits = [limit for limit in (self.max_gaussians, by_size) if limit is not None]
         return min(limits, default=None)
 
@@ -101,52 +101,56 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return most if most is None or self.optimize.control is None else round(self.surplus * most)
 
     @property
-    def initialisation(self) -> initialisation.Config:
-        """What decides the Gaussians that a scene begins with."""
+    def initialisation(self) -> initialisation.SceneInitializationConfig:
+        """Returns the configuration of the initial Gaussians of a scene."""
         most = self.first_gaussians
-        return initialisation.Config(self.completion, self.seeding, self.background, self.pixelwise, most)
+        return initialisation.SceneInitializationConfig(
+            self.completion, self.seeding, self.background, self.pixelwise, most
+        )
 
 
-PRESETS: dict[str, Config] = {
-    "preview": Config(size=384, optimize=refinement.Config(half_resolution_share=0.25, iterations=150)),
-    "fast": Config(optimize=refinement.Config(iterations=200)),
-    "balanced": Config(),
+PRESETS: dict[str, ReconstructionConfig] = {
+    "preview": ReconstructionConfig(
+        size=384, optimize=refinement.RefinementConfig(half_resolution_share=0.25, iterations=150)
+    ),
+    "fast": ReconstructionConfig(optimize=refinement.RefinementConfig(iterations=200)),
+    "balanced": ReconstructionConfig(),
     # Two scenes and one that agrees with both. For texture: two thirds more Gaussians, and LPIPS where its weights are
-    "quality": Config(
-        seeding=seeding.Config(max_error=0.0009),
-        optimize=refinement.Config(
+    "quality": ReconstructionConfig(
+        seeding=seeding.GaussianInitializationConfig(max_error=0.0009),
+        optimize=refinement.RefinementConfig(
             checkpoints=(150, 500),
-            ensemble=ensemble.Config(members=2),
-            perceptual=perceptual_loss.Config(weight=0.08, start=0.0, every=2),
+            ensemble=ensemble.EnsembleConfig(members=2),
+            perceptual=perceptual_loss.PerceptualLossConfig(weight=0.08, start=0.0, every=2),
             control=ControlChoice("prune", prune.Config(least_change=0.00125)),
         ),
     ),
 }
 
 
-def preset(name: str) -> Config:
+def preset(name: str) -> ReconstructionConfig:
     """The configuration called `name`. Raises ValueError when there is none."""
     if name not in PRESETS:
         raise ValueError(f"no preset {name!r}; there are: {', '.join(PRESETS)}")
     return PRESETS[name]
 
 
-def overlaid(config: Config, changes: Mapping[str, Any]) -> Config:
+def apply_changes(config: ReconstructionConfig, changes: Mapping[str, Any]) -> ReconstructionConfig:
     """`config` with `changes` as a file gives them. Raises ConfigError.
 
     Another kind of prior starts from its own defaults.
     """
-    tree = _as_in_files(msgspec.to_builtins(config))
+    tree = _flatten_plugins(msgspec.to_builtins(config))
     kind, prior = tree["prior"]["kind"], changes.get("prior")
     if isinstance(prior, Mapping) and prior.get("kind", kind) != kind:
         tree["prior"] = {}
-    return typed(merged(tree, changes), Config)
+    return parse_config(merge_config(tree, changes), ReconstructionConfig)
 
 
-def _as_in_files(tree: Any) -> Any:
+def _flatten_plugins(tree: Any) -> Any:
     """The tree with the settings of plug-ins beside their kinds, as files have them."""
     if not isinstance(tree, dict):
         return tree
     if set(tree) == {"kind", "config"}:
         tree = {"kind": tree["kind"], **tree["config"]}
-    return {key: _as_in_files(value) for key, value in tree.items()}
+    return {key: _flatten_plugins(value) for key, value in tree.items()}

@@ -14,13 +14,16 @@ _SECONDS_RANGE = 0.5, 3.0  # times as long: more cores and a preset that does le
 _MEMORY_RANGE = 0.9, 1.6
 
 
-def in_words(sizes: Sequence[tuple[int, int]]) -> str | None:
+def format_cost(sizes: Sequence[tuple[int, int]]) -> str | None:
     """One line about the photographs with these widths and heights; None for so few that nobody needs to know."""
     if len(sizes) <= FEW:
         return None
     views, seconds, megabytes = np.array(MEASURED).T
     count, pixels = len(sizes), sum(width * height for width, height in sizes)
-    took_s, took_mb = _along(count, views, seconds), _along(count, views, megabytes) + _BYTES_A_PIXEL * pixels / 1e6
+    took_s, took_mb = (
+        _interpolate(count, views, seconds),
+        _interpolate(count, views, megabytes) + _BYTES_A_PIXEL * pixels / 1e6,
+    )
     shortest, longest = (took_s * times for times in _SECONDS_RANGE)
     least, most = (took_mb * times / 1000 for times in _MEMORY_RANGE)
     time = (
@@ -30,7 +33,7 @@ def in_words(sizes: Sequence[tuple[int, int]]) -> str | None:
     return f"{count} photographs, {pixels / 1e6:.0f} megapixels in all: about {time}, {memory}"
 
 
-def _along(count: int, views: np.ndarray, measured: np.ndarray) -> float:
+def _interpolate(count: int, views: np.ndarray, measured: np.ndarray) -> float:
     """Between the measured counts; beyond the last one it goes on as between the last two."""
     if count <= views[-1]:
         return float(np.interp(count, views, measured))

@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 
 class OutOfTime(Exception):
-    """What a `pause` raises when its deadline is over: the work ends with what it has, if that is enough."""
+    """The exception that a `pause` raises at its deadline: the work ends with what it has."""
 
 
-def pausing_until(deadline: float | None, pause: Callable[[], None] = lambda: None) -> Callable[[], None]:
+def make_deadline_pause(deadline: float | None, pause: Callable[[], None] = lambda: None) -> Callable[[], None]:
     """A `pause` that raises OutOfTime from `deadline` on, a time of `time.monotonic()`; None: never."""
 
     def ask() -> None:
@@ -34,7 +34,7 @@ class Timer:
         return time.monotonic() - self._began_s - self._paused_s
 
     def pause(self) -> None:
-        """What the work calls about once a second: pauses, then raises OutOfTime where the time is spent."""
+        """Pauses, then raises OutOfTime where the time is spent; the work calls it about once a second."""
         before = time.monotonic()
         try:
             self._pause()
@@ -45,5 +45,5 @@ class Timer:
 
 
 def is_over(until: float) -> bool:
-    """Whether it is `until` or later, a time of `time.monotonic()`; of infinity, which is never, no clock is asked."""
+    """True from `until` on, a time of `time.monotonic()`; infinity never ends, so no clock is read."""
     return until < math.inf and time.monotonic() >= until

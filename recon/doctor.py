@@ -17,7 +17,7 @@ from splatnode.capture.cameras import v4l2
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.capture.process.packages import EXTRAS, REQUIRED
-from splatnode.capture.process.progress import waiting
+from splatnode.capture.process.progress import show_waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
@@ -44,7 +44,7 @@ class Finding:
 
 def doctor(args: argparse.Namespace) -> int:
     """Prints the findings; 2 when something is missing that everything needs."""
-    with waiting("looking at what is installed"):
+    with show_waiting("looking at what is installed"):
         found = findings()
     if args.json:
         print(json.dumps([asdict(finding) for finding in found], indent=1))
@@ -59,12 +59,12 @@ def findings() -> list[Finding]:
         _machine(),
         _compiler(),
         _core(),
-        *(_required(module, distribution) for module, distribution in REQUIRED.items()),
+        *(_check_required(module, distribution) for module, distribution in REQUIRED.items()),
         _poselib(),
         _gpu(),
-        *(_optional(module, purpose) for module, purpose in OPTIONAL.items()),
+        *(_check_optional(module, purpose) for module, purpose in OPTIONAL.items()),
         *(_lpips(network) for network in ("alex", "vgg")),
-        *_learned_parts(),
+        *_check_learned_parts(),
         _cameras(),
         *_oak_rights(),
         _network(),
@@ -95,13 +95,13 @@ def _core() -> Finding:
     return Finding("core", "ok", f"{usable[0]} (can also run: {', '.join(usable[1:]) or 'no other'})")
 
 
-def _required(module: str, distribution: str) -> Finding:
+def _check_required(module: str, distribution: str) -> Finding:
     if importlib.util.find_spec(module):
         return Finding(module, "ok", _version(distribution))
     return Finding(module, "missing", f"Run: pip install {distribution}")
 
 
-def _optional(module: str, purpose: str) -> Finding:
+def _check_optional(module: str, purpose: str) -> Finding:
     if importlib.util.find_spec(module):
         return Finding(module, "ok", _version(module))
     return Finding(module, "optional", f"not installed; for {purpose} (the extra named {EXTRAS[module]} brings it)")
@@ -118,12 +118,12 @@ def _poselib() -> Finding:
 def _gpu() -> Finding:
     """Whether Gaussians can be refined on a GPU: the answer of those who would do it."""
     try:
-        from splatnode.recon.rasterize.device import chosen, in_words
+        from splatnode.recon.rasterize.device import choose_device, format_device
 
-        device = chosen("auto")
+        device = choose_device("auto")
     except (ImportError, OSError) as error:
         return Finding("gpu", "optional", f"not examined: {error}")
-    return Finding("gpu", "ok" if device.type == "cuda" else "optional", in_words("auto", device))
+    return Finding("gpu", "ok" if device.type == "cuda" else "optional", format_device("auto", device))
 
 
 def _cameras() -> Finding:
@@ -151,7 +151,7 @@ def _oak_rights() -> list[Finding]:
 
 
 def _network() -> Finding:
-    """Where the processes meet unless they are told otherwise."""
+    """Checks the default folder of the sockets."""
     try:
         return Finding("sockets", "ok", str(runtime_directory(Network())))
     except OSError as error:
@@ -181,18 +181,18 @@ def _version(distribution: str) -> str:
         return f"installed, though not from {distribution}"
 
 
-def _learned_parts() -> list[Finding]:
+def _check_learned_parts() -> list[Finding]:
     """Whether each learned part is ready; one that is not costs nothing but itself."""
     try:
-        from splatnode.recon.learned_parts import learned_parts, obstacle
+        from splatnode.recon.learned_parts import find_unavailable_reason, list_learned_parts
 
-        parts = learned_parts()
+        parts = list_learned_parts()
     except (ImportError, OSError) as error:
         return [Finding("learned parts", "optional", f"not examined: {error}")]
     found = []
     for part in parts:
         try:
-            hindered = obstacle(part)
+            hindered = find_unavailable_reason(part)
         except ValueError as error:
             hindered = str(error)
         detail = f"{part.purpose}; weights: {part.licence}"

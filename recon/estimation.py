@@ -6,31 +6,31 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from splatnode.capture.stamp import Stamp
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.deadline import pausing_until
+from splatnode.recon.deadline import make_deadline_pause
 from splatnode.recon.frames.screening import Rejected
-from splatnode.recon.locating.gathering import gathered
+from splatnode.recon.locating.gathering import collect_landmarks
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import Prior, without_hidden
+from splatnode.recon.priors.prior import Prior, apply_image_masks
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.hand_eye import offset_of
-from splatnode.recon.registration.inliers import pooled_ratio
+from splatnode.recon.registration.inliers import compute_pooled_ratio
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.posed import register_posed
 from splatnode.recon.registration.register import Registration, register
-from splatnode.recon.registration.straightened import straightened
+from splatnode.recon.registration.straightened import undistort_keyframes
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.verdict import SURE, Verdict
-from splatnode.recon.verification.claims import claims, shaped
+from splatnode.recon.verification.claims import predict_bounds, shape_bounds
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import explain_refusal, refuse_stereo_or_panorama
-from splatnode.recon.verification.likelihood import record, weigh
-from splatnode.recon.verification.posed import decide_posed, posed_bounds
+from splatnode.recon.verification.likelihood import compute_log_odds, make_evidence_record
+from splatnode.recon.verification.posed import compute_posed_bounds, decide_posed
 from splatnode.recon.verification.verify import verify, verify_further
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
@@ -43,8 +43,8 @@ PROVISIONAL = "Provisional: checked again with all evidence when the camera rest
 
 
 @dataclass(frozen=True, eq=False)
-class Conclusion:
-    """What an estimate says of the cameras, without what it was concluded from: photographs, features and matches."""
+class ReconstructionSummary:
+    """The cameras, verdict and bounds of a reconstruction, without its images, features and matches."""
 
     verdict: Verdict
     bounds: Mapping[str, Bounds]  # of the errors of each camera, by the name of its keyframe
@@ -57,7 +57,7 @@ class Conclusion:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class Reconstruction:
     """The state of a reconstruction between matching and modelling."""
 
     graph: ViewGraph
@@ -69,46 +69,46 @@ class Estimate:
     @property
     def publishable(self) -> bool:
         """Whether there are cameras, verified, that may be published."""
-        held = self.evidence is not None or self.given is not None
+        held = self.evidence is not None or self.prior_world is not None
         return self.verdict.publishable and self.registration is not None and held
 
     @property
-    def given(self) -> GivenWorld | None:
+    def prior_world(self) -> GivenWorld | None:
         """The world of given poses that hold the cameras; None where none do."""
         return None if self.registration is None else self.registration.given
 
     @property
     def bounds(self) -> Mapping[str, Bounds]:
-        """Of the errors of each camera, by the name of its keyframe; empty where nothing was verified.
+        """Returns the error bounds of each camera, by its keyframe's name; empty where nothing was verified.
 
         A provisional estimate claims less, so that what is known in the end is not less than was claimed before.
         """
         if self.registration is not None and self.registration.given is not None:
-            return posed_bounds(self.graph, self.registration, self.registration.given)
+            return compute_posed_bounds(self.graph, self.registration, self.registration.given)
         if self.registration is None or self.evidence is None:
             return {}
         names, cameras = self.graph.names, self.registration.cameras
         covariances = {names[camera.index]: camera.centre_covariance for camera in cameras}
-        found = shaped(claims(self.evidence, FITTED.of(self.evidence).claims), covariances)
+        found = shape_bounds(predict_bounds(self.evidence, FITTED.select_model(self.evidence).claims), covariances)
         wider = PROVISIONALLY_WIDER if self.verdict.provisional else 1.0
-        return {name: bounds.widened(wider) for name, bounds in found.items()}
+        return {name: bounds.widen(wider) for name, bounds in found.items()}
 
     @property
     def evidence_record(self) -> dict[str, object] | None:
         """The evidence and what it amounts to, for reports; None where nothing was verified."""
         if self.evidence is None:
             return None
-        numbers = FITTED.of(self.evidence)
-        return record(self.evidence, weigh(self.evidence, numbers.claims, numbers.odds))
+        numbers = FITTED.select_model(self.evidence)
+        return make_evidence_record(self.evidence, compute_log_odds(self.evidence, numbers.claims, numbers.odds))
 
     @property
-    def conclusion(self) -> Conclusion:
-        """What snapshots tell of it."""
+    def summary(self) -> ReconstructionSummary:
+        """Returns what snapshots publish of the cameras."""
         stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
         known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
         masked, moving = self._hidden
         told = self.verdict, self.bounds, self.evidence_record, known
-        return Conclusion(*told, masked=masked, moving=moving, given=self.given)
+        return ReconstructionSummary(*told, masked=masked, moving=moving, given=self.prior_world)
 
     @property
     def _hidden(self) -> tuple[dict[str, float], dict[str, float]]:
@@ -122,64 +122,67 @@ class Estimate:
         return {name: share for name, share in masked.items() if share > _NOTHING or name not in moving}, moving
 
     @property
-    def conclusion_to_save(self) -> Conclusion:
-        """With the landmarks by which further photographs are placed; gathering them takes up to a second."""
-        return replace(self.conclusion, landmarks=self.landmarks)
+    def summary_to_save(self) -> ReconstructionSummary:
+        """Returns the summary with landmarks to localize query images; gathering them takes up to a second."""
+        return replace(self.summary, landmarks=self.landmarks)
 
     @property
     def landmarks(self) -> Landmarks | None:
         """Gathered from the cameras and all matches; None where no scene is published."""
         if not self.publishable or self.registration is None:
             return None
-        return gathered(self.graph, self.registration, self.bounds)
+        return collect_landmarks(self.graph, self.registration, self.bounds)
 
     @property
-    def registered(self) -> set[str]:
+    def camera_names(self) -> set[str]:
         """The keyframes that have a camera, whether it may be published or not."""
         cameras = () if self.registration is None else self.registration.cameras
         return {self.graph.keyframes[camera.index].name for camera in cameras}
 
     @property
-    def placed(self) -> set[str]:
+    def publishable_camera_names(self) -> set[str]:
         """The keyframes that have a camera in a scene that may be published."""
-        return self.registered if self.verdict.publishable else set()
+        return self.camera_names if self.verdict.publishable else set()
 
 
 def estimate_cameras(
-    graph: ViewGraph, rejected: Sequence[Rejected], config: Config, pause: Callable[[], None] = lambda: None
-) -> Estimate:
+    graph: ViewGraph,
+    rejected: Sequence[Rejected],
+    config: ReconstructionConfig,
+    pause: Callable[[], None] = lambda: None,
+) -> Reconstruction:
     """Registers the keyframes of a complete view graph, verifies the cameras, and decides whether they are published.
 
     There is no registration where it would be of no use. With trusted poses, those that the images do not contradict
     hold the cameras. `pause` is called about once a second and may raise.
     """
-    posed = _held_by_poses(graph, config, pause)
-    if posed is not None and not _contradicted(posed):
+    posed = _estimate_from_poses(graph, config, pause)
+    if posed is not None and not _is_contradicted(posed):
         return posed
-    alone = _by_images_alone(graph, rejected, config, pause)
+    alone = _estimate_from_images(graph, rejected, config, pause)
     if posed is None or alone.verdict.code in SURE:
-        return _without_offset(alone, config, pause) or alone
+        return _remove_offset(alone, config, pause) or alone
     return posed
 
 
-def _by_images_alone(
-    graph: ViewGraph, rejected: Sequence[Rejected], config: Config, pause: Callable[[], None]
-) -> Estimate:
+def _estimate_from_images(
+    graph: ViewGraph, rejected: Sequence[Rejected], config: ReconstructionConfig, pause: Callable[[], None]
+) -> Reconstruction:
     """As `estimate_cameras`, whatever poses are given."""
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
-        return Estimate(graph, None, None, explain_refusal(refusal, graph))
+        return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
     registration = register(graph.keyframes, graph.pairs, config.registration, pause)
     pause()
     evidence = verify(graph, registration, config.verification, pause)
     give_back_memory()
     verdict = explain_refusal(decide(graph, registration, evidence, config.decision), graph)
-    return Estimate(graph, registration, evidence, verdict)
+    return Reconstruction(graph, registration, evidence, verdict)
 
 
-def _held_by_poses(
-    graph: ViewGraph, config: Config, pause: Callable[[], None], offset: Offset | None = None
-) -> Estimate | None:
+def _estimate_from_poses(
+    graph: ViewGraph, config: ReconstructionConfig, pause: Callable[[], None], offset: Offset | None = None
+) -> Reconstruction | None:
     """The estimate whose cameras given poses hold; None where they are not trusted, or cannot hold any.
 
     `offset` is taken out of all poses.
@@ -190,44 +193,50 @@ def _held_by_poses(
     give_back_memory()
     if registration is None or registration.given is None:
         return None
-    return Estimate(graph, registration, None, decide_posed(graph, registration, registration.given, config.decision))
+    return Reconstruction(
+        graph, registration, None, decide_posed(graph, registration, registration.given, config.decision)
+    )
 
 
-def _contradicted(posed: Estimate) -> bool:
+def _is_contradicted(posed: Reconstruction) -> bool:
     """Whether so few matches fit that the poses may be wrong together: then no single one stands out."""
     if posed.registration is None or not posed.graph.pairs:
         return False
     ratios = posed.registration.inlier_ratios
     known = {pair: ratio for pair, ratio in ratios.items() if pair in posed.graph.pairs}
-    return bool(known) and pooled_ratio(known, posed.graph.pairs) < LEAST_FITTING
+    return bool(known) and compute_pooled_ratio(known, posed.graph.pairs) < LEAST_FITTING
 
 
-def _without_offset(alone: Estimate, config: Config, pause: Callable[[], None]) -> Estimate | None:
+def _remove_offset(
+    alone: Reconstruction, config: ReconstructionConfig, pause: Callable[[], None]
+) -> Reconstruction | None:
     """The estimate held by given poses without what is wrong with all of them alike; None where nothing is."""
     if not config.registration.trust_poses or alone.registration is None or not alone.verdict.publishable:
         return None
     offset = offset_of(alone.graph.keyframes, alone.registration)
-    posed = None if offset is None else _held_by_poses(alone.graph, config, pause, offset)
-    return None if posed is None or _contradicted(posed) else posed
+    posed = None if offset is None else _estimate_from_poses(alone.graph, config, pause, offset)
+    return None if posed is None or _is_contradicted(posed) else posed
 
 
 def estimate_depth(
-    estimate: Estimate, prior: Prior, pause: Callable[[], None] = lambda: None, until: float | None = None
-) -> Estimate:
-    """With a point map for each camera; with none where the verdict forbids a scene. `pause` as above.
+    estimate: Reconstruction, prior: Prior, pause: Callable[[], None] = lambda: None, until: float | None = None
+) -> Reconstruction:
+    """Adds a point map for each camera; none where the verdict forbids a scene. `pause` as above.
 
     A prior that can end early gives coarser depth from `until` on, a time of `time.monotonic()`.
     """
     if estimate.registration is None or not estimate.verdict.publishable:
         return estimate
-    pause = pausing_until(until, pause) if prior.ends_early else pause
-    graph, registration = straightened(estimate.graph, estimate.registration)
+    pause = make_deadline_pause(until, pause) if prior.ends_early else pause
+    graph, registration = undistort_keyframes(estimate.graph, estimate.registration)
     pointmaps = prior.pointmaps(graph, registration, pause)
     give_back_memory()
-    return replace(estimate, pointmaps=without_hidden(pointmaps, graph))
+    return replace(estimate, pointmaps=apply_image_masks(pointmaps, graph))
 
 
-def continued(known: Estimate, graph: ViewGraph, config: Config) -> Estimate | None:
+def extend_reconstruction(
+    known: Reconstruction, graph: ViewGraph, config: ReconstructionConfig
+) -> Reconstruction | None:
     """A provisional estimate for `graph`, which has the keyframes of `known` and others beside them.
 
     None where `known` has two cameras only, the others cannot be placed beyond doubt, or the verdict would not be
@@ -242,7 +251,7 @@ def continued(known: Estimate, graph: ViewGraph, config: Config) -> Estimate | N
     if not position.keys() >= set(names):
         return None
     start = [replace(camera, index=position[names[camera.index]]) for camera in known.registration.cameras]
-    registration = continuation.extended(graph.keyframes, graph.pairs, start, config.registration)
+    registration = continuation.extend_registration(graph.keyframes, graph.pairs, start, config.registration)
     further = position.keys() - set(names)
     if registration is None or not _has_cameras_of(registration, [position[name] for name in further]):
         return None
@@ -255,7 +264,7 @@ def continued(known: Estimate, graph: ViewGraph, config: Config) -> Estimate | N
     if not verdict.publishable:
         return None
     message = f"{verdict.message} {PROVISIONAL}"
-    return Estimate(graph, registration, evidence, replace(verdict, message=message, provisional=True))
+    return Reconstruction(graph, registration, evidence, replace(verdict, message=message, provisional=True))
 
 
 def _has_cameras_of(registration: Registration, indices: Collection[int]) -> bool:

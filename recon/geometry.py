@@ -19,7 +19,7 @@ MIN_DEPTH = 1e-9  # of a point that is projected; the scene's median depth is 1.
 _STRONG = 0.1  # radial coefficient from which on undoing it takes more steps
 
 
-def to_camera(points: ArrayOrTensor, T_world_camera: ArrayOrTensor) -> ArrayOrTensor:
+def transform_to_camera(points: ArrayOrTensor, T_world_camera: ArrayOrTensor) -> ArrayOrTensor:
     """World points (..., 3) in the frame of the camera `T_world_camera` (4, 4)."""
     return (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
 
@@ -86,12 +86,12 @@ def matrices_from_quats(quats: Tensor) -> Tensor:
     read are `rasterize.reference.rotations` and, without torch, `result.export.quaternions`.
     """
     products = (quats[:, :, None] * quats[:, None, :]).flatten(1)  # (N, 16)
-    rows, squared_lengths = (products @ _of_products(quats.dtype, quats.device)).split((9, 1), 1)
+    rows, squared_lengths = (products @ _quaternion_product_matrix(quats.dtype, quats.device)).split((9, 1), 1)
     return (rows / squared_lengths).unflatten(1, (3, 3))
 
 
 @lru_cache(maxsize=8)
-def _of_products(dtype: torch.dtype, device: torch.device) -> Tensor:
+def _quaternion_product_matrix(dtype: torch.dtype, device: torch.device) -> Tensor:
     """(16, 10): ww, wx, .. zz to the rows of the matrix and the squared length, of quaternions wxyz."""
     w, x, y, z = range(4)
     signs = [
@@ -168,7 +168,7 @@ def umeyama(source: Array, target: Array) -> Similarity:
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
-def spread(points: Array) -> float:
+def compute_rms_radius(points: Array) -> float:
     """RMS distance of points (M, 3) from their mean."""
     return float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))
 
@@ -202,7 +202,7 @@ def distortion(squared_radii: Array, radials: Array) -> Array:
     return 1.0 + (radials[..., 0] + radials[..., 1] * squared_radii) * squared_radii
 
 
-def without_distortion(rays: Array, radials: Array) -> Array:
+def undistort_rays(rays: Array, radials: Array) -> Array:
     """(M, 2) at depth 1 what a lens with radial coefficients (2,) or (M, 2) shows at `rays` (M, 2)."""
     found = rays
     for _ in range(undistort_iterations(radials)):

@@ -14,23 +14,30 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.budget import hits
+from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.deadline import OutOfTime, Timer
-from splatnode.recon.estimation import Estimate, continued, estimate_cameras, estimate_depth
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth, extend_reconstruction
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.frames.screening import Rejected, Screened
-from splatnode.recon.ladder.ladder import climbed, fallback_key
-from splatnode.recon.matching.match import completed, matched_soon
-from splatnode.recon.matching.moving import without_moving
+from splatnode.recon.frames.screening import Rejected, ScreeningState
+from splatnode.recon.ladder.ladder import make_fallback_key, run_fallbacks
+from splatnode.recon.matching.match import match_newest, match_pending
+from splatnode.recon.matching.moving import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.memory import Key, Memory
-from splatnode.recon.modelling import Shown, begin_scene, in_words, refined, shown, snapshot
+from splatnode.recon.memory import Key, ReconstructionCache
+from splatnode.recon.modelling import (
+    SceneWithVerdict,
+    create_initial_scene,
+    format_snapshot,
+    prepare_scene_for_display,
+    refine_scene,
+    snapshot,
+)
 from splatnode.recon.optimize import refinement
 from splatnode.recon.preparation import UnusableFrame, check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import without_hidden
+from splatnode.recon.priors.prior import apply_image_masks
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import growth, warping
 from splatnode.recon.scene.scene import Scene
@@ -43,32 +50,32 @@ WORTH_S = 0.1  # of fallbacks that gained nothing, from which on it is worth to 
 Pause = Callable[[], None]
 
 
-def without_pause() -> None:
-    """What is called between the parts of work that nobody interrupts."""
+def ignore_cancel() -> None:
+    """Does nothing: the pause of work that nobody interrupts."""
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class StreamState:
     """All that a growing reconstruction knows."""
 
     graph: ViewGraph  # of the keyframes that belong to the scene
     beside: ViewGraph  # what is known of keyframes that were set aside, and of others
-    screened: Screened = field(default_factory=Screened)
-    memory: Memory = field(default_factory=Memory)
+    screened: ScreeningState = field(default_factory=ScreeningState)
+    memory: ReconstructionCache = field(default_factory=ReconstructionCache)
     pointmaps: Mapping[str, Pointmap] = field(default_factory=dict)  # by keyframe, as they were last computed
     begun: Scene | None = None  # from the last estimate of all frames, not refined
-    show: Shown = field(default_factory=Shown)
+    show: SceneWithVerdict = field(default_factory=SceneWithVerdict)
 
     @property
     def key(self) -> Key:
-        """By which the estimate of these keyframes is remembered."""
+        """Returns the key under which the reconstruction of these keyframes is cached."""
         return tuple(self.graph.names), len(self.screened.rejected)
 
 
 class IncrementalReconstruction:
     """Keyframes, their cameras and verdict, and the scene that grows with them."""
 
-    def __init__(self, config: Config, known: Known | None = None) -> None:
+    def __init__(self, config: ReconstructionConfig, known: StreamState | None = None) -> None:
         """`known` is what an earlier process knew."""
         self.config = config
         self.clock = Clock()
@@ -78,10 +85,10 @@ class IncrementalReconstruction:
         check_device(config)
         self._prior = load_prior(config)
         empty = ViewGraph(config.matching)
-        self._known = known or Known(empty, empty)
+        self._known = known or StreamState(empty, empty)
 
     @property
-    def known(self) -> Known:
+    def state(self) -> StreamState:
         return self._known
 
     @property
@@ -90,39 +97,39 @@ class IncrementalReconstruction:
 
     @property
     def names(self) -> list[str]:
-        """Of the keyframes that belong to the scene, in their order."""
+        """Returns the names of the keyframes that belong to the scene, in their order."""
         return self._known.graph.names
 
     @property
     def scene(self) -> Scene | None:
-        """What is shown."""
+        """Returns the scene that snapshots show."""
         return self._known.show.scene
 
     @property
-    def begun(self) -> Scene | None:
+    def initial_scene(self) -> Scene | None:
         return self._known.begun
 
     @property
-    def aside(self) -> list[Keyframe]:
+    def keyframes_deferred(self) -> list[Keyframe]:
         """Keyframes that are known and do not belong to the scene, in the order in which their frames came."""
         belonging = set(self.names)
         found = [keyframe for keyframe in self._known.beside.keyframes if keyframe.name not in belonging]
         return sorted(found, key=lambda keyframe: keyframe.frame.frame_id)
 
     @property
-    def proven(self) -> frozenset[str]:
+    def publishable_names(self) -> frozenset[str]:
         """The keyframes that a publishable verdict was last given on thoroughly."""
         return self._known.memory.proven
 
-    def was_refused(self, names: Collection[str]) -> bool:
+    def is_rejected(self, names: Collection[str]) -> bool:
         """Whether a thorough estimate for these keyframes, just these, is known and forbade a scene."""
-        return self._known.memory.was_refused(names)
+        return self._known.memory.is_rejected(names)
 
     def drop(self, frame: DroppedFrame) -> None:
         """Keeps in mind that there was a frame that was left out."""
         self.dropped.append(frame)
 
-    def take(self, frame: Frame, pause: Pause = without_pause) -> None:
+    def add_frame(self, frame: Frame, pause: Pause = ignore_cancel) -> None:
         """Adds a frame to the view graph unless it says nothing new. Time counts from the first one.
 
         A frame that turns out to be blurred beside a sharper one is left out again, and so is one that cannot become a
@@ -133,7 +140,7 @@ class IncrementalReconstruction:
         self.clock.lap("wait")
         rejected = self.screen(frame)
         self.dropped += [DroppedFrame(each.name, each.reason) for each in rejected]
-        self.retract({each.name for each in rejected})
+        self.remove_keyframes({each.name for each in rejected})
         self.clock.lap("poses")
         if frame.name in self._known.screened.summaries:
             self._prepare_and_add(frame, pause)
@@ -146,21 +153,21 @@ class IncrementalReconstruction:
                 raise
             log.warning("left out: %s", error)
             self.drop(DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: ")))
-            self.retract({frame.name})
+            self.remove_keyframes({frame.name})
             return
-        self.add(keyframe, pause)
+        self.add_keyframe(keyframe, pause)
 
     def screen(self, frame: Frame) -> list[Rejected]:
         """The frames that say nothing beside the others, now that there is this one too: it, or earlier ones."""
-        screened, rejected = self._known.screened.with_frame(frame, self.config.screening)
+        screened, rejected = self._known.screened.add_frame(frame, self.config.screening)
         self._known = replace(self._known, screened=screened)
         return rejected
 
-    def add(self, keyframe: Keyframe, pause: Pause = without_pause) -> None:
+    def add_keyframe(self, keyframe: Keyframe, pause: Pause = ignore_cancel) -> None:
         """Adds a keyframe to the view graph, matched with a few others at first."""
-        graph = self.graph.with_keyframe(keyframe)
-        self._known = replace(self._known, graph=graph, screened=self._known.screened.with_known(keyframe.frame))
-        self._keep_matching(matched_soon(graph, self._prior.matcher), pause)
+        graph = self.graph.add_keyframe(keyframe)
+        self._known = replace(self._known, graph=graph, screened=self._known.screened.add_known_frame(keyframe.frame))
+        self._keep_matching(match_newest(graph, self._prior.matcher), pause)
         newest, num_features = len(self.graph.keyframes) - 1, len(keyframe.features.points)
         sharing = len(self.graph.partners(newest))
         compared = newest - sum(newest in pair for pair in self.graph.pending)
@@ -169,56 +176,63 @@ class IncrementalReconstruction:
         log.info("%s: %s (%d image features)", keyframe.name, told, num_features)
         self.clock.lap("poses")
 
-    def complete(self, pause: Pause = without_pause) -> None:
+    def match_pending_pairs(self, pause: Pause = ignore_cancel) -> None:
         """Matches the pairs that are still pending. What was matched is kept if `pause` raises."""
-        self._keep_matching(completed(self.graph, self._prior.matcher), pause)
+        self._keep_matching(match_pending(self.graph, self._prior.matcher), pause)
 
     def _keep_matching(self, graphs: Iterable[ViewGraph], pause: Pause) -> None:
         for graph in graphs:
             self._known = replace(self._known, graph=graph)
             pause()
 
-    def retract(self, names: Collection[str]) -> None:
+    def remove_keyframes(self, names: Collection[str]) -> None:
         """Forgets keyframes, and what the scene has from them alone."""
         known = self._known
-        self._known = replace(known, screened=known.screened.without(names), beside=known.beside.without(names))
-        self._leave_out(names)
+        self._known = replace(
+            known, screened=known.screened.remove_frames(names), beside=known.beside.remove_keyframes(names)
+        )
+        self._remove_from_scene(names)
 
-    def set_aside(self, names: Collection[str]) -> None:
+    def defer_keyframes(self, names: Collection[str]) -> None:
         """Takes keyframes out of the scene as `retract` does, and remembers them and what their pairs say."""
-        self._known = replace(self._known, beside=self.graph.joined(self._known.beside))
-        self._leave_out(names)
+        self._known = replace(self._known, beside=self.graph.merge(self._known.beside))
+        self._remove_from_scene(names)
 
-    def bring_back(self, names: Collection[str]) -> None:
+    def restore_keyframes(self, names: Collection[str]) -> None:
         """The keyframes among these that were set aside belong to the scene as before."""
-        others = {keyframe.name for keyframe in self.aside}.difference(names)
-        self._known = replace(self._known, graph=self.graph.joined(self._known.beside.without(others)))
+        others = {keyframe.name for keyframe in self.keyframes_deferred}.difference(names)
+        self._known = replace(self._known, graph=self.graph.merge(self._known.beside.remove_keyframes(others)))
 
-    def _leave_out(self, names: Collection[str]) -> None:
+    def _remove_from_scene(self, names: Collection[str]) -> None:
         if set(self.names).isdisjoint(names):
             return
         known, show = self._known, self._known.show
         if show.scene is not None and not {view.name for view in show.scene.views}.isdisjoint(names):
-            rest = growth.without_views(show.scene, names)
+            rest = growth.remove_views(show.scene, names)
             show = replace(show, scene=rest if rest.views else None)
         pointmaps = {name: pointmap for name, pointmap in known.pointmaps.items() if name not in names}
-        self._known = replace(known, graph=known.graph.without(names), begun=None, pointmaps=pointmaps, show=show)
+        self._known = replace(
+            known, graph=known.graph.remove_keyframes(names), begun=None, pointmaps=pointmaps, show=show
+        )
 
-    def remembered(self) -> Estimate | None:
+    def find_reconstruction(self) -> Reconstruction | None:
         """The estimate of just these keyframes, if it was made a moment ago."""
-        return self._known.memory.recall(self._known.key)
+        return self._known.memory.find_reconstruction(self._known.key)
 
-    def estimate_thoroughly(self, pause: Pause = without_pause) -> Estimate:
+    def estimate_thoroughly(self, pause: Pause = ignore_cancel) -> Reconstruction:
         """Cameras and verdict from all that there is to know, whatever it takes; remembered while nothing changes."""
-        estimate = self.remembered()
+        estimate = self.find_reconstruction()
         if estimate is not None and not estimate.verdict.provisional:
             return estimate
         self.clock.lap("wait")
-        self.complete(pause)
-        graph, rejected = without_moving(self.graph, self._prior.matcher, pause=pause), self._known.screened.rejected
+        self.match_pending_pairs(pause)
+        graph, rejected = (
+            mask_moving_objects(self.graph, self._prior.matcher, pause=pause),
+            self._known.screened.rejected,
+        )
         estimate = estimate_cameras(graph, rejected, self.config, pause)
         self.clock.lap("poses")
-        estimate = self._with_fallbacks(estimate, rejected, pause)
+        estimate = self._run_fallbacks(estimate, rejected, pause)
         self._remember(estimate)
         self.clock.lap("ladder")
         return estimate
@@ -232,10 +246,10 @@ class IncrementalReconstruction:
         finally:
             self._fallback_budget_s = self._fallbacks_left_s = math.inf
 
-    def _with_fallbacks(self, estimate: Estimate, rejected: Sequence[Rejected], pause: Pause) -> Estimate:
+    def _run_fallbacks(self, estimate: Reconstruction, rejected: Sequence[Rejected], pause: Pause) -> Reconstruction:
         """The estimate after what else there is to try, unless that gained nothing from the same start before."""
-        start, memory = fallback_key(estimate.graph, self.config), self._known.memory
-        told = memory.recall_fruitless(start)
+        start, memory = make_fallback_key(estimate.graph, self.config), self._known.memory
+        told = memory.find_fruitless_fallback(start)
         if told is not None:
             verdict = estimate.verdict
             return replace(estimate, verdict=replace(verdict, message=verdict.message + told)) if told else estimate
@@ -244,7 +258,7 @@ class IncrementalReconstruction:
             return estimate
         timer, found = Timer(left_s, pause), estimate
         try:
-            found = climbed(estimate, rejected, self.config, timer.pause)
+            found = run_fallbacks(estimate, rejected, self.config, timer.pause)
         except OutOfTime:
             log.info("fallbacks ended after %.1f s, all that there were", left_s)
             if left_s < self._fallback_budget_s:  # others had a part of it: another time there may be more
@@ -253,27 +267,27 @@ class IncrementalReconstruction:
             self._fallbacks_left_s -= timer.spent_s
         if found.registration is estimate.registration and (found is not estimate or timer.spent_s > WORTH_S):
             told = found.verdict.message.removeprefix(estimate.verdict.message)
-            self._known = replace(self._known, memory=memory.remember_fruitless(start, told))
+            self._known = replace(self._known, memory=memory.add_fruitless_fallback(start, told))
         return found
 
-    def estimate_quickly(self) -> Estimate | None:
-        """What is remembered, or what continues it with cameras for all keyframes; None without either."""
-        estimate = self.remembered()
+    def estimate_quickly(self) -> Reconstruction | None:
+        """Returns the cached reconstruction, or extends one to all keyframes; None without either."""
+        estimate = self.find_reconstruction()
         if estimate is not None:
             return estimate
         self.clock.lap("wait")
         known = self._known.memory.newest_publishable(self.names)
-        estimate = None if known is None else continued(known, self.graph, self.config)
+        estimate = None if known is None else extend_reconstruction(known, self.graph, self.config)
         if estimate is not None:
             self._remember(estimate)
         self.clock.lap("poses")
         return estimate
 
-    def estimate_soon(self, pause: Pause = without_pause) -> Estimate:
+    def estimate_soon(self, pause: Pause = ignore_cancel) -> Reconstruction:
         """As `estimate_quickly`, else as `estimate_thoroughly`."""
         return self.estimate_quickly() or self.estimate_thoroughly(pause)
 
-    def estimate_with_depth(self, pause: Pause = without_pause) -> Estimate:
+    def estimate_with_depth(self, pause: Pause = ignore_cancel) -> Reconstruction:
         """A thorough estimate, with point maps made afresh from all keyframes where a scene is allowed."""
         estimate = self.estimate_thoroughly(pause)
         pause()
@@ -281,72 +295,76 @@ class IncrementalReconstruction:
         self.clock.lap("points")
         return estimate
 
-    def _remember(self, estimate: Estimate) -> None:
-        self._known = replace(self._known, memory=self._known.memory.remember(self._known.key, estimate))
+    def _remember(self, estimate: Reconstruction) -> None:
+        self._known = replace(self._known, memory=self._known.memory.add_reconstruction(self._known.key, estimate))
 
-    def update(self, pause: Pause = without_pause) -> None:
+    def update(self, pause: Pause = ignore_cancel) -> None:
         """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""
         if not self.grow(pause):
             self.rebuild(pause)
-            self.show(shown(self.begun, self.config))
+            self.show(prepare_scene_for_display(self.initial_scene, self.config))
         for show in self.refine(self.scene, self.config.preview):
             self.show(show)
 
-    def grow(self, pause: Pause = without_pause) -> bool:
+    def grow(self, pause: Pause = ignore_cancel) -> bool:
         """Adds to the shown scene what new keyframes show; False where it has to be begun anew, or given up."""
         estimate, scene = self.estimate_soon(pause), self.scene
         if scene is None or estimate.registration is None or not estimate.verdict.publishable:
             return False
-        beside = warping.beside(scene, estimate.registration, estimate.graph, estimate.verdict.provisional)
-        carried = warping.updated_pointmaps(self._known.pointmaps, beside.registration, beside.graph) if beside else {}
-        moved = beside and warping.warped_scene(beside.scene, self._known.pointmaps, carried, MAX_CAMERA_SHIFT)
+        beside = warping.align_registration(scene, estimate.registration, estimate.graph, estimate.verdict.provisional)
+        carried = warping.update_pointmaps(self._known.pointmaps, beside.registration, beside.graph) if beside else {}
+        moved = beside and warping.warp_scene(beside.scene, self._known.pointmaps, carried, MAX_CAMERA_SHIFT)
         if beside is None or moved is None:
             return False
         graph, placed = beside.graph, beside.registration
-        pointmaps = carried | without_hidden(self._prior.further_pointmaps(graph, placed, carried), graph)
+        pointmaps = carried | apply_image_masks(self._prior.further_pointmaps(graph, placed, carried), graph)
         grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation, self.config.light)
-        self._known = replace(self._known, pointmaps=pointmaps, show=shown(grown, self.config))
+        self._known = replace(self._known, pointmaps=pointmaps, show=prepare_scene_for_display(grown, self.config))
         self.clock.lap("points")
         return True
 
-    def rebuild(self, pause: Pause = without_pause) -> None:
+    def rebuild(self, pause: Pause = ignore_cancel) -> None:
         """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it."""
         estimate = self.estimate_with_depth(pause)
-        begun = begin_scene(estimate, self.config, all_at_hand=False)
+        begun = create_initial_scene(estimate, self.config, all_at_hand=False)
         self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
         self.clock.lap("points")
 
-    def refine(self, scene: Scene | None, steps: refinement.Config, pause: Pause = without_pause) -> Iterator[Shown]:
+    def refine(
+        self, scene: Scene | None, steps: refinement.RefinementConfig, pause: Pause = ignore_cancel
+    ) -> Iterator[SceneWithVerdict]:
         """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet."""
         self.clock.lap("wait")
-        for show in refined(scene, self.config, steps, gone_on=lambda done: pause()):
+        for show in refine_scene(scene, self.config, steps, gone_on=lambda done: pause()):
             self.clock.lap("optimise")
             yield show
             self.clock.lap("wait")
 
-    def show(self, show: Shown) -> None:
+    def show(self, show: SceneWithVerdict) -> None:
         """Makes this what snapshots show."""
         self._known = replace(self._known, show=show)
 
     def release_scene(self) -> None:
         """Gives the memory of all scenes and depth maps back; the photographs, their pairs and the estimate stay."""
-        self._known = replace(self._known, pointmaps={}, begun=None, show=Shown())
+        self._known = replace(self._known, pointmaps={}, begun=None, show=SceneWithVerdict())
 
     def snapshot(self, dropped: Collection[DroppedFrame] | None = None, final: bool = False) -> Snapshot:
-        """What was estimated and is shown. `dropped` are the frames to name as left out; None: those that were dropped.
+        """Makes a snapshot. `dropped` are the frames to name as left out; None: those that were dropped.
 
         Raises RuntimeError where these keyframes have no estimate: one of the steps that estimate comes before.
         """
-        estimate = self.remembered()
+        estimate = self.find_reconstruction()
         if estimate is None:
             raise RuntimeError("a snapshot needs an estimate of the keyframes: call estimate_soon before")
         left_out = self.dropped if dropped is None else dropped
-        show, seconds, bound = self._known.show, self.clock.booked, ()
+        show, seconds, bound = self._known.show, self.clock.stage_seconds, ()
         if final and estimate.verdict.publishable:
-            bound = hits(self.config, self.begun, show.scene, seconds, ended_early=show.verdict is not None)
+            bound = find_budget_hits(
+                self.config, self.initial_scene, show.scene, seconds, ended_early=show.verdict is not None
+            )
         made = snapshot(
-            next(self.numbers), estimate.conclusion, show, self.config,
+            next(self.numbers), estimate.summary, show, self.config,
             seconds=seconds, dropped=left_out, budget=bound, final=final,
         )  # fmt: skip
-        log.info("%s", in_words(made))
+        log.info("%s", format_snapshot(made))
         return made

@@ -13,8 +13,8 @@ from importlib import import_module
 from splatnode.recon.config import PriorChoice
 from splatnode.recon.networks import depth_anything, weight_catalogue
 from splatnode.recon.networks.weight_catalogue import Weights
-from splatnode.recon.networks.weight_download import complaint
-from splatnode.recon.networks.weight_folder import located
+from splatnode.recon.networks.weight_download import find_mismatch
+from splatnode.recon.networks.weight_folder import locate_weights
 from splatnode.recon.optimize.losses import dino
 
 
@@ -29,7 +29,7 @@ class LearnedPart:
 
     @property
     def licence(self) -> str:
-        """Of the weights; empty where the catalogue does not have them."""
+        """Returns the licence of the weights; empty where the catalogue does not have them."""
         known = _catalogue()
         return "; ".join(dict.fromkeys(known[path].licence for path in self.weights if path in known))
 
@@ -41,23 +41,23 @@ OTHERS = (
 )
 
 
-def learned_parts() -> tuple[LearnedPart, ...]:
+def list_learned_parts() -> tuple[LearnedPart, ...]:
     """The priors that have weights, as recon/priors has them, and the networks of other rooms."""
     return (*_priors(), *OTHERS)
 
 
-def obstacle(part: LearnedPart) -> str:
-    """What keeps `part` from being used, and the remedy; empty if nothing does, as far as digests tell."""
+def find_unavailable_reason(part: LearnedPart) -> str:
+    """Returns why `part` is unavailable, and the remedy; empty if it is available, as far as digests tell."""
     if part.package is not None and not importlib.util.find_spec(part.package):
         return f"pip install {part.package}"
     known = _catalogue()
     for path in part.weights:
         if path not in known:
             return f"{path} is not in the catalogue of weights: recon/networks/weight_catalogue.py needs its entry"
-        entry, file = known[path], located(path)
+        entry, file = known[path], locate_weights(path)
         if file is None:
             return f"no weights: splatnode weights fetch {entry.name}" if entry.url else f"no weights: see {entry.name}"
-        if wrong := complaint(entry, file):
+        if wrong := find_mismatch(entry, file):
             return f"{file}: {wrong}; splatnode weights fetch {entry.name}"
     return ""
 

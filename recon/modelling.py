@@ -10,28 +10,28 @@ import numpy.typing as npt
 import torch
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.masks import filled
-from splatnode.recon.budget import Hit
-from splatnode.recon.config import Config
+from splatnode.capture.masks import fill_masked
+from splatnode.recon.budget import BudgetHit
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.estimation import Conclusion, Estimate
+from splatnode.recon.estimation import Reconstruction, ReconstructionSummary
 from splatnode.recon.frames import border
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.torch_threads import single_torch_thread
-from splatnode.recon.optimize.watch import examine, watch
-from splatnode.recon.priors.confirmed import confirmed_depths
+from splatnode.recon.optimize.watch import examine, start_watch
+from splatnode.recon.priors.confirmed import compute_consistent_depths
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.rasterize.device import chosen
-from splatnode.recon.registration.straightened import straightened
-from splatnode.recon.result.consistent_depth import with_consistent_depth
+from splatnode.recon.rasterize.device import choose_device
+from splatnode.recon.registration.straightened import undistort_keyframes
+from splatnode.recon.result.consistent_depth import append_consistent_depth
 from splatnode.recon.result.snapshot import GaussianArrays, InGivenWorld, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import denied, growth, light
-from splatnode.recon.scene.first_look import first_look
-from splatnode.recon.scene.initialisation import initial_scene
+from splatnode.recon.scene.first_look import create_coarse_scene
+from splatnode.recon.scene.initialisation import initialize_scene
 from splatnode.recon.scene.scene import Scene
-from splatnode.recon.scene.told_light import told_logs
+from splatnode.recon.scene.told_light import compute_exposure_priors
 
 COARSE = "Coarse so far: the matched points alone; depth and refinement follow."
 
@@ -42,29 +42,31 @@ _PROCESSOR = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class SceneWithVerdict:
     """A scene as others may see it, and the verdict on its refinement where that replaces the one on the cameras."""
 
     scene: Scene | None = None
     verdict: Verdict | None = None  # DIVERGED, without a scene, or OVERFIT, with the best one before
 
 
-def shown(scene: Scene | None, config: Config) -> Shown:
+def prepare_scene_for_display(scene: Scene | None, config: ReconstructionConfig) -> SceneWithVerdict:
     """The scene with as many Gaussians as there may be."""
-    return Shown(None if scene is None else growth.limited(scene, config.most_gaussians))
+    return SceneWithVerdict(None if scene is None else growth.limit_gaussians(scene, config.most_gaussians))
 
 
 @single_torch_thread()
-def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
+def create_coarse_preview(estimate: Reconstruction, config: ReconstructionConfig) -> SceneWithVerdict | None:
     """A coarse scene as soon as there are cameras, with a verdict that says so; None where no scene is published."""
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
-    scene = first_look(*straightened(estimate.graph, estimate.registration), config.most_gaussians)
-    return Shown(scene, replace(estimate.verdict, message=f"{estimate.verdict.message} {COARSE}"))
+    scene = create_coarse_scene(*undistort_keyframes(estimate.graph, estimate.registration), config.most_gaussians)
+    return SceneWithVerdict(scene, replace(estimate.verdict, message=f"{estimate.verdict.message} {COARSE}"))
 
 
 @single_torch_thread()
-def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) -> Scene | None:
+def create_initial_scene(
+    estimate: Reconstruction, config: ReconstructionConfig, all_at_hand: bool = True
+) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one.
 
     Photographs that were exposed differently are brought to one light first. Of photographs that are all at hand, what
@@ -73,26 +75,29 @@ def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) ->
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
     pointmaps = tuple(estimate.pointmaps.values())
-    keyframes = straightened(estimate.graph, estimate.registration)[0].keyframes
+    keyframes = undistort_keyframes(estimate.graph, estimate.registration)[0].keyframes
     images = {keyframe.name: keyframe.image for keyframe in keyframes}
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
-    told = told_logs(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
-    exposures, headroom = light.with_headroom(images, light.differing(pointmaps, images, config.light, told))
-    images = light.in_one_light(images, exposures)
-    seen_through = _seen_through(pointmaps, images, masks, config) if all_at_hand else {}
+    told = compute_exposure_priors(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
+    exposures, headroom = light.apply_headroom(images, light.estimate_exposures(pointmaps, images, config.light, told))
+    images = light.compensate_images(images, exposures)
+    seen_through = _find_transient_masks(pointmaps, images, masks, config) if all_at_hand else {}
     for name, hidden in seen_through.items():
         free, own = ~hidden, masks[name]
         masks[name] = free if own is None else free & own
-        images[name] = filled(images[name], free)
-    scene = initial_scene(pointmaps, images, config.initialisation, masks, exposures, lenses)
+        images[name] = fill_masked(images[name], free)
+    scene = initialize_scene(pointmaps, images, config.initialisation, masks, exposures, lenses)
     shares = {name: float(hidden.mean()) for name, hidden in seen_through.items()}
     views = tuple(replace(view, moved=shares.get(view.name, 0.0)) for view in scene.views)
     return replace(scene, views=views, headroom=headroom)
 
 
-def _seen_through(
-    pointmaps: Sequence[Pointmap], images: Mapping[str, Image], masks: Mapping[str, Mask | None], config: Config
+def _find_transient_masks(
+    pointmaps: Sequence[Pointmap],
+    images: Mapping[str, Image],
+    masks: Mapping[str, Mask | None],
+    config: ReconstructionConfig,
 ) -> dict[str, Mask]:
     """For each photograph that shows what others see through: the mask (h, w), True there, that no other mask hides."""
     if not config.denied.enabled:
@@ -102,17 +107,17 @@ def _seen_through(
     for pointmap, rim in zip(pointmaps, border.valid_masks(pictures), strict=True):
         mask = masks[pointmap.name]
         used.append(rim if mask is None else rim & mask)
-    found = zip(pointmaps, denied.denied(pointmaps, pictures, used), used, strict=True)
+    found = zip(pointmaps, denied.find_transient_masks(pointmaps, pictures, used), used, strict=True)
     return {pointmap.name: hidden & own for pointmap, hidden, own in found if hidden is not None}
 
 
-def refined(
+def refine_scene(
     scene: Scene | None,
-    config: Config,
-    steps: refinement.Config,
+    config: ReconstructionConfig,
+    steps: refinement.RefinementConfig,
     deadline: float | None = None,
     gone_on: Callable[[int], None] = lambda done: None,
-) -> Iterator[Shown]:
+) -> Iterator[SceneWithVerdict]:
     """The scene, if there is one, at each checkpoint of its refinement and at its end.
 
     Where it diverges or overfits it ends with a verdict, and with the best scene so far if that is publishable.
@@ -121,8 +126,8 @@ def refined(
     """
     if scene is None:
         return
-    scene = scene.on(chosen(config.device))
-    watching = watch(scene, steps.iterations)
+    scene = scene.move_to_device(choose_device(config.device))
+    watching = start_watch(scene, steps.iterations)
     limit = config.most_gaussians
     give_back_memory()
     work = refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit, gone_on=gone_on)
@@ -134,24 +139,28 @@ def refined(
         if later.losses or looked_at:
             watching, verdict = examine(watching, later)
         if verdict is not None:
-            best = shown(watching.best.on(_PROCESSOR), config).scene if verdict.publishable else None
-            yield Shown(best, verdict)
+            best = (
+                prepare_scene_for_display(watching.best.move_to_device(_PROCESSOR), config).scene
+                if verdict.publishable
+                else None
+            )
+            yield SceneWithVerdict(best, verdict)
             return
-        yield shown(later.on(_PROCESSOR), config)
+        yield prepare_scene_for_display(later.move_to_device(_PROCESSOR), config)
 
 
 def snapshot(
     sequence: int,
-    conclusion: Conclusion,
-    show: Shown,
-    config: Config,
+    conclusion: ReconstructionSummary,
+    show: SceneWithVerdict,
+    config: ReconstructionConfig,
     *,
     seconds: Mapping[str, float],
     dropped: Collection[DroppedFrame] = (),
-    budget: Collection[Hit] = (),
+    budget: Collection[BudgetHit] = (),
     final: bool = False,
 ) -> Snapshot:
-    """What is known of the cameras, and the scene, now; `seconds` by stage. Only a publishable verdict has a scene.
+    """Makes a snapshot of cameras and scene; `seconds` by stage. Only a publishable verdict has a scene.
 
     The verdict says how many of the scene's pixels have multi-view consistent depth.
     """
@@ -172,18 +181,18 @@ def snapshot(
         final=final,
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
-        given=_in_given_world(conclusion) if scene and final else None,
+        given=_find_given_world(conclusion) if scene and final else None,
         landmarks=conclusion.landmarks if scene and final else None,
-        depths=_confirmed(scene) if scene and final else {},
+        depths=_find_consistent_depths(scene) if scene and final else {},
         masked=conclusion.masked,
         moving=_moving(conclusion, scene),
         gains=scene.gains() if scene else {},
         falloffs=_falloffs(scene) if scene else {},
     )
-    return replace(made, verdict=with_consistent_depth(verdict, made.consistent_depth, config.consistent_depth))
+    return replace(made, verdict=append_consistent_depth(verdict, made.consistent_depth, config.consistent_depth))
 
 
-def _in_given_world(conclusion: Conclusion) -> InGivenWorld | None:
+def _find_given_world(conclusion: ReconstructionSummary) -> InGivenWorld | None:
     given = conclusion.given
     if given is None:
         return None
@@ -191,13 +200,13 @@ def _in_given_world(conclusion: Conclusion) -> InGivenWorld | None:
 
 
 def _falloffs(scene: Scene) -> dict[str, float]:
-    """By photograph whose lens's vignetting was taken out: its falloff."""
+    """Returns the falloff of each image whose vignetting was taken out, by name."""
     lit = {view.name: view.exposure for view in scene.views if view.exposure is not None}
     return {name: exposure.falloff for name, exposure in lit.items() if exposure.falloff}
 
 
-def _moving(conclusion: Conclusion, scene: Scene | None) -> dict[str, float]:
-    """By photograph the share that was left out of matching, or of the scene, because it moved."""
+def _moving(conclusion: ReconstructionSummary, scene: Scene | None) -> dict[str, float]:
+    """Returns the share of each image that was left out of matching, or of the scene, because it moved."""
     shares = dict(conclusion.moving)
     for view in scene.views if scene else ():
         if view.moved:
@@ -205,12 +214,12 @@ def _moving(conclusion: Conclusion, scene: Scene | None) -> dict[str, float]:
     return shares
 
 
-def _confirmed(scene: Scene) -> dict[str, npt.NDArray[np.float16]]:
-    """By view the depths that another one confirms; it takes less than a tenth of a second a view."""
-    return confirmed_depths([view.pointmap for view in scene.views if view.pointmap is not None])
+def _find_consistent_depths(scene: Scene) -> dict[str, npt.NDArray[np.float16]]:
+    """Returns the multi-view consistent depths of each view; it takes below 0.1 s a view."""
+    return compute_consistent_depths([view.pointmap for view in scene.views if view.pointmap is not None])
 
 
-def with_landmarks(made: Snapshot, estimate: Estimate | None) -> Snapshot:
+def add_landmarks(made: Snapshot, estimate: Reconstruction | None) -> Snapshot:
     """The snapshot of a scene that grew, to be saved: with the landmarks of `estimate` in the world of its cameras.
 
     Without landmarks where the estimate is not known any more, or has fewer than two of the cameras.
@@ -223,10 +232,10 @@ def with_landmarks(made: Snapshot, estimate: Estimate | None) -> Snapshot:
     if len(common) < 2:
         return made
     by = align_cameras(landmarks.Ts_world_camera[common], np.stack([Ts_shown[landmarks.names[i]] for i in common]))
-    return replace(made, landmarks=landmarks.moved(by.scale, by.rotation, by.translation))
+    return replace(made, landmarks=landmarks.transform(by.scale, by.rotation, by.translation))
 
 
-def in_words(made: Snapshot) -> str:
+def format_snapshot(made: Snapshot) -> str:
     """The verdict and what there is of a scene, in a line of a log."""
     seconds = f"after {made.seconds['total']:.1f} s"
     if not made.cameras:

@@ -12,21 +12,21 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.progress import Tell, told_to_nobody
+from splatnode.capture.process.progress import Tell, ignore_progress
 from splatnode.recon import threads
-from splatnode.recon.config import Config
-from splatnode.recon.metric.evidence import NOTHING, Evidence, gathered
-from splatnode.recon.metric.metres import in_metres
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
+from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.replay_source import IMAGES, Source
-from splatnode.recon.result.only_seen import only_seen
+from splatnode.recon.result.only_seen import remove_unconfirmed
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.write import write_result_folder
 
 
 @dataclass(frozen=True, eq=False)
-class Reconstructed:
-    """What came of photographs, and what its report tells of how it was made."""
+class OfflineResult:
+    """The result of an offline reconstruction, with what its report says of how it was made."""
 
     snapshot: Snapshot
     source: Source  # without its frames where a folder has them
@@ -40,13 +40,15 @@ class Reconstructed:
         """
         files = self.source.files() if self.snapshot.verdict.publishable else {}
         lie_in = self.source.photographs or (out / IMAGES if files else None)
-        told: dict[str, object] = {"photographs": None if lie_in is None else _in_json(lie_in.resolve())}
+        told: dict[str, object] = {"photographs": None if lie_in is None else _encode_path(lie_in.resolve())}
         if self.source.choice is not None:
             told["selection"] = self.source.choice.record()
-        return finish(self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, told=told)
+        return write_result_folder(
+            self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, told=told
+        )
 
 
-def _in_json(folder: Path) -> str | None:
+def _encode_path(folder: Path) -> str | None:
     """The folder's path; None where it is no text, as Linux allows, which no JSON file can hold."""
     try:
         return folder.as_posix().encode().decode()
@@ -54,21 +56,21 @@ def _in_json(folder: Path) -> str | None:
         return None
 
 
-def shown_to_nobody(_: Snapshot) -> None:
-    """What is done with a snapshot where nobody watches."""
+def ignore_snapshot(_: Snapshot) -> None:
+    """Ignores a snapshot: nobody watches."""
 
 
-def reconstructed(
+def reconstruct_source(
     source: Source,
-    config: Config,
+    config: ReconstructionConfig,
     preset_name: str,
     without_guesses: bool = False,
     most_threads: int | None = None,
     given: Evidence = NOTHING,
     *,
-    show: Callable[[Snapshot], None] = shown_to_nobody,
-    tell: Tell = told_to_nobody,
-) -> Reconstructed:
+    show: Callable[[Snapshot], None] = ignore_snapshot,
+    tell: Tell = ignore_progress,
+) -> OfflineResult:
     """The final snapshot of what `source` gives, in metres where `config` knows how.
 
     `given` is what is known of metres beside the photographs. `without_guesses` leaves out what no two photographs
@@ -76,20 +78,20 @@ def reconstructed(
     most; None: as many as the process may use.
     Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
     """
-    with threads.at_most(most_threads):
-        evidence = given.and_also(gathered(source.frames, config.metric, tell))
-        snapshot = in_metres(run(source.frames, config, show, tell), config.metric, evidence)
+    with threads.apply_thread_limit(most_threads):
+        evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
+        snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)
     if without_guesses:
-        snapshot = only_seen(snapshot)
+        snapshot = remove_unconfirmed(snapshot)
     kept = source if source.photographs is None else replace(source, frames=())
-    return Reconstructed(snapshot, kept, config.seed, preset_name)
+    return OfflineResult(snapshot, kept, config.seed, preset_name)
 
 
 def run(
     frames: Iterable[Frame | DroppedFrame],
-    config: Config,
-    show: Callable[[Snapshot], None] = shown_to_nobody,
-    tell: Tell = told_to_nobody,
+    config: ReconstructionConfig,
+    show: Callable[[Snapshot], None] = ignore_snapshot,
+    tell: Tell = ignore_progress,
 ) -> Snapshot:
     """The final snapshot; every one is given to `show`, and what is being done to `tell`."""
     snapshot = None
@@ -100,7 +102,7 @@ def run(
     return snapshot
 
 
-def check_baseline(config: Config, source: Source) -> None:
+def check_baseline(config: ReconstructionConfig, source: Source) -> None:
     """Raises ValueError before the work where a measured distance names a photograph that is not used."""
     names = [frame.name for frame in source.frames]
     missing = [name for baseline in config.metric.baselines for name in baseline[:2] if name not in names]
@@ -116,7 +118,7 @@ def check_baseline(config: Config, source: Source) -> None:
         )
 
 
-def with_looks(config: Config, every: int) -> Config:
+def set_preview_interval(config: ReconstructionConfig, every: int) -> ReconstructionConfig:
     """The same reconstruction, with a snapshot to look at `every` so many iterations."""
     looks = tuple(range(every, config.optimize.iterations, every))
     return msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, looks=looks))

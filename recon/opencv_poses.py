@@ -104,7 +104,7 @@ def estimate_relative_pose(
     for state in range(_ATTEMPTS):
         pose, inliers = _five_point(rays1, rays2, limit, state)
         if inliers.any():
-            (pose, _), _ = _polished(pose, 1.0, rays1[inliers], rays2[inliers], limit, free_focal=False)
+            (pose, _), _ = _refine_pose(pose, 1.0, rays1[inliers], rays2[inliers], limit, free_focal=False)
         found = np.minimum(_errors_in_front(pose, rays1, rays2) / limit, 1)
         if (cost := float((found**2).sum())) < least:
             best, least = (pose, found < 1), cost
@@ -129,7 +129,7 @@ def estimate_shared_focal_relative_pose(
         start, inliers = _five_point(centred1 / focal, centred2 / focal, limit / focal)
         if not inliers.any():
             continue
-        found, cost = _polished(start, focal, centred1[some], centred2[some], limit, free_focal=True)
+        found, cost = _refine_pose(start, focal, centred1[some], centred2[some], limit, free_focal=True)
         if cost < least:
             best, least = found, cost
     pose, focal = best
@@ -137,23 +137,23 @@ def estimate_shared_focal_relative_pose(
     return ImagePair(pose, _SharedCamera(focal)), {"inliers": inliers.tolist()}
 
 
-def _polished(
+def _refine_pose(
     start: Pose, focal: float, pixels1: Array, pixels2: Array, limit: float, *, free_focal: bool
 ) -> tuple[tuple[Pose, float], float]:
     """Pose and focal length that minimise the Sampson errors of pixels (M, 2), cut off softly, and that minimum."""
 
-    def moved(parameters: Array) -> tuple[Pose, float]:
+    def apply_step(parameters: Array) -> tuple[Pose, float]:
         turn = np.asarray(cv2.Rodrigues(parameters[:3])[0], np.float64)
         direction = start.t + parameters[3:6]
         length = focal * float(np.exp(parameters[6])) if free_focal else focal
         return Pose(turn @ start.R, direction / np.linalg.norm(direction)), length
 
     def errors(parameters: Array) -> Array:
-        pose, length = moved(parameters)
+        pose, length = apply_step(parameters)
         return _sampson(pose, pixels1 / length, pixels2 / length) * length / limit
 
     found = least_squares(errors, np.zeros(7 if free_focal else 6), loss="soft_l1", max_nfev=_MAX_STEPS)
-    return moved(found.x), float(found.cost)
+    return apply_step(found.x), float(found.cost)
 
 
 def _starts(centred1: Array, centred2: Array, focals: Array) -> Array:

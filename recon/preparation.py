@@ -9,13 +9,13 @@ from dataclasses import replace
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.recon.config import Config
-from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, modelled_image
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.priors.prior import Prior
-from splatnode.recon.rasterize.device import chosen, in_words
+from splatnode.recon.rasterize.device import choose_device, format_device
 
 log = logging.getLogger(__name__)
 
@@ -24,25 +24,25 @@ class UnusableFrame(ValueError):
     """One frame that cannot become a keyframe; the text names it and says why."""
 
 
-def load_prior(config: Config) -> Prior:
+def load_prior(config: ReconstructionConfig) -> Prior:
     """The prior that the configuration names. Raises ValueError or FileNotFoundError where it lacks its weights."""
     return config.prior.module.load(msgspec.structs.replace(config.prior.config, seed=config.seed))
 
 
-def check_device(config: Config) -> None:
+def check_device(config: ReconstructionConfig) -> None:
     """Before the work begins: raises DeviceUnavailable; the log tells the device where it was left open."""
-    device = chosen(config.device)
+    device = choose_device(config.device)
     if config.device != "cpu":
-        log.info("%s", in_words(config.device, device))
+        log.info("%s", format_device(config.device, device))
 
 
-def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyframe:
+def prepare(frame: Frame, config: ReconstructionConfig, found: Features | None = None) -> Keyframe:
     """The frame without distortion, with its image at modelled size and its features, unless these are known.
 
     No other frame is needed. Raises UnusableFrame where the given intrinsics cannot be used, or a library fails.
     """
     try:
-        straight = undistorted(frame)
+        straight = undistort_frame(frame)
     except ValueError as error:  # it names the frame
         raise UnusableFrame(str(error)) from error
     except LIBRARY_ERRORS as error:
@@ -50,14 +50,14 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
         raise UnusableFrame(f"{frame.name}: its distortion cannot be taken out: {error}") from error
     frame = replace(straight, encoded=None)  # recordings alone want the file as it came
     try:
-        found = found or features.used(features.extract(frame.image, config.matching.features), frame.mask)
-        return Keyframe(frame, modelled_image(frame.image, config.size), found)
+        found = found or features.apply_mask(features.extract(frame.image, config.matching.features), frame.mask)
+        return Keyframe(frame, resize_image(frame.image, config.size), found)
     except LIBRARY_ERRORS as error:
         raise_shortage(error)
         raise UnusableFrame(f"{frame.name}: no features can be found in it: {error}") from error
 
 
-def prepare_all(frames: Iterable[Frame], config: Config) -> tuple[list[Keyframe], list[DroppedFrame]]:
+def prepare_all(frames: Iterable[Frame], config: ReconstructionConfig) -> tuple[list[Keyframe], list[DroppedFrame]]:
     """The keyframes of all frames that can become one, and the others with the reason, which the log tells too.
 
     Raises UnusableFrame, of the first frame, where none of them can: then what they have in common is to blame.

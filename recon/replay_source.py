@@ -20,15 +20,15 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.choosing import THINNED, Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_lens import Lenses, describe_image
-from splatnode.capture.given_pose import given_pose
+from splatnode.capture.given_pose import make_given_pose
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lerobot import data_set
-from splatnode.capture.masks import Find, all_masked, in_files
-from splatnode.capture.process.printable import printable_name
-from splatnode.capture.process.progress import Tell, counted, told_to_nobody
+from splatnode.capture.masks import Find, mask_frames, open_masks
+from splatnode.capture.process.printable import sanitize_name
+from splatnode.capture.process.progress import Tell, ignore_progress, report_items
 from splatnode.capture.quality import Limits
 from splatnode.capture.selection import Config
-from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
 Array = npt.NDArray[np.float64]
 
@@ -42,7 +42,7 @@ _OF_PHOTOGRAPHS = Config(per_second=1e9, patience_s=0.0)  # which were not taken
 
 @dataclass(frozen=True)
 class Request:
-    """What is to be reconstructed."""
+    """A request for a reconstruction: which images, masks and lens."""
 
     source: Path  # a folder, or a film
     listed: tuple[str, ...] = ()  # the photographs of the folder that were named; none: all
@@ -78,7 +78,7 @@ class Source:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class ReplayRecording:
     """All keyframes of a recording, which are read again when they are needed."""
 
     path: Path
@@ -111,10 +111,10 @@ class Recording:
         chosen = (each for each in streamed if isinstance(each, DroppedFrame) or each.name in names)
         if self.lenses is not None:
             chosen = map(self.lenses.apply, chosen)
-        return chosen if self.masks is None else all_masked(chosen, in_files(self.masks))
+        return chosen if self.masks is None else mask_frames(chosen, open_masks(self.masks))
 
 
-def asked_for(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
+def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
     """The folder or the video that the command line names, and the photographs of that folder; none of these: all.
 
     Raises ValueError where several are named that are not photographs of one folder.
@@ -132,78 +132,78 @@ def asked_for(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
     return first.parent, tuple(folder.frame_name(path) for path in paths)
 
 
-def at_hand(
-    frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = told_to_nobody
+def select_frames(
+    frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = ignore_progress
 ) -> Source:
     """Photographs that lie in no folder, or what is used of them: as of a folder's. Raises ValueError as `source`."""
     if views:
-        return Source(tuple(frames[i] for i in _spread(views, len(frames))), None, None)
+        return Source(tuple(frames[i] for i in _select_evenly(views, len(frames))), None, None)
     if every_frame or len(frames) <= ALL:
         return Source(tuple(frames), None, None)
-    looked_through = counted(frames, tell, "choosing keyframes", len(frames), "photograph")
+    looked_through = report_items(frames, tell, "choosing keyframes", len(frames), "photograph")
     choice = choose(looked_through, _OF_PHOTOGRAPHS, Limits(), MOST, "photograph")
     return Source((*choice.keyframes, *choice.dropped), None, choice)
 
 
-def recording(request: Request, tell: Tell = told_to_nobody) -> Recording:
+def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayRecording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(request.source)
     images: set[tuple[str, str, int, int]] = set()
-    looked_through = _noted(_looked_through(request, tell), images)
-    choice = choose(looked_through, _selection(request), Limits(), None, _what(request))
+    looked_through = _record_sizes(_stream_candidates(request, tell), images)
+    choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request))
     if request.lenses is not None:
         request.lenses.check(images)
-    return Recording(request.source, request.listed, choice, request.masks, request.lenses)
+    return ReplayRecording(request.source, request.listed, choice, request.masks, request.lenses)
 
 
-def source(request: Request, tell: Tell = told_to_nobody) -> Source:
+def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
     """The frames that are asked for; `tell` hears how far the reading is.
 
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
     _check_there(request.source)
-    found = _unmasked(request, tell)
+    found = _load_unmasked(request, tell)
     if request.lenses is not None:
-        found = with_lenses(found, request.lenses)
-    return found if request.masks is None else with_masks(found, in_files(request.masks), tell)
+        found = apply_lenses(found, request.lenses)
+    return found if request.masks is None else apply_masks(found, open_masks(request.masks), tell)
 
 
-def with_lenses(given: Source, lenses: Lenses) -> Source:
+def apply_lenses(given: Source, lenses: Lenses) -> Source:
     """Returns the frames, each with its lens. Raises ValueError where a lens is of none of them."""
     lenses.check(describe_image(each) for each in given.frames if isinstance(each, Frame))
     return replace(given, frames=tuple(map(lenses.apply, given.frames)))
 
 
-def with_poses(given: Source, poses: Mapping[str, Array], sigma_m: float, sigma_deg: float) -> Source:
+def add_poses(given: Source, poses: Mapping[str, Array], sigma_m: float, sigma_deg: float) -> Source:
     """The frames, each with its pose of `poses` (4, 4), metres, by their names, and its sigmas. Raises ValueError."""
 
-    def posed(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
+    def add_pose(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
         if not isinstance(frame, Frame) or frame.name not in poses:
             return frame
         try:
-            return replace(frame, given_pose=given_pose(poses[frame.name], sigma_m, sigma_deg))
+            return replace(frame, given_pose=make_given_pose(poses[frame.name], sigma_m, sigma_deg))
         except ValueError as error:
-            raise ValueError(f"{printable_name(frame.name)}: {error}") from error
+            raise ValueError(f"{sanitize_name(frame.name)}: {error}") from error
 
-    return replace(given, frames=tuple(map(posed, given.frames)))
+    return replace(given, frames=tuple(map(add_pose, given.frames)))
 
 
-def with_masks(given: Source, find: Find, tell: Tell = told_to_nobody) -> Source:
+def apply_masks(given: Source, find: Find, tell: Tell = ignore_progress) -> Source:
     """The frames, each with the mask that is found for it. Raises UnusableMask where one cannot be its mask."""
-    return replace(given, frames=tuple(all_masked(given.frames, find, tell)))
+    return replace(given, frames=tuple(mask_frames(given.frames, find, tell)))
 
 
-def _unmasked(request: Request, tell: Tell) -> Source:
+def _load_unmasked(request: Request, tell: Tell) -> Source:
     if film.is_film(request.source):
         if request.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
-        return _chosen(request, None, tell)
-    names, there = _names(request), _there(request)
-    if names or request.every_frame or len(_readable(there)) <= ALL:
+        return _select_keyframes(request, None, tell)
+    names, there = _names(request), _list_photographs(request)
+    if names or request.every_frame or len(_skip_raw_files(there)) <= ALL:
         frames = folder.stream(folder.Config(folder=request.source, names=names or request.listed))
         of = len(names or there)
-        return Source(tuple(counted(frames, tell, "reading", of, "photograph")), request.source, None)
-    return _chosen(request, request.source, tell)
+        return Source(tuple(report_items(frames, tell, "reading", of, "photograph")), request.source, None)
+    return _select_keyframes(request, request.source, tell)
 
 
 def _check_there(path: Path) -> None:
@@ -214,21 +214,21 @@ def _check_there(path: Path) -> None:
             f"{str(path)!r} is not there; give a folder that holds photographs, a video, or an MCAP file"
         )
     if path.is_dir() and data_set.is_data_set(path):
-        first = data_set.parts(path)[0]
+        first = data_set.list_parts(path)[0]
         raise ValueError(
             f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
             f"{str(film.part_of(path, first))!r}, or give it to `splatnode batch`, which takes them all"
         )
 
 
-def _there(request: Request) -> Sequence[str]:
+def _list_photographs(request: Request) -> Sequence[str]:
     """The names of the photographs that there are to choose from."""
     return request.listed or folder.names_in(request.source)
 
 
-def _readable(names: Sequence[str]) -> Sequence[str]:
+def _skip_raw_files(names: Sequence[str]) -> Sequence[str]:
     """Without raw files, beside which their cameras put photographs; all where there is nothing else."""
-    return [name for name in names if folder.foreign_file(Path(name)) is None] or names
+    return [name for name in names if folder.explain_unreadable_file(Path(name)) is None] or names
 
 
 def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFrame]:
@@ -237,14 +237,14 @@ def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFram
     return folder.stream(folder.Config(folder=path, names=listed))
 
 
-def _looked_through(request: Request, tell: Tell) -> Iterator[Frame | DroppedFrame]:
+def _stream_candidates(request: Request, tell: Tell) -> Iterator[Frame | DroppedFrame]:
     """All that there is to choose from; how many frames a video has is known at its end."""
-    of = 0 if film.is_film(request.source) else len(_there(request))
-    doing = f"choosing keyframes of {printable_name(request.source.name)}"
-    return counted(_stream(request.source, request.listed), tell, doing, of, _what(request))
+    of = 0 if film.is_film(request.source) else len(_list_photographs(request))
+    doing = f"choosing keyframes of {sanitize_name(request.source.name)}"
+    return report_items(_stream(request.source, request.listed), tell, doing, of, _unit_name(request))
 
 
-def _noted(
+def _record_sizes(
     frames: Iterator[Frame | DroppedFrame], images: set[tuple[str, str, int, int]]
 ) -> Iterator[Frame | DroppedFrame]:
     """The frames, whose names, cameras and sizes are added to `images` as they pass."""
@@ -254,7 +254,7 @@ def _noted(
         yield each
 
 
-def _what(request: Request) -> str:
+def _unit_name(request: Request) -> str:
     """One of those that keyframes are chosen of."""
     return "frame" if film.is_film(request.source) else "photograph"
 
@@ -264,41 +264,41 @@ def _selection(request: Request) -> Config:
     return msgspec.structs.replace(config, every_frame=request.every_frame)
 
 
-def _chosen(request: Request, photographs: Path | None, tell: Tell) -> Source:
+def _select_keyframes(request: Request, photographs: Path | None, tell: Tell) -> Source:
     """The keyframes of a recording; with --views N so many, evenly spread: thinning leaves half of the most."""
     most = EVERY if request.every_frame else max(MOST, 2 * (request.views or 0))
-    choice = choose(_looked_through(request, tell), _selection(request), Limits(), most, _what(request))
+    choice = choose(_stream_candidates(request, tell), _selection(request), Limits(), most, _unit_name(request))
     frames = choice.keyframes
     if request.every_frame and THINNED in choice.left_out:
         raise ValueError(
-            f"{printable_name(request.source.name)!r} has more than {EVERY} frames that are sharp and no copies, which "
+            f"{sanitize_name(request.source.name)!r} has more than {EVERY} frames that are sharp and no copies, which "
             "is more than one scene takes. Leave --every-frame out to use keyframes, or add --map for a map of all"
         )
     if request.views:
         if request.views > len(frames):
             raise ValueError(f"{request.views} views are asked for: {choice}; ask for at most as many")
-        frames = tuple(frames[i] for i in _evenly(len(frames), request.views))
+        frames = tuple(frames[i] for i in _space_evenly(len(frames), request.views))
     return Source((*frames, *choice.dropped), photographs, choice)
 
 
 def _names(request: Request) -> tuple[str, ...]:
-    """Of the photographs to use; none means all."""
+    """Returns the names of the images to use; none means all."""
     if request.frames and request.listed:
         raise ValueError("--frames names photographs of a folder; here they are listed already, so leave it out")
     if request.frames:
         return request.frames
     if not request.views:
         return ()
-    names = _readable(_there(request))
-    return tuple(names[i] for i in _spread(request.views, len(names)))
+    names = _skip_raw_files(_list_photographs(request))
+    return tuple(names[i] for i in _select_evenly(request.views, len(names)))
 
 
-def _spread(views: int, count: int) -> list[int]:
+def _select_evenly(views: int, count: int) -> list[int]:
     """So many of `count` photographs. Raises ValueError where there are fewer."""
     if views > count:
         raise ValueError(f"{views} views are asked for: there are {count} photographs; ask for at most as many")
-    return _evenly(count, views)
+    return _space_evenly(count, views)
 
 
-def _evenly(count: int, wanted: int) -> list[int]:
+def _space_evenly(count: int, wanted: int) -> list[int]:
     return np.linspace(0, count - 1, wanted).round().astype(int).tolist()

@@ -9,9 +9,9 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.process.arguments import add_json, megabytes, names, natural, percent, positive, seconds
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 from splatnode.recon.metric.arguments import add_baseline, add_marker, add_poses, add_stereo
-from splatnode.recon.shared_arguments import add_device, add_only_seen
+from splatnode.recon.shared_arguments import add_device, add_multi_view_only
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +26,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "30 photographs, keyframes are chosen as a live camera's are",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
-    add_way(parser)
+    add_reconstruction_options(parser)
     add_baseline(parser)
     add_poses(parser)
     add_stereo(parser)
@@ -41,7 +41,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
-    add_choice(chosen)
+    add_selection_options(chosen)
     chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these photographs, by name")
     parser.add_argument(
         "--map",
@@ -51,7 +51,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
+def add_reconstruction_options(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
     """The options that say how any photographs are reconstructed, whatever they show."""
     add = parser.add_argument
     return (
@@ -83,11 +83,11 @@ def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
         add("--max-gaussians", type=positive, metavar="N", help="the best scene with at most so many Gaussians"),
         add("--max-mb", type=megabytes, metavar="MB", help="the best scene of at most so many 10^6 bytes"),
         add("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)"),
-        add_only_seen(parser),
+        add_multi_view_only(parser),
     )
 
 
-def add_choice(group: argparse._MutuallyExclusiveGroup) -> tuple[argparse.Action, ...]:
+def add_selection_options(group: argparse._MutuallyExclusiveGroup) -> tuple[argparse.Action, ...]:
     """The options that say how many of a recording's photographs are used, whatever their names."""
     return (
         group.add_argument(
@@ -115,5 +115,5 @@ REPLAY = Verb(
     "replay",
     "reconstruct a folder of photographs, or a video",
     _arguments,
-    lazily("splatnode.recon.cli", "replay"),
+    import_lazily("splatnode.recon.cli", "replay"),
 )

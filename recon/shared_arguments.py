@@ -13,7 +13,7 @@ def add_device(parser: argparse.ArgumentParser) -> argparse.Action:
     )
 
 
-def add_only_seen(parser: argparse.ArgumentParser) -> argparse.Action:
+def add_multi_view_only(parser: argparse.ArgumentParser) -> argparse.Action:
     return parser.add_argument(
         "--only-seen",
         action="store_true",

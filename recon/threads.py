@@ -15,15 +15,15 @@ from splatnode.recon import core
 
 
 @contextmanager
-def at_most(threads: int | None) -> Iterator[None]:
+def apply_thread_limit(threads: int | None) -> Iterator[None]:
     """Inside the block this thread's work takes at most so many threads; None: as many as before.
 
     The work of other threads goes on as it did. Raises ValueError below 1.
     """
-    with core.at_most(threads):
+    with core.apply_thread_limit(threads):
         before = torch.get_num_threads()  # to be asked first: the first question in a thread sets it anew
         if threads is not None:
-            torch.set_num_threads(core.allowed_threads())
+            torch.set_num_threads(core.num_usable_threads())
         try:
             yield
         finally:

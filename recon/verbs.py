@@ -19,12 +19,12 @@ from splatnode.capture.process.arguments import (
     natural,
     positive,
 )
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 from splatnode.recon.batch.verb import BATCH
 from splatnode.recon.evaluate.verbs import BENCH, STABILITY
 from splatnode.recon.metric.arguments import add_marker
 from splatnode.recon.replay_verb import REPLAY
-from splatnode.recon.shared_arguments import add_device, add_only_seen
+from splatnode.recon.shared_arguments import add_device, add_multi_view_only
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
 EXPORT_FORMATS = tuple(
@@ -60,7 +60,7 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
     parser.add_argument("--to", required=True, choices=EXPORT_FORMATS, help="the format")
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
-    add_only_seen(parser)
+    add_multi_view_only(parser)
     parser.add_argument(
         "--no-background",
         action="store_true",
@@ -143,50 +143,63 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("splatnode.recon.cli", "demo")),
+    Verb("demo", "reconstruct the built-in capture", _demo_arguments, import_lazily("splatnode.recon.cli", "demo")),
     REPLAY,
     BATCH,
     Verb(
         "export",
         "write a scene in another format",
         _export_arguments,
-        lazily("splatnode.recon.result.export.command", "export"),
+        import_lazily("splatnode.recon.result.export.command", "export"),
     ),
     Verb(
         "locate",
         "tell where further photographs of a scene were taken",
         _locate_arguments,
-        lazily("splatnode.recon.locating.command", "locate"),
+        import_lazily("splatnode.recon.locating.command", "locate"),
     ),
     Verb(
         "audit",
         "tell which camera of a station moved, when and by how much",
         _audit_arguments,
-        lazily("splatnode.recon.auditing.command", "audit"),
+        import_lazily("splatnode.recon.auditing.command", "audit"),
     ),
     Verb(
         "map",
         "tell which space of a scene is free, occupied, or not seen",
         _map_arguments,
-        lazily("splatnode.recon.occupancy.command", "map_result"),
+        import_lazily("splatnode.recon.occupancy.command", "map_result"),
     ),
     Verb(
         "merge",
         "make one scene of the scenes of a long walk",
         _merge_arguments,
-        lazily("splatnode.recon.merging.command", "merge"),
+        import_lazily("splatnode.recon.merging.command", "merge"),
     ),
     Verb(
-        "recon", "reconstruct what comes, for ever", _recon_arguments, lazily("splatnode.recon.daemon.daemon", "recon")
+        "recon",
+        "reconstruct what comes, for ever",
+        _recon_arguments,
+        import_lazily("splatnode.recon.daemon.daemon", "recon"),
     ),
-    Verb("retract", "take a keyframe back", _retract_arguments, lazily("splatnode.recon.daemon.control", "retract")),
+    Verb(
+        "retract",
+        "take a keyframe back",
+        _retract_arguments,
+        import_lazily("splatnode.recon.daemon.control", "retract"),
+    ),
     BENCH,
     STABILITY,
     Verb(
         "weights",
         "get and check the weights of optional networks",
         _weights_arguments,
-        lazily("splatnode.recon.networks.weights_command", "command"),
+        import_lazily("splatnode.recon.networks.weights_command", "command"),
     ),
-    Verb("doctor", "tell what is installed and what is missing", add_json, lazily("splatnode.recon.doctor", "doctor")),
+    Verb(
+        "doctor",
+        "tell what is installed and what is missing",
+        add_json,
+        import_lazily("splatnode.recon.doctor", "doctor"),
+    ),
 )

@@ -15,8 +15,8 @@ from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process import python
-from splatnode.recon.result.depth_message import depth_header
-from splatnode.recon.result.message import to_message
+from splatnode.recon.result.depth_message import make_depth_header
+from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import Snapshot
 
 Show = Callable[[Snapshot], None]
@@ -36,7 +36,7 @@ def viewer(pictures: Path, command: Sequence[str] | None = None) -> Iterator[Sho
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         config = Path(folder, "node.yaml")
         config.write_text(json.dumps({"network": {"directory": folder}}))  # YAML, whatever the folder's name is
-        with _Stage(Network(directory=Path(folder))) as stage:
+        with _SnapshotServer(Network(directory=Path(folder))) as stage:
             child = subprocess.Popen([*begin, str(config), "--until-final", "--out", str(pictures)])
             try:
                 yield stage.show
@@ -46,7 +46,7 @@ def viewer(pictures: Path, command: Sequence[str] | None = None) -> Iterator[Sho
                 child.wait()
 
 
-class _Stage:
+class _SnapshotServer:
     """Publishes the newest of the snapshots that it is shown, and answers a viewer that comes late, in a thread."""
 
     def __init__(self, network: Network) -> None:
@@ -56,7 +56,7 @@ class _Stage:
         self._closing = False
         self._thread = threading.Thread(target=self._serve, name="audience", daemon=True)
 
-    def __enter__(self) -> _Stage:
+    def __enter__(self) -> _SnapshotServer:
         self._thread.start()
         return self
 
@@ -77,8 +77,8 @@ class _Stage:
             newest = self._newest
             if newest is not None and newest is not published:
                 numbers, session = numbering.next(), numbering.session
-                self._depths.publish(depth_header(newest, session, numbers["sequence"], depth_numbering.next()))
-                self._server.publish(*to_message(newest, session, numbers))
+                self._depths.publish(make_depth_header(newest, session, numbers["sequence"], depth_numbering.next()))
+                self._server.publish(*encode_snapshot(newest, session, numbers))
                 published = newest
             self._depths.serve(0)
             self._server.serve(_SERVE_S)

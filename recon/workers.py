@@ -11,26 +11,26 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from splatnode.recon.core import allowed_threads, limit_threads, limited_threads
+from splatnode.recon.core import current_thread_limit, limit_threads, num_usable_threads
 
 Item = TypeVar("Item")
 T = TypeVar("T")
 
 
-def each(function: Callable[..., T], *arguments: Iterable) -> list[T]:
-    """What `function` returns for each of the arguments, taken together as by `map`, in order."""
-    return list(in_turn(lambda together: function(*together), zip(*arguments, strict=False)))
+def map_parallel(function: Callable[..., T], *arguments: Iterable) -> list[T]:
+    """Returns `function` of each of the arguments, taken together as by `map`, in order."""
+    return list(map_parallel_lazily(lambda together: function(*together), zip(*arguments, strict=False)))
 
 
-def in_turn(function: Callable[[Item], T], items: Iterable[Item]) -> Iterator[T]:
+def map_parallel_lazily(function: Callable[[Item], T], items: Iterable[Item]) -> Iterator[T]:
     """`function` of each of the items, in their order, as soon as it is known.
 
     Whoever stops asking gives up the few items that are under way, and no more are begun. What `function` raises is
     raised in the place of its result.
     """
-    threads = allowed_threads()
+    threads = num_usable_threads()
     waiting: deque[Future[T]] = deque()
-    with ThreadPoolExecutor(threads, initializer=limit_threads, initargs=(limited_threads(),)) as pool:
+    with ThreadPoolExecutor(threads, initializer=limit_threads, initargs=(current_thread_limit(),)) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))

@@ -26,9 +26,9 @@ import splatnode.viewer.verbs
 from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.packages import remedy
-from splatnode.capture.process.printable import printable, printable_lines
-from splatnode.capture.process.stop_signals import on_first
-from splatnode.capture.process.terminal import nobody_reads, shown_as_text
+from splatnode.capture.process.printable import sanitize_lines, sanitize_text
+from splatnode.capture.process.stop_signals import handle_first_signal
+from splatnode.capture.process.terminal import is_output_closed, sanitize_output
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -45,7 +45,7 @@ VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the verb that `argv` names and returns the exit code. Raises SystemExit for usage errors and SIGTERM."""
-    with shown_as_text():
+    with sanitize_output():
         return _run(argv)
 
 
@@ -63,18 +63,18 @@ def _run(argv: Sequence[str] | None) -> int:
         stopping.set()
         sys.exit(0)
 
-    on_first((signal.SIGTERM,), stop)
+    handle_first_signal((signal.SIGTERM,), stop)
     try:
         code = args.run(args)
         print(end="", flush=True)  # where there is a standard output
         return code
     except (Exception, KeyboardInterrupt) as error:
-        if isinstance(error, BrokenPipeError) and nobody_reads():
+        if isinstance(error, BrokenPipeError) and is_output_closed():
             return _NOBODY_READS
         if stopping.is_set():  # a package that was being imported makes an ImportError of the exit
             return 0
         if args.debug:
-            print(printable_lines(traceback.format_exc()), file=sys.stderr)
+            print(sanitize_lines(traceback.format_exc()), file=sys.stderr)
         code = exit_code(error)
         print(f"splatnode: {explain(error, code)}", file=sys.stderr)
         return code
@@ -84,7 +84,7 @@ class _Parser(argparse.ArgumentParser):
     """One whose complaints repeat an argument as text that only shows."""
 
     def error(self, message: str) -> NoReturn:
-        super().error(printable_lines(message))
+        super().error(sanitize_lines(message))
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -104,7 +104,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def exit_code(error: BaseException) -> int:
-    """What an exception that ended a verb tells the shell. Rooms raise ValueError for what the user can put right.
+    """Returns the exit code of an exception that ended a verb. Rooms raise ValueError for what the user can put right.
 
     An exception of a room that knows better has an `exit_code` of its own.
     """
@@ -123,10 +123,10 @@ def exit_code(error: BaseException) -> int:
 
 def explain(error: BaseException, code: int) -> str:
     """One line, or the error's own text where that has more, its further lines set in."""
-    return printable_lines(_explained(error, code))
+    return sanitize_lines(_describe_error(error, code))
 
 
-def _explained(error: BaseException, code: int) -> str:
+def _describe_error(error: BaseException, code: int) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     if is_shortage(error):
@@ -141,7 +141,7 @@ def _explained(error: BaseException, code: int) -> str:
 
 
 def _file(name: str | bytes | int) -> str:
-    return printable(os.fsdecode(name) if isinstance(name, bytes) else name)
+    return sanitize_text(os.fsdecode(name) if isinstance(name, bytes) else name)
 
 
 def _os_exit_code(error: OSError) -> int:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.viewer.colours import middle, normals
+from splatnode.viewer.colours import mean_camera_centre, normals
 from splatnode.viewer.support import Support
 from splatnode.viewer.viewpoint import look_at, scene_up
 
@@ -57,7 +57,7 @@ def surface_points(
     chosen = visible[:: max(1, math.ceil(len(visible) / most))]
     return Points(
         positions=gaussians.means[chosen].astype(np.float64),
-        normals=normals(take(gaussians, chosen), middle(cameras)).astype(np.float64),
+        normals=normals(select_gaussians(gaussians, chosen), mean_camera_centre(cameras)).astype(np.float64),
         seen_by=support.sizes[chosen] > 0,
     )
 
@@ -86,41 +86,43 @@ def next_view(cameras: tuple[CameraEstimate, ...], points: Points) -> Advice:
     """
     if not cameras or not len(points.positions):
         return Advice("No camera is placed yet: take photographs that overlap, with a step to the side.", None, None, 0)
-    sight = _sight(cameras, points)
+    sight = _measure_viewing_angles(cameras, points)
     moves = [move for camera in cameras for move in _moves(camera, cameras, points, sight)]
     best = max(moves, key=lambda move: (round(move.gain, 3), move.base.frame_id), default=None)
     if best is None or best.gain < ENOUGH:
         return Advice("The scene is covered well: more photographs from around here would add little.", None, None, 0)
     pivot = _pivot(best.base, points, cameras)
-    return Advice(_sentence(best, points, sight), (best.base.T_world_camera[:3, 3], best.centre), pivot, best.gain)
+    return Advice(_describe_move(best, points, sight), (best.base.T_world_camera[:3, 3], best.centre), pivot, best.gain)
 
 
 @dataclass(frozen=True, eq=False)
-class _Sight:
+class _ViewingAngles:
     """How the cameras see the points."""
 
     rays: Array  # (C, M, 3) unit, from each camera to each point
     angles: Array  # (M,) the widest between two cameras that see the point; 0 where fewer than two do
 
 
-def _sight(cameras: tuple[CameraEstimate, ...], points: Points) -> _Sight:
+def _measure_viewing_angles(cameras: tuple[CameraEstimate, ...], points: Points) -> _ViewingAngles:
     rays = np.stack([_rays(points, camera.T_world_camera[:3, 3]) for camera in cameras])
     angles = np.zeros(len(points.positions))
     for index, ray in enumerate(rays):
         to_others = _angles_to(ray, rays, points)
         angles = np.maximum(angles, np.where(points.seen_by[:, index], to_others, 0.0))
-    return _Sight(rays, angles)
+    return _ViewingAngles(rays, angles)
 
 
-def _moves(camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: Points, sight: _Sight) -> list[_Move]:
+def _moves(
+    camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: Points, sight: _ViewingAngles
+) -> list[_Move]:
     up = scene_up(cameras)
     pivot = _pivot(camera, points, cameras)
     angles, views = sight.angles, points.seen_by.sum(1)
     moves = []
     for turn, (right, upwards) in _TURNS.items():
         for step in _STEPS:
-            centre = _walked(camera, pivot, up, right * step, upwards * step)
-            shown = _shows(camera, look_at(centre, pivot, up), points)
+            centre = _orbit_camera(camera, pivot, up, right * step, upwards * step)
+            shown = _find_visible_points(camera, look_at(centre, pivot, up), points)
             if shown.sum() == 0 or (views[shown] > 0).mean() < MIN_OVERLAP or shown.mean() < _MIN_SHOWN:
                 continue
             wider = np.where(shown, np.maximum(angles, _angles_to(_rays(points, centre), sight.rays, points)), angles)
@@ -130,7 +132,7 @@ def _moves(camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: 
     return moves
 
 
-def _walked(camera: CameraEstimate, pivot: Array, up: Array, right: float, upwards: float) -> Array:
+def _orbit_camera(camera: CameraEstimate, pivot: Array, up: Array, right: float, upwards: float) -> Array:
     """The camera's centre after a walk around the pivot by angles, to its own right or upwards."""
     offset = camera.T_world_camera[:3, 3] - pivot
     distance = float(np.linalg.norm(offset))
@@ -150,7 +152,7 @@ def _pivot(camera: CameraEstimate, points: Points, cameras: tuple[CameraEstimate
     return centre + (float(np.median(depths)) if len(depths) else 1.0) * forward
 
 
-def _shows(lens: CameraEstimate, T_world_camera: Array, points: Points) -> npt.NDArray[np.bool_]:
+def _find_visible_points(lens: CameraEstimate, T_world_camera: Array, points: Points) -> npt.NDArray[np.bool_]:
     """(M,) points inside the image that `lens` would take from there, on surfaces turned towards it."""
     offsets = points.positions - T_world_camera[:3, 3]
     local = offsets @ T_world_camera[:3, :3]
@@ -171,7 +173,7 @@ def _angles_to(ray: Array, rays: Array, points: Points) -> Array:
     return np.arccos(np.clip(np.where(points.seen_by.T, cosines, 1.0).min(0), -1.0, 1.0))
 
 
-def _sentence(move: _Move, points: Points, sight: _Sight) -> str:
+def _describe_move(move: _Move, points: Points, sight: _ViewingAngles) -> str:
     distance = 2.0 * math.sin(move.angle / 2.0)
     where = f"From {move.base.name} move {move.turn} by {distance:.0%} of the distance to the scene"
     if move.parallax >= move.coverage:

@@ -36,7 +36,7 @@ class Analyst:
         self._thread = threading.Thread(target=self._work, name="analyst", daemon=True)
         self._thread.start()
 
-    def of(self, moment: Moment) -> Analysis | None:
+    def request_analysis(self, moment: Moment) -> Analysis | None:
         """The analysis of `moment`; None while it is not ready. Never waits."""
         with self._changed:
             if self._done is not None and self._done.moment is moment:
@@ -55,7 +55,7 @@ class Analyst:
     def _work(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._closing or self._unanswered())
+                self._changed.wait_for(lambda: self._closing or self._is_pending())
                 if self._closing or self._asked is None:
                     return
                 moment = self._asked
@@ -63,5 +63,5 @@ class Analyst:
             with self._changed:
                 self._done = analysis
 
-    def _unanswered(self) -> bool:
+    def _is_pending(self) -> bool:
         return self._asked is not None and (self._done is None or self._done.moment is not self._asked)

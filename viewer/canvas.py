@@ -28,12 +28,12 @@ def empty_canvas(width: int, height: int) -> Canvas:
 
 def project(points: Array, view: Viewpoint, width: int, height: int) -> Array:
     """(M, 3) pixel x, pixel y and z of world points (M, 3) in the window."""
-    local = in_camera(points, np.linalg.inv(view.T_world_camera))
+    local = transform_to_camera(points, np.linalg.inv(view.T_world_camera))
     z = np.where(np.abs(local[:, 2]) > 1e-9, local[:, 2], 1e-9)
     homogeneous = local @ view.K(width, height).T
     return np.column_stack([homogeneous[:, :2] / z[:, None], local[:, 2]])
 
 
-def in_camera(points: Array, T_camera_world: Array) -> Array:
+def transform_to_camera(points: Array, T_camera_world: Array) -> Array:
     """(..., 3) world points in the camera's frame."""
     return points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]

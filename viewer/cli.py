@@ -12,21 +12,21 @@ from pathlib import Path
 import cv2
 
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import read_yaml, typed
-from splatnode.capture.process.progress import telling, waiting
+from splatnode.capture.process.config import parse_config, read_yaml
+from splatnode.capture.process.progress import show_progress, show_waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.result.rendering import use_threads
-from splatnode.recon.result.stored_snapshot import found_photographs
-from splatnode.recon.result.whole import is_whole
+from splatnode.recon.result.stored_snapshot import load_images
+from splatnode.recon.result.whole import is_map_set
 from splatnode.viewer.map_source import BUDGET, Maps, MapSource, map_moment
 from splatnode.viewer.moment import Moment
-from splatnode.viewer.pictures import keep_picture, write_movie, write_series
+from splatnode.viewer.pictures import update_picture, write_movie, write_series
 from splatnode.viewer.probe import open3d_installed, probe_window
 from splatnode.viewer.rerun_stream import URL, stream
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished, Live, Source, load_result
+from splatnode.viewer.sources import FixedSource, LiveSource, Source, load_result
 from splatnode.viewer.splash import splash
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.web import stage as web
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
@@ -44,35 +44,35 @@ def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     _check_web(args)
     if not (args.web or args.viser or args.rerun or args.headless or args.export is not None):
-        return _in_window(args)
-    with waiting("reading the scene"):
-        finished, network = _finished(args), _network(args)
+        return _show_in_window(args)
+    with show_waiting("reading the scene"):
+        finished, network = _load_finished_source(args), _network(args)
     if args.web:
-        where = web.place(args.listen, web.PORT if args.port is None else args.port, args.key)
-        web.show(_source(finished, network), where, _give_way, say)
+        where = web.resolve_address(args.listen, web.PORT if args.port is None else args.port, args.key)
+        web.show(_source(finished, network), where, _lower_priority, say)
     if args.viser:
-        _give_way()
+        _lower_priority()
         viser = import_module("splatnode.viewer.viser")  # an extra
         viser.show(_source(finished, network), args.listen, viser.PORT if args.port is None else args.port, say)
     if args.rerun:
-        _give_way()
+        _lower_priority()
         stream(_source(finished, network), args.rerun_url or URL)
         return EXIT_GOOD
     if args.export is None:
-        return _as_pictures(args, finished, network)
+        return _write_pictures(args, finished, network)
     if finished is None or args.export.suffix.lower() != ".mp4":
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
-    with telling() as tell:
+    with show_progress() as tell:
         say(write_movie(_moment(finished), args.export, width, height, args.pictures, of=args.what, tell=tell))
     return EXIT_GOOD
 
 
-def _in_window(args: argparse.Namespace) -> int:
+def _show_in_window(args: argparse.Namespace) -> int:
     """Shows it in a window, or as pictures where there can be none."""
     installed = open3d_installed()
-    with splash() if installed else contextlib.nullcontext(_nothing) as ready, ThreadPoolExecutor(1) as beside:
-        finished, network = _finished(args), _network(args)
+    with splash() if installed else contextlib.nullcontext(_do_nothing) as ready, ThreadPoolExecutor(1) as beside:
+        finished, network = _load_finished_source(args), _network(args)
         if not installed:
             say(_NO_OPEN3D, error=True)
             return EXIT_UNAVAILABLE
@@ -83,37 +83,37 @@ def _in_window(args: argparse.Namespace) -> int:
         if not probe.window:
             say(f"splatnode: no window: {probe.detail}. Writing pictures instead, as with --headless", error=True)
             ready()
-            return _as_pictures(args, finished, network)
+            return _write_pictures(args, finished, network)
         source = _source(finished, network)
         from splatnode.viewer.window import show
 
         def on_open() -> None:
             ready()
             if finished is None:
-                _give_way()
+                _lower_priority()
 
-        session, size = Session(source, State()), args.size or probe.size
+        session, size = Session(source, ViewerState()), args.size or probe.size
         show(session, software=probe.software, screenshots=_folder(args, finished), opened=on_open, size=size)
     return EXIT_GOOD
 
 
-def _as_pictures(args: argparse.Namespace, finished: Moment | Maps | None, network: Network) -> int:
+def _write_pictures(args: argparse.Namespace, finished: Moment | Maps | None, network: Network) -> int:
     width, height = args.size or _PICTURE
     folder = _folder(args, finished)
     if finished is not None:
-        with telling() as tell:
+        with show_progress() as tell:
             say(write_series(_moment(finished), folder, width, height, args.pictures, of=args.what, tell=tell))
         return EXIT_GOOD
     source = _source(finished, network)
-    _give_way()
+    _lower_priority()
     with contextlib.closing(source):
-        keep_picture(source, folder, width, height, until_final=args.until_final, say=say)
+        update_picture(source, folder, width, height, until_final=args.until_final, say=say)
     return EXIT_GOOD
 
 
 def _folder(args: argparse.Namespace, finished: Moment | Maps | None) -> Path:
-    """Where pictures and edited scenes go."""
-    return args.out or (_beside(args.what) if finished is not None else Path("view"))
+    """Returns the folder for pictures and edited scenes."""
+    return args.out or (_default_folder(args.what) if finished is not None else Path("view"))
 
 
 def _check_web(args: argparse.Namespace) -> None:
@@ -133,7 +133,7 @@ def _check_web(args: argparse.Namespace) -> None:
         raise ValueError("--web shows it in a browser; --headless and --export write pictures: one of them at a time")
 
 
-def _finished(args: argparse.Namespace) -> Moment | Maps | None:
+def _load_finished_source(args: argparse.Namespace) -> Moment | Maps | None:
     """The result, or the folder of many, that is named; None where it is a running node."""
     if args.photographs is not None and not args.photographs.is_dir():
         raise FileNotFoundError(
@@ -141,9 +141,9 @@ def _finished(args: argparse.Namespace) -> Moment | Maps | None:
         )
     if args.what is None or _is_configuration(args.what):
         return None
-    if is_whole(args.what):
+    if is_map_set(args.what):
         folder = args.photographs or args.what / "images"
-        return Maps(args.what, lambda cameras: found_photographs(cameras, [folder]), args.max_gaussians or BUDGET)
+        return Maps(args.what, lambda cameras: load_images(cameras, [folder]), args.max_gaussians or BUDGET)
     return load_result(args.what, args.photographs)
 
 
@@ -152,9 +152,9 @@ def _moment(finished: Moment | Maps) -> Moment:
 
 
 def _network(args: argparse.Namespace) -> Network:
-    """Where the running node is to be found: as its configuration says, if one is named."""
+    """Returns the network of the running node: that of its configuration, if one is named."""
     raw = read_yaml(args.what) if args.what is not None and _is_configuration(args.what) else {}
-    return typed(raw.get("network", {}), Network, "network")
+    return parse_config(raw.get("network", {}), Network, "network")
 
 
 def _is_configuration(what: Path) -> bool:
@@ -163,15 +163,15 @@ def _is_configuration(what: Path) -> bool:
 
 def _source(finished: Moment | Maps | None, network: Network) -> Source:
     if finished is None:
-        return Live(network)
-    return Finished(finished) if isinstance(finished, Moment) else MapSource(finished)
+        return LiveSource(network)
+    return FixedSource(finished) if isinstance(finished, Moment) else MapSource(finished)
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     """Closes the splash that there is none of."""
 
 
-def _give_way() -> None:
+def _lower_priority() -> None:
     """Beside a running node the viewer takes one thread, and steps back where the node wants the processors.
 
     Not before it is open: starting costs the node little, and the person should not wait for it.
@@ -181,5 +181,5 @@ def _give_way() -> None:
     os.nice(_NICENESS)
 
 
-def _beside(what: Path) -> Path:
+def _default_folder(what: Path) -> Path:
     return (what if what.is_dir() else what.parent) / "view"

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.export.quaternions import matrices_from_quats
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.recon.result.sources import frame_of
+from splatnode.recon.result.sources import decode_frame_id
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.state import Colouring
 from splatnode.viewer.support import Support
@@ -24,16 +24,16 @@ _SUPPORT = np.array([UNKNOWN, (0.85, 0.2, 0.15), (0.95, 0.6, 0.1), (0.85, 0.85, 
 _GOLDEN = 0.61803398875  # steps around the circle of hues that stay far apart, however many there are
 
 
-def coloured(moment: Moment, colouring: Colouring, support: Support) -> GaussianArrays:
+def colour_gaussians(moment: Moment, colouring: Colouring, support: Support) -> GaussianArrays:
     """The Gaussians in the colours of `colouring`; what is unknown is grey."""
     gaussians = moment.snapshot.gaussians
     if colouring is Colouring.PHOTOGRAPH:
         return gaussians
     rgb = {
-        Colouring.DEPTH: _by_depth,
-        Colouring.NORMAL: _by_normal,
-        Colouring.SUPPORT: _by_support,
-        Colouring.SOURCE: _by_source,
+        Colouring.DEPTH: _colour_by_depth,
+        Colouring.NORMAL: _colour_by_normal,
+        Colouring.SUPPORT: _colour_by_support,
+        Colouring.SOURCE: _colour_by_source,
     }[colouring](moment, support)
     return replace(gaussians, sh=((rgb[:, None] - 0.5) / SH_C0).astype(np.float32))
 
@@ -53,37 +53,39 @@ def source_colour(index: int) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
-def middle(cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.float64]:
+def mean_camera_centre(cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.float64]:
     """(3,) the mean of the cameras' centres; the origin without any."""
     return np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0) if cameras else np.zeros(3)
 
 
-def _by_depth(moment: Moment, _support: Support) -> Array:
-    """By the distance from the middle of the cameras: inverse, because that is what images resolve."""
+def _colour_by_depth(moment: Moment, _support: Support) -> Array:
+    """Colours by inverse distance from the mean camera centre, as images resolve inverse depth."""
     means = moment.snapshot.gaussians.means
     if not len(means):
         return np.zeros((0, 3), np.float32)
-    nearness = 1.0 / np.maximum(np.linalg.norm(means - middle(moment.snapshot.cameras), axis=1), 1e-6)
+    nearness = 1.0 / np.maximum(np.linalg.norm(means - mean_camera_centre(moment.snapshot.cameras), axis=1), 1e-6)
     low, high = np.percentile(nearness, [2, 98])
     levels = np.rint(255 * np.clip((nearness - low) / max(high - low, 1e-9), 0, 1)).astype(np.uint8)
     return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].astype(np.float32) / 255
 
 
-def _by_normal(moment: Moment, _support: Support) -> Array:
+def _colour_by_normal(moment: Moment, _support: Support) -> Array:
     snapshot = moment.snapshot
-    return 0.5 + 0.5 * normals(snapshot.gaussians, middle(snapshot.cameras)) * np.array([1, -1, -1], np.float32)
+    return 0.5 + 0.5 * normals(snapshot.gaussians, mean_camera_centre(snapshot.cameras)) * np.array(
+        [1, -1, -1], np.float32
+    )
 
 
-def _by_support(_moment: Moment, support: Support) -> Array:
+def _colour_by_support(_moment: Moment, support: Support) -> Array:
     return _SUPPORT[np.minimum(support.views, len(_SUPPORT) - 1)]
 
 
-def _by_source(moment: Moment, support: Support) -> Array:
-    """By the frame that started a Gaussian. A file does not keep it: there, by the camera that sees it largest."""
+def _colour_by_source(moment: Moment, support: Support) -> Array:
+    """Colours by the frame that started a Gaussian; in a file, without these, by the camera that sees it largest."""
     snapshot = moment.snapshot
     palette = np.array([*(source_colour(index) for index in range(len(snapshot.cameras))), UNKNOWN], np.float32)
-    if not len(snapshot.gaussians) or not (frame_of(snapshot.gaussians.source_frame) >= 0).any():
+    if not len(snapshot.gaussians) or not (decode_frame_id(snapshot.gaussians.source_frame) >= 0).any():
         return palette[support.best]
     index_of = {camera.frame_id: index for index, camera in enumerate(snapshot.cameras)}
-    frames, inverse = np.unique(frame_of(snapshot.gaussians.source_frame), return_inverse=True)
+    frames, inverse = np.unique(decode_frame_id(snapshot.gaussians.source_frame), return_inverse=True)
     return palette[np.array([index_of.get(int(frame), -1) for frame in frames])][inverse]

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export import SceneFileError, viewer_safe, write_files
+from splatnode.recon.result.export import SceneFileError, sanitize_gaussians, write_files
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.selection import Box, Selection
 from splatnode.recon.result.export.sources import SOURCES, encode_sources
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import SHELL, seen
+from splatnode.recon.result.sources import SHELL, find_confirmed
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.shapes import Colour, Lines
 from splatnode.viewer.state import Span
@@ -34,30 +34,30 @@ _THINNEST = 0.01  # of the room, a box
 
 
 class EditError(Exception):
-    """What was asked for cannot be done; the message says why."""
+    """An edit cannot be applied; the message says why."""
 
 
-def edited(gaussians: GaussianArrays, edits: Edits) -> GaussianArrays:
-    """What the edits leave of the Gaussians, or none where one of them leaves nothing."""
+def apply_edits(gaussians: GaussianArrays, edits: Edits) -> GaussianArrays:
+    """Returns the Gaussians that the edits leave, or none where one of the edits leaves nothing."""
     try:
         for edit in edits:
-            gaussians = edit.of(gaussians, "the scene")
+            gaussians = edit.apply(gaussians, "the scene")
     except SceneFileError:  # a scene that changed since: what was asked for is not in it any more
         return GaussianArrays.empty()
     return gaussians
 
 
-def one_more(moment: Moment, edits: Edits, edit: Selection) -> Edits:
+def add_edit(moment: Moment, edits: Edits, edit: Selection) -> Edits:
     """The edits with another one. Raises EditError where it cannot be told what it leaves, or where that is nothing."""
     if moment.graph is not None:
         raise EditError("A map shows only what is near: cut a single scene, or use splatnode export --crop.")
-    before = edited(moment.snapshot.gaussians, edits)
+    before = apply_edits(moment.snapshot.gaussians, edits)
     if edit.only_seen and not (before.source_frame != SHELL).any():
         raise EditError(
             f"This file does not tell which Gaussians two photographs confirm: that is in the {SOURCES} of a result."
         )
     try:
-        after = edit.of(before, "the scene")
+        after = edit.apply(before, "the scene")
     except SceneFileError:
         raise EditError("Nothing would be left: nothing was changed.") from None
     if len(after) == len(before):
@@ -65,13 +65,13 @@ def one_more(moment: Moment, edits: Edits, edit: Selection) -> Edits:
     return (*edits, edit)
 
 
-def room(moment: Moment) -> npt.NDArray[np.float64]:
+def compute_crop_bounds(moment: Moment) -> npt.NDArray[np.float64]:
     """(2, 3) the least and the greatest corner of the room that boxes are cut from: around what was photographed.
 
     That is what two photographs confirm, where it is known; without the far and a few in a hundred in any case.
     """
     gaussians = moment.snapshot.gaussians
-    confirmed = seen(gaussians.source_frame)
+    confirmed = find_confirmed(gaussians.source_frame)
     means = (gaussians.means[confirmed] if confirmed.any() else gaussians.means).astype(np.float64)
     if not len(means):
         return np.array([[-1.0] * 3, [1.0] * 3])
@@ -102,10 +102,10 @@ def box_lines(cut: Box) -> Lines:
 
 
 def edit_lines(moment: Moment, edits: Edits) -> list[str]:
-    """What the edits have left."""
+    """Describes how many Gaussians the edits leave."""
     if not edits:
         return ["Nothing is taken away yet."]
-    whole, left = len(moment.snapshot.gaussians), len(edited(moment.snapshot.gaussians, edits))
+    whole, left = len(moment.snapshot.gaussians), len(apply_edits(moment.snapshot.gaussians, edits))
     return [f"{left} of {whole} Gaussians left ({len(edits)} step{'s' * (len(edits) != 1)})."]
 
 
@@ -117,7 +117,7 @@ def write_edited(moment: Moment, edits: Edits, folder: Path) -> Path:
     if not edits:
         raise EditError("Nothing was taken away: there is nothing new to save.")
     snapshot = moment.snapshot
-    left = viewer_safe(edited(snapshot.gaussians, edits))
+    left = sanitize_gaussians(apply_edits(snapshot.gaussians, edits))
     if not len(left):
         raise EditError("Nothing is left: there is nothing to save.")
     files = {"scene.ply": encode_ply(left, snapshot.scale)}

@@ -54,7 +54,7 @@ def edge_lines(edges: tuple[GraphEdge, ...], *, loop: bool, retracted: bool) -> 
     """(M, 2, 3) the lines of one kind of links: whole, or dashed where they no longer count."""
     ends = [edge.ends for edge in edges if edge.loop is loop and (edge.retracted is not None) is retracted]
     whole = np.array(ends, np.float64).reshape(-1, 2, 3)
-    return _dashed(whole) if retracted else whole
+    return _dash_lines(whole) if retracted else whole
 
 
 def node_marks(nodes: tuple[GraphNode, ...], *, good: bool) -> Array:
@@ -89,7 +89,7 @@ def _detail(node: GraphNode) -> str:
     return f"{node.num_gaussians} Gaussians, {how}"
 
 
-def _dashed(lines: Array) -> Array:
+def _dash_lines(lines: Array) -> Array:
     """Every other part of the lines (M, 2, 3)."""
     at = np.linspace(0.0, 1.0, 2 * _DASHES)
     start, step = lines[:, :1], lines[:, 1:] - lines[:, :1]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.scale import Scale
 from splatnode.viewer.ground import AXES, round_number
-from splatnode.viewer.lengths import in_words
+from splatnode.viewer.lengths import format_length
 from splatnode.viewer.shapes import Colour, Label, Lines, Shapes
 from splatnode.viewer.viewpoint import Viewpoint
 
@@ -28,7 +28,7 @@ _BESIDE = 1.3  # times the length of an axis, to its letter
 def legend(view: Viewpoint, width: int, height: int, scale: Scale) -> Shapes:
     """The bar at the lower left and the axes at the lower right of a picture of this size."""
     length = bar_length(view, width, height)
-    pixels = length / _per_pixel(view, width, height)
+    pixels = length / _units_per_pixel(view, width, height)
     left, bottom = _MARGIN, height - _MARGIN
     strokes = np.array(
         [
@@ -37,9 +37,11 @@ def legend(view: Viewpoint, width: int, height: int, scale: Scale) -> Shapes:
             [[left + pixels, bottom - _TICK], [left + pixels, bottom + _TICK]],
         ]
     )
-    bar = Lines(_before_the_eye(strokes, view, width, height), COLOUR, 2)
+    bar = Lines(_unproject_near(strokes, view, width, height), COLOUR, 2)
     says = Label(
-        in_words(length, scale), _before_the_eye(np.array([left + 4.0, bottom - 14.0]), view, width, height), COLOUR
+        format_length(length, scale),
+        _unproject_near(np.array([left + 4.0, bottom - 14.0]), view, width, height),
+        COLOUR,
     )
     middle = np.array([width - _MARGIN - 1.4 * _RADIUS, height - _MARGIN - 1.4 * _RADIUS])
     directions = [*zip(np.eye(3), AXES, strict=True), (view.up, ("up", COLOUR))]
@@ -49,11 +51,11 @@ def legend(view: Viewpoint, width: int, height: int, scale: Scale) -> Shapes:
 
 def bar_length(view: Viewpoint, width: int, height: int) -> float:
     """1, 2 or 5 times a power of ten, in the world's unit, as long as fits at the depth that orbits go around."""
-    longest = _LONGEST * width * _per_pixel(view, width, height)
+    longest = _LONGEST * width * _units_per_pixel(view, width, height)
     return 1.0 / round_number(1.0 / longest)
 
 
-def _per_pixel(view: Viewpoint, width: int, height: int) -> float:
+def _units_per_pixel(view: Viewpoint, width: int, height: int) -> float:
     """World units that a pixel covers at the pivot's depth."""
     return view.distance / float(view.K(width, height)[0, 0])
 
@@ -63,12 +65,12 @@ def _axis(
 ) -> tuple[Lines, Label]:
     """A line from the `middle` (2,) in pixels along a direction of the world (3,), and its name behind the tip."""
     flat = _RADIUS * (view.T_world_camera[:3, :3].T @ direction)[:2]
-    ends = _before_the_eye(np.array([[middle, middle + flat]]), view, *size)
+    ends = _unproject_near(np.array([[middle, middle + flat]]), view, *size)
     beside = middle + _BESIDE * flat + [-4.0, 4.0]  # a label begins at its lower left
-    return Lines(ends, colour, 2), Label(name, _before_the_eye(beside, view, *size), colour)
+    return Lines(ends, colour, 2), Label(name, _unproject_near(beside, view, *size), colour)
 
 
-def _before_the_eye(pixels: Array, view: Viewpoint, width: int, height: int) -> Array:
+def _unproject_near(pixels: Array, view: Viewpoint, width: int, height: int) -> Array:
     """(..., 3) world points right before the eye that are seen at the pixels (..., 2)."""
     K = view.K(width, height)
     rays = np.concatenate([(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((*pixels.shape[:-1], 1))], axis=-1)

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.pieces import Pieces, has_scene, pieces_of
+from splatnode.recon.result.pieces import Pieces, find_pieces, has_scene
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.result.whole import Whole, WholeMap, read_whole
+from splatnode.recon.result.whole import JoinedMap, MapSet, read_map_set
 from splatnode.viewer.graph import NOTHING, Array, Graph, GraphEdge, GraphNode
 from splatnode.viewer.map_loader import MapLoader
 from splatnode.viewer.moment import Moment
@@ -39,10 +39,10 @@ class Maps:
 class MapView:
     """One of the maps of a folder, and what of it is loaded."""
 
-    def __init__(self, maps: Maps, whole: Whole, which: int) -> None:
+    def __init__(self, maps: Maps, whole: MapSet, which: int) -> None:
         self._whole, self._which, self._photographs = whole, which, maps.photographs
-        self._number, self._of = len(_shown_maps(whole)), _shown_maps(whole)[which]
-        self._pieces: Pieces = pieces_of(whole, self._of, maps.folder)
+        self._number, self._of = len(_list_shown_maps(whole)), _list_shown_maps(whole)[which]
+        self._pieces: Pieces = find_pieces(whole, self._of, maps.folder)
         self._loader = MapLoader(self._pieces, maps.budget)
         self._images: dict[str, npt.NDArray[np.uint8]] = {}
 
@@ -56,7 +56,7 @@ class MapView:
         return np.mean(centres, axis=0) if centres else np.zeros(3)
 
     def moment(self, eye: Array) -> Moment:
-        """What is loaded, with the graph and the cameras, of which the nearest have their photographs."""
+        """Returns the loaded part with the graph and the cameras, of which the nearest have their images."""
         cameras = self._pieces.cameras
         near = sorted(cameras, key=lambda camera: float(np.linalg.norm(camera.T_world_camera[:3, 3] - eye)))
         missing = tuple(camera for camera in near[:_MOST_PHOTOGRAPHS] if camera.name not in self._images)
@@ -97,21 +97,21 @@ class MapView:
 
 def map_moment(maps: Maps, which: int = 0) -> Moment:
     """The whole map at once, the middle in most detail. Raises SceneFileError, FileNotFoundError, OSError."""
-    view = MapView(maps, _whole(maps), which)
+    view = MapView(maps, _read_maps(maps), which)
     eye = view.start()
     view.look_from(eye, lambda: False)
     return view.moment(eye)
 
 
-def _whole(maps: Maps) -> Whole:
+def _read_maps(maps: Maps) -> MapSet:
     """Raises SceneFileError where nothing has come yet, besides what `read_whole` raises."""
-    whole = read_whole(maps.folder)
-    if not _shown_maps(whole):
+    whole = read_map_set(maps.folder)
+    if not _list_shown_maps(whole):
         raise SceneFileError(f"{maps.folder} holds no scene yet: its places.json lists none with a result")
     return whole
 
 
-def _shown_maps(whole: Whole) -> list[WholeMap]:
+def _list_shown_maps(whole: MapSet) -> list[JoinedMap]:
     """Those with a scene to show."""
     return [each for each in whole.maps if any(has_scene(whole.places[scene_id]) for scene_id in each.placements)]
 
@@ -124,7 +124,7 @@ class MapSource:
 
     def __init__(self, maps: Maps) -> None:
         """Raises SceneFileError, FileNotFoundError, OSError where the folder cannot be read."""
-        self._maps, self._whole = maps, _whole(maps)
+        self._maps, self._whole = maps, _read_maps(maps)
         self._view = MapView(maps, self._whole, 0)
         self._eye, self._which = self._view.start(), 0
         self._changed = threading.Condition()
@@ -143,8 +143,8 @@ class MapSource:
             return moment
 
     def look_from(self, eye: Array, which: int) -> None:
-        """Where the person looks from now, and at which map: any number, they follow each other in a circle."""
-        which %= len(_shown_maps(self._whole))
+        """Sets the viewpoint's position and the map that it looks at: any number, as maps follow in a circle."""
+        which %= len(_list_shown_maps(self._whole))
         with self._changed:
             if which != self._which or float(np.linalg.norm(eye - self._eye)) > _STEP:
                 self._eye, self._moved = np.array(eye), True

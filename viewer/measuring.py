@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.scale import Scale
 from splatnode.viewer.canvas import Canvas
-from splatnode.viewer.lengths import in_words
+from splatnode.viewer.lengths import format_length
 from splatnode.viewer.shapes import Colour, Label, Lines, Shapes
 from splatnode.viewer.viewpoint import Viewpoint
 
@@ -33,13 +33,13 @@ def surface_point(canvas: Canvas, view: Viewpoint, x: float, y: float) -> Array 
     return view.T_world_camera[:3, :3] @ (float(np.median(depths)) * ray) + view.T_world_camera[:3, 3]
 
 
-def with_point(points: tuple[Array, ...], point: Array) -> tuple[Array, ...]:
+def add_point(points: tuple[Array, ...], point: Array) -> tuple[Array, ...]:
     """The points that are measured between after one more was clicked: a third one begins anew."""
     return (point,) if len(points) == 2 else (*points, point)
 
 
-def measured_lines(points: tuple[Array, ...], measuring: bool, scale: Scale) -> list[str]:
-    """What there is to say of none, one or two points."""
+def measurement_lines(points: tuple[Array, ...], measuring: bool, scale: Scale) -> list[str]:
+    """Describes the measurement between none, one or two points."""
     if len(points) == 2:
         source = f" ({scale.source})" if scale.metric and scale.source else ""
         said = f"{distance_words(points, scale)} between the two points{source}."
@@ -50,10 +50,10 @@ def measured_lines(points: tuple[Array, ...], measuring: bool, scale: Scale) -> 
 
 
 def distance_words(points: tuple[Array, ...], scale: Scale) -> str:
-    return in_words(float(np.linalg.norm(points[1] - points[0])), scale)
+    return format_length(float(np.linalg.norm(points[1] - points[0])), scale)
 
 
-def measured_shapes(points: tuple[Array, ...], eye: Array, scale: Scale) -> Shapes:
+def measurement_shapes(points: tuple[Array, ...], eye: Array, scale: Scale) -> Shapes:
     """A cross at each point (3,), as large from the `eye` (3,) wherever it is; between two a line with its length."""
     ends = [
         [point - step, point + step] for point in points for step in _CROSS * np.linalg.norm(point - eye) * np.eye(3)

@@ -28,7 +28,7 @@ class Moment:
     @cached_property
     def photographs(self) -> dict[str, tuple[npt.NDArray[np.uint8], ...]]:
         """The images at their size, at half of it, at a quarter and so on: what is drawn small must not flicker."""
-        return {name: _halvings(image) for name, image in self.snapshot.images.items()}
+        return {name: _build_image_pyramid(image) for name, image in self.snapshot.images.items()}
 
     @property
     def num_bytes(self) -> int:
@@ -62,7 +62,7 @@ def same_world(one: Moment, other: Moment) -> bool:
     return bool(np.linalg.norm(here - there, axis=1).max() <= _MOST_MOVED * spread)
 
 
-def remembered(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTES) -> History:
+def append_moment(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTES) -> History:
     """The history with `moment` as its newest, thinned until it fits into `memory_bytes`.
 
     What goes first is the moment whose neighbours are closest together in time, so that the whole time axis stays
@@ -77,7 +77,7 @@ def remembered(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTE
     return tuple(kept)
 
 
-def _halvings(image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], ...]:
+def _build_image_pyramid(image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], ...]:
     levels = [image]
     while min(levels[-1].shape[:2]) >= 2 * _SMALLEST:
         height, width = levels[-1].shape[:2]

@@ -20,7 +20,7 @@ class Extent:
     sides: tuple[float, ...]  # of the voxels of level 1 and so on, world units
 
 
-def chosen_levels(extents: Sequence[Extent], budget: int) -> tuple[int, ...]:
+def choose_levels(extents: Sequence[Extent], budget: int) -> tuple[int, ...]:
     """For each piece the level to show, or NOTHING where the budget of Gaussians does not suffice.
 
     A piece wants the coarsest level whose voxels are below a pixel from where the eye is. The nearest is served first:
@@ -39,14 +39,14 @@ def chosen_levels(extents: Sequence[Extent], budget: int) -> tuple[int, ...]:
         if chosen[index] == NOTHING:
             continue
         room = left + extent.counts[chosen[index]]
-        better = [level for level in range(_wanted(extent), chosen[index]) if extent.counts[level] <= room]
+        better = [level for level in range(_choose_level(extent), chosen[index]) if extent.counts[level] <= room]
         if better:
             chosen[index] = better[0]
             left = room - extent.counts[better[0]]
     return tuple(chosen)
 
 
-def _wanted(extent: Extent) -> int:
+def _choose_level(extent: Extent) -> int:
     """The coarsest level that suffices from there."""
     enough = [level for level, side in enumerate(extent.sides, 1) if extent.away >= FOCAL_PX * side]
     return max(enough, default=FULL)

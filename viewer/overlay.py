@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.viewer.canvas import NEAR, Array, Canvas, Image, in_camera
-from splatnode.viewer.shapes import Label, Lines, Photograph, Shapes
+from splatnode.viewer.canvas import NEAR, Array, Canvas, Image, transform_to_camera
+from splatnode.viewer.shapes import ImageQuad, Label, Lines, Shapes
 
 _BEHIND = 1.02  # a shape this many times as far as the surface is behind it
 _PIECES = 24  # that a line is cut into, each of them hidden or not
@@ -19,15 +19,17 @@ _HIDDEN = 0.3  # how much of a line's colour is left where it is behind somethin
 
 def paint_shapes(canvas: Canvas, shapes: Shapes, T_camera_world: Array, K: Array) -> None:
     """The photographs, the nearest on top, and over them the lines."""
-    in_front = [(in_camera(photograph.corners, T_camera_world), photograph) for photograph in shapes.photographs]
+    in_front = [
+        (transform_to_camera(photograph.corners, T_camera_world), photograph) for photograph in shapes.photographs
+    ]
     for corners, photograph in sorted(in_front, key=lambda one: -float(one[0][:, 2].mean())):
-        _paint_photograph(canvas, photograph, corners, K)
+        _paint_image(canvas, photograph, corners, K)
     _paint_lines(canvas, shapes.lines, T_camera_world, K)
     for label in shapes.labels:
         _paint_label(canvas, label, T_camera_world, K)
 
 
-def _paint_photograph(canvas: Canvas, photograph: Photograph, corners: Array, K: Array) -> None:
+def _paint_image(canvas: Canvas, photograph: ImageQuad, corners: Array, K: Array) -> None:
     """The image on its rectangle (camera frame), where nothing is in front; not if that reaches behind the eye."""
     height, width = canvas.depth.shape
     if corners[:, 2].min() < NEAR:
@@ -37,7 +39,7 @@ def _paint_photograph(canvas: Canvas, photograph: Photograph, corners: Array, K:
     high = np.minimum(np.ceil(pixels[:, :2].max(0)).astype(int), [width, height])
     if (high <= low).any():
         return
-    image = _level(photograph.levels, high - low)
+    image = _select_pyramid_level(photograph.levels, high - low)
     image_height, image_width = image.shape[:2]
     source = np.array([[0, 0], [image_width, 0], [image_width, image_height], [0, image_height]], np.float32) - 0.5
     target = (pixels[:, :2] - low - 0.5).astype(np.float32)
@@ -52,7 +54,7 @@ def _paint_photograph(canvas: Canvas, photograph: Photograph, corners: Array, K:
     np.divide(1.0, nearness, out=canvas.depth[box], where=shown)
 
 
-def _level(levels: tuple[Image, ...], size: npt.NDArray[np.int_]) -> Image:
+def _select_pyramid_level(levels: tuple[Image, ...], size: npt.NDArray[np.int_]) -> Image:
     """The smallest of the images that has at least 0.7 pixels for each of `size` (width, height): none flickers."""
     enough = [image for image in levels if (np.array([image.shape[1], image.shape[0]]) >= 0.7 * size).all()]
     return enough[-1] if enough else levels[0]
@@ -78,7 +80,7 @@ def _paint_lines(canvas: Canvas, groups: Sequence[Lines], T_camera_world: Array,
     ends = np.concatenate([group.ends for group in groups])
     group_of = [number for number, group in enumerate(groups) for _ in group.ends]
     steps = np.linspace(0.0, 1.0, _PIECES + 1)
-    start, end = (in_camera(ends[:, i], T_camera_world) for i in (0, 1))
+    start, end = (transform_to_camera(ends[:, i], T_camera_world) for i in (0, 1))
     points = start[:, None] + steps[None, :, None] * (end - start)[:, None]  # (M, pieces + 1, 3)
     ahead = points[..., 2] > NEAR
     pixels = ((points / np.where(ahead, points[..., 2], 1.0)[..., None]) @ K.T)[..., :2]
@@ -89,7 +91,7 @@ def _paint_lines(canvas: Canvas, groups: Sequence[Lines], T_camera_world: Array,
     drawable = near_window[:, :-1] & near_window[:, 1:]
     bright = [tuple(round(255 * value) for value in group.colour) for group in groups]
     for chosen, behind in ((drawable & hidden, True), (drawable & ~hidden, False)):
-        pieces, line_of = _runs(pixels, chosen)
+        pieces, line_of = _find_visible_segments(pixels, chosen)
         for piece, line in zip(np.rint((pieces - 0.5) * 16).astype(np.int32).tolist(), line_of, strict=True):
             colour, thick = bright[group_of[line]], groups[group_of[line]].width
             if behind:
@@ -99,7 +101,7 @@ def _paint_lines(canvas: Canvas, groups: Sequence[Lines], T_camera_world: Array,
 
 def _paint_label(canvas: Canvas, label: Label, T_camera_world: Array, K: Array) -> None:
     """The letters on a dark plate, over everything else; not of a point that is behind the eye or far off."""
-    at = in_camera(label.at, T_camera_world)
+    at = transform_to_camera(label.at, T_camera_world)
     height, width = canvas.depth.shape
     if at[2] < NEAR:
         return
@@ -115,7 +117,7 @@ def _paint_label(canvas: Canvas, label: Label, T_camera_world: Array, K: Array) 
     cv2.putText(canvas.image, label.text, place, cv2.FONT_HERSHEY_SIMPLEX, _LETTERS, colour, 1, cv2.LINE_AA)
 
 
-def _runs(pixels: Array, chosen: npt.NDArray[np.bool_]) -> tuple[Array, npt.NDArray[np.intp]]:
+def _find_visible_segments(pixels: Array, chosen: npt.NDArray[np.bool_]) -> tuple[Array, npt.NDArray[np.intp]]:
     """(R, 2, 2) ends of the parts of M lines (M, pieces + 1, 2) whose pieces are all `chosen`, (R,) of which line."""
     edges = np.diff(np.pad(chosen, ((0, 0), (1, 1))).astype(np.int8), axis=1)  # a line is straight in the picture too
     return np.stack([pixels[edges > 0], pixels[edges < 0]], 1), np.nonzero(edges > 0)[0]

@@ -10,12 +10,12 @@ SLOWEST_S = (
 _COARSEST = 4
 
 
-def first_part(seconds: float) -> int:
-    """By what to divide width and height, so that a picture which takes `seconds` in full takes SLOWEST_S at most."""
+def choose_first_divisor(seconds: float) -> int:
+    """Returns the divisor of width and height with which a picture of `seconds` in full takes SLOWEST_S at most."""
     return min(max(math.ceil(math.sqrt(seconds / SLOWEST_S) - 0.1), 1), _COARSEST)
 
 
-def next_part(part: int, seconds: float) -> int:
+def choose_next_divisor(part: int, seconds: float) -> int:
     """The divisor after a picture with this one took `seconds`: coarser where it was late, finer where time is left."""
     if seconds > SLOWEST_S:
         return min(part + 1, _COARSEST)

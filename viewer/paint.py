@@ -15,23 +15,25 @@ import numpy as np
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.canvas import BACKGROUND, Array, Canvas, Image, empty_canvas
-from splatnode.viewer.outside import seen_from
+from splatnode.viewer.outside import cull_far_shell
 from splatnode.viewer.overlay import paint_shapes
 from splatnode.viewer.points import paint_points
 from splatnode.viewer.shapes import Shapes
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import Viewpoint
 
 _LETTER = 8  # pixels, the width of a wide letter of a caption
 
 
-def paint(gaussians: GaussianArrays, shapes: Shapes, view: Viewpoint, state: State, width: int, height: int) -> Image:
+def paint(
+    gaussians: GaussianArrays, shapes: Shapes, view: Viewpoint, state: ViewerState, width: int, height: int
+) -> Image:
     """(H, W, 3) RGB of the Gaussians, in the colours that they have, with the shapes among them."""
     K = view.K(width, height)
-    return with_shapes(paint_gaussians(gaussians, view.T_world_camera, K, state, width, height), shapes, view)
+    return overlay_shapes(paint_gaussians(gaussians, view.T_world_camera, K, state, width, height), shapes, view)
 
 
-def with_shapes(canvas: Canvas, shapes: Shapes, view: Viewpoint) -> Image:
+def overlay_shapes(canvas: Canvas, shapes: Shapes, view: Viewpoint) -> Image:
     """(H, W, 3) RGB of what is on the canvas, with the shapes among it. The canvas stays as it is."""
     height, width = canvas.depth.shape
     copy = Canvas(canvas.image.copy(), canvas.depth.copy())
@@ -40,12 +42,12 @@ def with_shapes(canvas: Canvas, shapes: Shapes, view: Viewpoint) -> Image:
 
 
 def paint_gaussians(
-    gaussians: GaussianArrays, T_world_camera: Array, K: Array, state: State, width: int, height: int
+    gaussians: GaussianArrays, T_world_camera: Array, K: Array, state: ViewerState, width: int, height: int
 ) -> Canvas:
     """The Gaussians on the background, as Gaussians or as points, or only the background."""
     if not state.gaussians or not len(gaussians):
         return empty_canvas(width, height)
-    gaussians = seen_from(gaussians, T_world_camera[:3, 3])
+    gaussians = cull_far_shell(gaussians, T_world_camera[:3, 3])
     if state.as_points:
         return paint_points(gaussians, np.linalg.inv(T_world_camera), K, state.point_size, width, height)
     rendered = render_arrays(
@@ -60,7 +62,7 @@ def paint_gaussians(
 
 
 def paint_coarsely(
-    gaussians: GaussianArrays, view: Viewpoint, state: State, size: tuple[int, int], part: int
+    gaussians: GaussianArrays, view: Viewpoint, state: ViewerState, size: tuple[int, int], part: int
 ) -> Canvas:
     """The Gaussians for a picture of this size (width, height), painted with one `part`-th of it and made larger."""
     width, height = size
@@ -75,7 +77,7 @@ def paint_coarsely(
     return Canvas(image, depth)
 
 
-def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, weight: float) -> Image:
+def blend_image(image: Image, photograph: Image, camera: CameraEstimate, K: Array, weight: float) -> Image:
     """`image` with the camera's photograph over it, where both are seen from the camera and `K` is the window's."""
     height, width = image.shape[:2]
     size = np.array([camera.width / photograph.shape[1], camera.height / photograph.shape[0], 1.0])
@@ -88,7 +90,7 @@ def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, w
     return np.asarray(cv2.blendLinear(over, image, share, 1.0 - share), np.uint8)
 
 
-def caption(image: Image, lines: Sequence[str]) -> Image:
+def add_caption(image: Image, lines: Sequence[str]) -> Image:
     """The image with text on a dark band below it, wrapped; signs that OpenCV's font lacks become plain ones."""
     step, letters = 18, max((image.shape[1] - 16) // _LETTER, 10)
     plain = [line.replace("°", " deg").replace("×", "x").encode("ascii", "replace").decode() for line in lines]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
 from splatnode.viewer.session import Session
-from splatnode.viewer.viewpoint import orbited, panned, zoomed
+from splatnode.viewer.viewpoint import orbit, pan, zoom
 
 _TURN_PER_PIXEL = 0.006  # radians
 _ZOOM_PER_NOTCH = 0.88
@@ -21,8 +21,8 @@ class Pointer:
         self._pressed: tuple[float, float] | None = None  # where it went down, None: it is up
         self._last = (0.0, 0.0)
 
-    def moved(self, event: gui.MouseEvent, x: float, y: float, size: tuple[int, int]) -> bool:
-        """What an event at a pixel of the picture, which has this size, does; whether it changes the picture."""
+    def handle_event(self, event: gui.MouseEvent, x: float, y: float, size: tuple[int, int]) -> bool:
+        """Handles an event at a pixel of the picture, which has this size; returns whether it changes the picture."""
         if event.type == gui.MouseEvent.Type.BUTTON_DOWN:
             self._pressed = self._last = (x, y)
         elif event.type == gui.MouseEvent.Type.DRAG and self._pressed is not None:
@@ -35,7 +35,7 @@ class Pointer:
         elif event.type == gui.MouseEvent.Type.WHEEL:
             view = self._session.viewpoint_to_move()
             if view is not None:
-                self._session.move(zoomed(view, _ZOOM_PER_NOTCH**event.wheel_dy))
+                self._session.move(zoom(view, _ZOOM_PER_NOTCH**event.wheel_dy))
                 return True
         return False
 
@@ -49,7 +49,7 @@ class Pointer:
         if view is None:
             return False
         if event.is_button_down(gui.MouseButton.LEFT):
-            self._session.move(orbited(view, -_TURN_PER_PIXEL * right, _TURN_PER_PIXEL * down))
+            self._session.move(orbit(view, -_TURN_PER_PIXEL * right, _TURN_PER_PIXEL * down))
         else:
-            self._session.move(panned(view, right, down, float(view.K(*size)[0, 0])))
+            self._session.move(pan(view, right, down, float(view.K(*size)[0, 0])))
         return True

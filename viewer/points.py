@@ -5,16 +5,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.viewer.canvas import BACKGROUND, NEAR, Array, Canvas, in_camera
+from splatnode.viewer.canvas import BACKGROUND, NEAR, Array, Canvas, transform_to_camera
 
 
 def paint_points(
     gaussians: GaussianArrays, T_camera_world: Array, K: Array, size: int, width: int, height: int
 ) -> Canvas:
     """A canvas with squares of `size` pixels at the centres of the Gaussians."""
-    points = in_camera(gaussians.means, T_camera_world.astype(np.float32))
+    points = transform_to_camera(gaussians.means, T_camera_world.astype(np.float32))
     ahead = np.flatnonzero(points[:, 2] > NEAR)
     z = points[ahead, 2]
     focal, corner = K[[0, 1], [0, 1]].astype(np.float32), (K[:2, 2] - size / 2 + 0.5).astype(np.float32)
@@ -29,7 +29,7 @@ def paint_points(
     squares = cv2.dilate(wide, np.ones((size, size), np.uint8), anchor=(size - 1, size - 1))
     owner = squares[size : size + height, size : size + width].astype(np.intp)  # 0, where nobody owns a pixel
     colours = np.zeros((len(order) + 1, 4), np.uint8)  # four bytes are one number, which is gathered at once
-    colours[0, :3], colours[1:, :3] = BACKGROUND, base_rgb(gaussians)[ahead[order]]
+    colours[0, :3], colours[1:, :3] = BACKGROUND, compute_base_rgb(gaussians)[ahead[order]]
     depths = np.concatenate([np.array([np.inf], np.float32), z[order]])
     # Every owner is a valid index; "clip" spares take the buffer that its check would need.
     four = colours.view(np.uint32)[:, 0].take(owner, mode="clip")[..., None].view(np.uint8)

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from splatnode.viewer.sources import Source
 
 if TYPE_CHECKING:
-    from splatnode.recon.result.export.rerun import Recording
+    from splatnode.recon.result.export.rerun import RerunRecording
 
 URL = "rerun+http://127.0.0.1:9876/proxy"  # where rerun listens on this machine
 _PORT = 9876
@@ -35,14 +35,14 @@ def stream(source: Source, url: str = URL) -> None:
 
     _check_listening(url)
     with contextlib.closing(source):
-        recording = rerun.connected(url)
+        recording = rerun.connect_viewer(url)
         try:
             follow(source, recording)
         finally:
             recording.flush()
 
 
-def follow(source: Source, recording: Recording) -> None:
+def follow(source: Source, recording: RerunRecording) -> None:
     """Each moment, and each move of the live camera, is a step; returns when nothing more will come."""
     from splatnode.recon.result.export import rerun
 
@@ -52,8 +52,8 @@ def follow(source: Source, recording: Recording) -> None:
         if moment is not None:
             step += 1
             drawn = rerun.draw(recording, moment.snapshot, step, drawn)
-        if source.tracked is not tracked:
-            step, tracked = step + 1, source.tracked
+        if source.live_camera is not tracked:
+            step, tracked = step + 1, source.live_camera
             rerun.draw_tracked(recording, tracked, step)
         if source.age_s is None:
             return

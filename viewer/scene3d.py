@@ -12,11 +12,11 @@ import numpy.typing as npt
 import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
-from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.canvas import BACKGROUND
-from splatnode.viewer.shapes import Label, Lines, Photograph, Shapes
-from splatnode.viewer.state import State
+from splatnode.viewer.shapes import ImageQuad, Label, Lines, Shapes
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import Viewpoint
 
 _BOUNDS = o3d.geometry.AxisAlignedBoundingBox(np.full(3, -20.0), np.full(3, 20.0))  # for near and far planes
@@ -31,7 +31,7 @@ class Scene3D:
         self._widget, self._scene = widget, scene
         self._shapes: set[str] = set()
         self._labels: list[gui.Label3D] = []
-        scene.set_background([*_encoded(np.array(BACKGROUND) / 255.0), 1.0])
+        scene.set_background([*_encode_srgb(np.array(BACKGROUND) / 255.0), 1.0])
 
     def set_drawing(self, drawing: bool) -> None:
         """Whether the scene is what the person sees.
@@ -41,7 +41,7 @@ class Scene3D:
         """
         self._scene.view.set_post_processing(not drawing)
 
-    def show_gaussians(self, gaussians: GaussianArrays, state: State) -> None:
+    def show_gaussians(self, gaussians: GaussianArrays, state: ViewerState) -> None:
         """The Gaussians, as Gaussians or as points, in place of those that were there."""
         self._remove(_CLOUD)
         if state.gaussians and len(gaussians):
@@ -81,7 +81,9 @@ def image3d(image: npt.NDArray[np.uint8]) -> o3d.geometry.Image:
     return o3d.geometry.Image(np.ascontiguousarray(image))  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
-def _splats(gaussians: GaussianArrays, _state: State) -> tuple[o3d.t.geometry.PointCloud, rendering.MaterialRecord]:
+def _splats(
+    gaussians: GaussianArrays, _state: ViewerState
+) -> tuple[o3d.t.geometry.PointCloud, rendering.MaterialRecord]:
     """Open3D 0.20 leaves out what covers more than 256 of its tiles, whatever its material says: the far shell."""
     cloud = o3d.t.geometry.PointCloud(_tensor(gaussians.means))
     cloud.point["f_dc"] = _tensor(gaussians.sh[:, 0])
@@ -97,9 +99,11 @@ def _splats(gaussians: GaussianArrays, _state: State) -> tuple[o3d.t.geometry.Po
     return cloud, material
 
 
-def _points(gaussians: GaussianArrays, state: State) -> tuple[o3d.t.geometry.PointCloud, rendering.MaterialRecord]:
+def _points(
+    gaussians: GaussianArrays, state: ViewerState
+) -> tuple[o3d.t.geometry.PointCloud, rendering.MaterialRecord]:
     cloud = o3d.t.geometry.PointCloud(_tensor(gaussians.means))
-    cloud.point["colors"] = _tensor(base_rgb(gaussians) / 255.0)
+    cloud.point["colors"] = _tensor(compute_base_rgb(gaussians) / 255.0)
     material = _material("defaultUnlit")
     material.point_size = float(state.point_size)
     return cloud, material
@@ -116,7 +120,7 @@ def _lines(lines: Lines) -> tuple[o3d.geometry.LineSet, rendering.MaterialRecord
     return geometry, material
 
 
-def _photograph(photograph: Photograph) -> tuple[o3d.geometry.TriangleMesh, rendering.MaterialRecord]:
+def _photograph(photograph: ImageQuad) -> tuple[o3d.geometry.TriangleMesh, rendering.MaterialRecord]:
     """A rectangle with the image on it, seen from both sides."""
     triangles = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
     mesh = o3d.geometry.TriangleMesh(
@@ -125,7 +129,7 @@ def _photograph(photograph: Photograph) -> tuple[o3d.geometry.TriangleMesh, rend
     corners = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])  # v points up
     mesh.vertex_colors = o3d.utility.Vector3dVector(np.ones((4, 3)))  # without them the image is half as bright
     mesh.triangle_uvs = o3d.utility.Vector2dVector(corners[triangles.ravel()])
-    levels = np.rint(255 * _encoded(np.arange(256) / 255.0)).astype(np.uint8)
+    levels = np.rint(255 * _encode_srgb(np.arange(256) / 255.0)).astype(np.uint8)
     material = _material("defaultUnlit")
     material.albedo_img = image3d(levels[photograph.levels[0]])
     return mesh, material
@@ -138,7 +142,7 @@ def _material(shader: str) -> rendering.MaterialRecord:
     return material
 
 
-def _encoded(linear: npt.NDArray) -> npt.NDArray[np.float64]:
+def _encode_srgb(linear: npt.NDArray) -> npt.NDArray[np.float64]:
     """sRGB values of linear light in [0, 1] (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 

@@ -11,18 +11,27 @@ from splatnode.recon.result.export.selection import Selection
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.analysis import Analysis, Analyst
 from splatnode.viewer.canvas import Canvas, Image, project
-from splatnode.viewer.colours import coloured
-from splatnode.viewer.editing import EditError, Edits, box, box_lines, edited, one_more, room, write_edited
+from splatnode.viewer.colours import colour_gaussians
+from splatnode.viewer.editing import (
+    EditError,
+    Edits,
+    add_edit,
+    apply_edits,
+    box,
+    box_lines,
+    compute_crop_bounds,
+    write_edited,
+)
 from splatnode.viewer.ground import Ground, ground, ground_lines
 from splatnode.viewer.legend import legend
-from splatnode.viewer.measuring import measured_shapes, surface_point, with_point
-from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, remembered, same_world
-from splatnode.viewer.paint import blended, paint_coarsely, with_shapes
-from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes, together
-from splatnode.viewer.sources import Roaming, Source
-from splatnode.viewer.state import Colouring, State, go_to_camera, press, shown_moment
+from splatnode.viewer.measuring import add_point, measurement_shapes, surface_point
+from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, append_moment, same_world
+from splatnode.viewer.paint import blend_image, overlay_shapes, paint_coarsely
+from splatnode.viewer.shapes import ImageQuad, Shapes, live_camera, merge_shapes, shapes
+from splatnode.viewer.sources import PagedSource, Source
+from splatnode.viewer.state import Colouring, ViewerState, current_moment, go_to_camera, press
 from splatnode.viewer.support import Support
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, at_depth, first_view, overview, scene_pivot
+from splatnode.viewer.viewpoint import Viewpoint, first_view, move_to_camera, overview, scene_pivot, set_pivot_depth
 
 _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 
@@ -30,7 +39,7 @@ _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 class Session:
     """The history, the state and the viewpoint, and the pictures that follow from them. To be used in one thread."""
 
-    def __init__(self, source: Source, state: State, memory_bytes: int = MEMORY_BYTES) -> None:
+    def __init__(self, source: Source, state: ViewerState, memory_bytes: int = MEMORY_BYTES) -> None:
         self.source = source
         self._memory_bytes = memory_bytes  # of the history
         self.state = state
@@ -55,14 +64,14 @@ class Session:
         """Takes what the source has; whether that was something."""
         self._follow_state()
         view = self.viewpoint()
-        if isinstance(self.source, Roaming) and view is not None:
+        if isinstance(self.source, PagedSource) and view is not None:
             self.source.look_from(view.T_world_camera[:3, 3], self.state.which_map)
         moment, before = self.source.take(), self._tracked
-        self._tracked = self.source.tracked
+        self._tracked = self.source.live_camera
         if moment is None:
             return self._tracked is not before
-        self.history = remembered(self.history, moment, self._memory_bytes)
-        self._come_to(self.moment or moment)
+        self.history = append_moment(self.history, moment, self._memory_bytes)
+        self._reset_on_world_change(self.moment or moment)
         return True
 
     def _follow_state(self) -> None:
@@ -70,25 +79,25 @@ class Session:
         moment = self.moment
         before = self._world
         if moment is not None and before is not None and moment is not before and not same_world(before, moment):
-            self._come_to(moment)
+            self._reset_on_world_change(moment)
 
-    def _come_to(self, shown: Moment) -> None:
+    def _reset_on_world_change(self, shown: Moment) -> None:
         """Takes back what was said in another world than that of the moment which is shown now, and its viewpoint."""
         before, self._world = self._world, shown
         if before is not None and not same_world(before, shown):
             self._touched = self._from_outside = False
             self.state = replace(self.state, measured=(), edits=())
         if not self._touched and shown is not before and (self._view is None or shown.snapshot.cameras):
-            self._look(shown)
+            self._choose_viewpoint(shown)
 
     @property
-    def tracked(self) -> CameraEstimate | None:
+    def live_camera(self) -> CameraEstimate | None:
         """The live camera, as it was when something last came."""
         return self._tracked
 
     @property
     def moment(self) -> Moment | None:
-        return shown_moment(self.state, self.history)
+        return current_moment(self.state, self.history)
 
     def analysis(self) -> Analysis | None:
         """The analysis of the shown moment, or of one with the same cameras; None while there is none."""
@@ -99,12 +108,12 @@ class Session:
         usable = known is not None and _same_cameras(known.moment, moment)
         if usable and not self._needs_support():
             return known  # what is advised depends on the cameras: the same ones need no second look
-        self._analysis = self._analyst.of(moment) or (known if usable else None)
+        self._analysis = self._analyst.request_analysis(moment) or (known if usable else None)
         if self._analysis is not None and not usable and not self._touched and self.state.advice:
-            self._look(moment)
+            self._choose_viewpoint(moment)
         return self._analysis
 
-    def _look(self, moment: Moment) -> None:
+    def _choose_viewpoint(self, moment: Moment) -> None:
         """Takes the viewpoint that nobody has chosen: a photographed one, or from outside if that was asked for."""
         if not self._from_outside:
             self._view = first_view(moment)
@@ -125,7 +134,7 @@ class Session:
         self.state = replace(self.state, camera=None, follow=False)
         self._touched, self._from_outside = False, True
         if self.moment is not None:
-            self._look(self.moment)
+            self._choose_viewpoint(self.moment)
 
     def camera(self) -> CameraEstimate | None:
         """The camera whose viewpoint is taken, followed or chosen; None for a free one."""
@@ -137,11 +146,11 @@ class Session:
         return next((camera for camera in moment.snapshot.cameras if camera.name == self.state.camera), None)
 
     def viewpoint(self) -> Viewpoint | None:
-        """Where the person looks from; None where nothing has come yet."""
+        """Returns the current viewpoint; None before the first moment."""
         camera = self.camera()
         if self._view is None or camera is None:
             return self._view
-        return at_camera(self._view, camera)
+        return move_to_camera(self._view, camera)
 
     def move(self, view: Viewpoint) -> None:
         """The person takes another viewpoint, and leaves the camera's if it was one."""
@@ -154,28 +163,28 @@ class Session:
         view, moment = self.viewpoint(), self.moment
         if view is None or moment is None or self.camera() is None:
             return view
-        return at_depth(view, scene_pivot(moment))
+        return set_pivot_depth(view, scene_pivot(moment))
 
     def shapes(self) -> Shapes:
-        """What stands in the scene beside the Gaussians."""
+        """Returns the shapes that are drawn beside the Gaussians."""
         moment, analysis, view, state = self.moment, self.analysis(), self.viewpoint(), self.state
         if moment is None or view is None:
             return Shapes((), ())
         advice, eye = analysis.advice if analysis else None, view.T_world_camera[:3, 3]
         standing = ground_lines(self.ground()) if state.ground else ()
-        boxed = (box_lines(box(room(moment), state.box)),) if state.boxed else ()
-        return together(
+        boxed = (box_lines(box(compute_crop_bounds(moment), state.box)),) if state.boxed else ()
+        return merge_shapes(
             Shapes((*standing, *boxed), ()),
             shapes(moment, state, advice, self._tracked, eye),
-            measured_shapes(state.measured, eye, moment.snapshot.scale),
+            measurement_shapes(state.measured, eye, moment.snapshot.scale),
         )
 
-    def furnished(self, width: int, height: int) -> Shapes:
+    def shapes_with_legend(self, width: int, height: int) -> Shapes:
         """The shapes, and the legend of a picture of this size."""
         moment, view = self.moment, self.viewpoint_to_move()
         if moment is None or view is None or not self.state.ground:
             return self.shapes()
-        return together(self.shapes(), legend(view, width, height, moment.snapshot.scale))
+        return merge_shapes(self.shapes(), legend(view, width, height, moment.snapshot.scale))
 
     def ground(self) -> Ground | None:
         """Below the shown moment; None where there is nothing to stand on."""
@@ -187,7 +196,7 @@ class Session:
         return self._standing[1]
 
     def gaussians(self) -> GaussianArrays:
-        """What the edits leave of the shown moment, in the colours that are asked for, as soon as those are known."""
+        """Returns the Gaussians after the edits, in the chosen colours as soon as those are known."""
         moment, analysis = self.moment, self.analysis()
         if moment is None:
             return GaussianArrays.empty()
@@ -196,7 +205,7 @@ class Session:
         key = (moment, colouring, self.state.edits)
         if self._coloured is None or self._coloured[0] != key:
             support = analysis.support if analysis and ready else Support(np.zeros((0, 0), np.float32))
-            self._coloured = key, edited(coloured(moment, colouring, support), self.state.edits)
+            self._coloured = key, apply_edits(colour_gaussians(moment, colouring, support), self.state.edits)
         return self._coloured[1]
 
     def paint(self, width: int, height: int, part: int = 1) -> Image | None:
@@ -207,11 +216,11 @@ class Session:
         view = self.viewpoint()
         if view is None:
             return None
-        image = with_shapes(self._canvas(view, width, height, part), self.furnished(width, height), view)
-        camera, photograph = self.camera(), self.photograph()
+        image = overlay_shapes(self._canvas(view, width, height, part), self.shapes_with_legend(width, height), view)
+        camera, photograph = self.camera(), self.camera_image()
         if camera is None or photograph is None or self.state.blend == 0.0:
             return image
-        return blended(image, photograph, camera, view.K(width, height), self.state.blend)
+        return blend_image(image, photograph, camera, view.K(width, height), self.state.blend)
 
     def _canvas(self, view: Viewpoint, width: int, height: int, part: int) -> Canvas:
         """The Gaussians alone. They are painted once while nothing but shapes comes and goes."""
@@ -223,15 +232,15 @@ class Session:
             self.paintings += 1
         return self._painted[1]
 
-    def photograph(self) -> Image | None:
-        """What the camera whose viewpoint is taken saw; None where there is none."""
+    def camera_image(self) -> Image | None:
+        """Returns the image of the camera whose viewpoint is taken; None where there is none."""
         moment, camera = self.moment, self.camera()
         return moment.snapshot.images.get(camera.name) if moment and camera else None
 
     def crop(self) -> None:
         """Takes away what is outside of the box. Raises EditError."""
         if self.moment is not None:
-            self._edit(Selection(box=box(room(self.moment), self.state.box)))
+            self._edit(Selection(box=box(compute_crop_bounds(self.moment), self.state.box)))
 
     def keep_seen(self) -> None:
         """Takes away what no two photographs confirm. Raises EditError."""
@@ -239,7 +248,7 @@ class Session:
 
     def _edit(self, edit: Selection) -> None:
         if self.moment is not None:
-            edits: Edits = one_more(self.moment, self.state.edits, edit)
+            edits: Edits = add_edit(self.moment, self.state.edits, edit)
             self.state = replace(self.state, edits=edits, measured=())
 
     def save(self, folder: Path) -> Path:
@@ -254,7 +263,7 @@ class Session:
             view = self.viewpoint()
             point = None if view is None else surface_point(self._canvas(view, width, height, 1), view, x, y)
             if point is not None:
-                self.state = replace(self.state, measured=with_point(self.state.measured, point))
+                self.state = replace(self.state, measured=add_point(self.state.measured, point))
             return point is not None
         name = self._camera_at(x, y, width, height)
         if name is not None:
@@ -282,7 +291,7 @@ def _same_cameras(one: Moment, other: Moment) -> bool:
     return names[0] == names[1] and same_world(one, other)
 
 
-def _depth_at(photograph: Photograph, view: Viewpoint, x: float, y: float, width: int, height: int) -> float | None:
+def _depth_at(photograph: ImageQuad, view: Viewpoint, x: float, y: float, width: int, height: int) -> float | None:
     """How far the photograph is where it is seen at the pixel; None where it is not."""
     corners = project(photograph.corners, view, width, height)
     if corners[:, 2].min() <= 0:

@@ -13,7 +13,7 @@ from splatnode.viewer.advice import Advice
 from splatnode.viewer.colours import source_colour
 from splatnode.viewer.graph import Graph, edge_lines, node_marks
 from splatnode.viewer.moment import Moment
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import look_at, scene_depth, scene_up
 
 Array = npt.NDArray[np.float64]
@@ -41,7 +41,7 @@ class Lines:
 
 
 @dataclass(frozen=True, eq=False)
-class Photograph:
+class ImageQuad:
     """An image on its camera's frustum."""
 
     name: str
@@ -61,11 +61,11 @@ class Label:
 @dataclass(frozen=True, eq=False)
 class Shapes:
     lines: tuple[Lines, ...]
-    photographs: tuple[Photograph, ...]
+    photographs: tuple[ImageQuad, ...]
     labels: tuple[Label, ...] = ()
 
 
-def together(*parts: Shapes) -> Shapes:
+def merge_shapes(*parts: Shapes) -> Shapes:
     """All of them."""
     return Shapes(
         tuple(lines for part in parts for lines in part.lines),
@@ -75,7 +75,11 @@ def together(*parts: Shapes) -> Shapes:
 
 
 def shapes(
-    moment: Moment, state: State, advice: Advice | None, tracked: CameraEstimate | None = None, eye: Array | None = None
+    moment: Moment,
+    state: ViewerState,
+    advice: Advice | None,
+    tracked: CameraEstimate | None = None,
+    eye: Array | None = None,
 ) -> Shapes:
     """All shapes that `state` shows, with the `tracked` live camera where it is known.
 
@@ -96,18 +100,18 @@ def shapes(
             corners = image_corners(camera, camera.T_world_camera, depth)
             lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
             if state.photographs and camera.name in moment.photographs:
-                photographs.append(Photograph(camera.name, corners, moment.photographs[camera.name]))
+                photographs.append(ImageQuad(camera.name, corners, moment.photographs[camera.name]))
     if state.graph and moment.graph is not None:
         lines += _graph(moment.graph)
     if state.uncertainty:
-        for index, camera, axes in _uncertain(snapshot.cameras, eye):
+        for index, camera, axes in _select_uncertain_cameras(snapshot.cameras, eye):
             lines.append(Lines(ellipsoid(camera, axes), source_colour(index), 1))
     if state.tracked and tracked is not None and not state.follow:
         corners = image_corners(tracked, tracked.T_world_camera, 1.2 * depth)
         lines.append(Lines(frustum(tracked.T_world_camera, corners), TRACKED_COLOUR, 3))
     if state.advice and advice is not None and advice.arrow is not None and advice.target is not None:
         start, end = advice.arrow
-        lines += hint(snapshot.cameras, start, end, advice.target, depth)
+        lines += advice_lines(snapshot.cameras, start, end, advice.target, depth)
         labels.append(Label("next view", end, ADVICE_COLOUR))
     return Shapes(tuple(lines), tuple(photographs), tuple(labels))
 
@@ -169,7 +173,9 @@ def ellipsoid(camera: CameraEstimate, axes: Array) -> Array:
     return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
-def _uncertain(cameras: Sequence[CameraEstimate], eye: Array | None) -> Iterator[tuple[int, CameraEstimate, Array]]:
+def _select_uncertain_cameras(
+    cameras: Sequence[CameraEstimate], eye: Array | None
+) -> Iterator[tuple[int, CameraEstimate, Array]]:
     """The cameras whose ellipsoid is drawn, with their positions in the list and the semi-axes (3, 3).
 
     Not one that would be a dot from the `eye`, nor one that has the eye within it.
@@ -193,7 +199,7 @@ def path(cameras: tuple[CameraEstimate, ...]) -> Array:
     return np.stack([centres[:-1], centres[1:]], 1)
 
 
-def hint(
+def advice_lines(
     cameras: tuple[CameraEstimate, ...], start: Array, end: Array, target: Array, depth: float
 ) -> tuple[Lines, Lines]:
     """A frustum at `end` that looks at `target`, as a camera there would, and the way there from the one at `start`."""

@@ -16,13 +16,13 @@ from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateClient
-from splatnode.capture.process.problems import Problems, is_said
+from splatnode.capture.process.problems import Problems, is_logged
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.result.depth_message import DepthHeader, with_depth
-from splatnode.recon.result.export import viewer_safe
-from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_from, from_message
+from splatnode.recon.result.depth_message import DepthHeader, add_depth_shares
+from splatnode.recon.result.export import sanitize_gaussians
+from splatnode.recon.result.message import CameraRecord, SceneHeader, decode_snapshot, parse_camera
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
-from splatnode.recon.result.stored_snapshot import found_photographs, read_result
+from splatnode.recon.result.stored_snapshot import load_images, read_result
 from splatnode.viewer.moment import Moment
 
 log = logging.getLogger(__name__)
@@ -40,21 +40,21 @@ class Source(Protocol):
         """Seconds since something came; None where nothing more will."""
 
     @property
-    def tracked(self) -> CameraEstimate | None:
-        """Where the live camera is just now in the newest scene; None: not known."""
+    def live_camera(self) -> CameraEstimate | None:
+        """Returns the live camera in the newest scene; None where it is not known."""
 
     def close(self) -> None: ...
 
 
 @runtime_checkable
-class Roaming(Protocol):
+class PagedSource(Protocol):
     """A source that has more than fits into memory, and gives what is near."""
 
     def look_from(self, eye: npt.NDArray[np.float64], which: int) -> None:
-        """Where the person looks from now (3,), and at which of its maps. Never waits."""
+        """Sets the viewpoint's position (3,) and the map that it looks at. Never waits."""
 
 
-class Finished:
+class FixedSource:
     """One moment that is there from the start."""
 
     age_s = None
@@ -71,7 +71,7 @@ class Finished:
         self._moment = None
 
 
-class Live:
+class LiveSource:
     """The scene of a running node. A thread listens; it keeps one moment, the newest."""
 
     def __init__(self, network: Network) -> None:
@@ -96,7 +96,7 @@ class Live:
         return min(self._client.age_s, self._heartbeats.age_s)
 
     @property
-    def tracked(self) -> CameraEstimate | None:
+    def live_camera(self) -> CameraEstimate | None:
         return self._tracked
 
     def take(self) -> Moment | None:
@@ -130,16 +130,16 @@ class Live:
                 heartbeat = self._heartbeats.latest(0)
                 if heartbeat is not None and heartbeat.header.tracked != last:
                     last = heartbeat.header.tracked
-                    self._tracked = last and camera_from(last)
+                    self._tracked = last and parse_camera(last)
                 if message is None:
                     continue
                 self.scene = message.header.session, message.header.sequence
                 try:
-                    live = from_message(message)
-                    snapshot = self._with_depth(_safe(live.snapshot), self.scene)
+                    live = decode_snapshot(message)
+                    snapshot = self._attach_depth(_sanitize_snapshot(live.snapshot), self.scene)
                     moment = Moment(snapshot, time.monotonic(), live.scene_id)
                 except Exception as error:  # of one scene; the next one may do
-                    if is_said(self._refusals.add("scenes that were refused", error)):
+                    if is_logged(self._refusals.add("scenes that were refused", error)):
                         log.warning("a scene of the node was refused: %s", error)
                     continue
                 with self._lock:
@@ -150,7 +150,7 @@ class Live:
                 self._error = error
                 self._lock.notify_all()
 
-    def _with_depth(self, snapshot: Snapshot, scene: tuple[str, int]) -> Snapshot:
+    def _attach_depth(self, snapshot: Snapshot, scene: tuple[str, int]) -> Snapshot:
         """The snapshot of message `scene` with its shares of multi-view consistent depth, if these come in time."""
         deadline = time.monotonic() + _DEPTH_S
         while (depth := self._depth) is None or (depth.session, depth.scene_sequence) != scene:
@@ -160,7 +160,7 @@ class Live:
             if message is None:
                 return snapshot
             self._depth = message.header
-        return with_depth(snapshot, depth)
+        return add_depth_shares(snapshot, depth)
 
 
 def load_result(place: Path, photographs: Path | None = None) -> Moment:
@@ -169,10 +169,10 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
     They are looked for in `photographs`, or else where `read_result` tells. Raises what that raises.
     """
     snapshot, folders = read_result(place)
-    images = found_photographs(snapshot.cameras, [photographs] if photographs else folders)
+    images = load_images(snapshot.cameras, [photographs] if photographs else folders)
     return Moment(replace(snapshot, images=images), time.monotonic())
 
 
-def _safe(snapshot: Snapshot) -> Snapshot:
-    """What comes over the network is input: Gaussians that cannot be drawn are left out."""
-    return replace(snapshot, gaussians=viewer_safe(snapshot.gaussians))
+def _sanitize_snapshot(snapshot: Snapshot) -> Snapshot:
+    """Removes Gaussians that cannot be drawn: what comes over the network is untrusted input."""
+    return replace(snapshot, gaussians=sanitize_gaussians(snapshot.gaussians))

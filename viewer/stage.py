@@ -14,7 +14,7 @@ import numpy.typing as npt
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
 from splatnode.viewer.canvas import BACKGROUND
-from splatnode.viewer.pace import first_part, next_part
+from splatnode.viewer.pace import choose_first_divisor, choose_next_divisor
 from splatnode.viewer.scene3d import Scene3D, image3d, look_from
 from splatnode.viewer.session import Session
 from splatnode.viewer.state import open3d_draws
@@ -30,7 +30,7 @@ _ASKED_REDRAWN_S = (0.3, 1.0)
 _SCENE_REDRAWN_S = (0.0, 0.0, 0.3, 1.0)
 
 
-class Stage:
+class WindowStage:
     """Two widgets in the same place, of which one is visible. `software`: Vulkan runs on the processor."""
 
     def __init__(self, window: gui.Window, software: bool) -> None:
@@ -47,7 +47,7 @@ class Stage:
         self._redraw_at: list[float] = []  # times to come
 
     @property
-    def painted_s(self) -> float | None:
+    def paint_time_s(self) -> float | None:
         """Seconds that a picture takes; None where Open3D draws it."""
         return self._painted_s if self.picture.visible else None
 
@@ -64,7 +64,7 @@ class Stage:
         view = session.viewpoint()
         if view is None or min(self.size) < 2:
             return
-        blends = session.state.blend > 0 and session.photograph() is not None
+        blends = session.state.blend > 0 and session.camera_image() is not None
         own = blends or not open3d_draws(session.state, self._software)
         if self.picture.visible != own or self.scene.visible == own:
             self.picture.visible, self.scene.visible = own, not own
@@ -76,7 +76,7 @@ class Stage:
         else:
             self._draw_scene(session, view)
 
-    def redraws(self) -> bool:
+    def redraw_if_due(self) -> bool:
         """Whether the window is to be drawn once more, though nothing has changed."""
         if not self._redraw_at or time.monotonic() < self._redraw_at[0]:
             return False
@@ -93,14 +93,14 @@ class Stage:
 
     def _paint(self, session: Session, hurried: bool) -> None:
         width, height = self.size
-        self._part = (self._part or first_part(self._painted_s)) if hurried else None
+        self._part = (self._part or choose_first_divisor(self._painted_s)) if hurried else None
         started, paintings = time.perf_counter(), session.paintings
         image = session.paint(width, height, self._part or 1)
         if image is not None:
             self.picture.update_image(image3d(image))
         took = time.perf_counter() - started
         if self._part is not None:
-            self._part = next_part(self._part, took)
+            self._part = choose_next_divisor(self._part, took)
         elif session.paintings > paintings:
             self._painted_s = took
 
@@ -110,6 +110,6 @@ class Stage:
         if len(self._in_scene) != len(wanted) or any(a is not b for a, b in zip(self._in_scene, wanted, strict=True)):
             self._content.show_gaussians(session.gaussians(), state)
             self._in_scene = wanted
-        self._content.show_shapes(session.furnished(*self.size))
+        self._content.show_shapes(session.shapes_with_legend(*self.size))
         look_from(self.scene, view, *self.size)
         self.scene.force_redraw()

@@ -34,7 +34,7 @@ class Colouring(enum.Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class ViewerState:
     engine: Engine = Engine.CORE
     as_points: bool = False
     point_size: int = 3  # pixels
@@ -62,7 +62,7 @@ class State:
     edits: tuple[Selection, ...] = ()  # what was taken out of the scene, in order
 
 
-Change = Callable[[State, History], State]
+Change = Callable[[ViewerState, History], ViewerState]
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Binding:
     change: Change
 
 
-def open3d_draws(state: State, software: bool) -> bool:
+def open3d_draws(state: ViewerState, software: bool) -> bool:
     """Whether Open3D is asked for the picture, and for one that it draws whole.
 
     Its splat shader leaves tiles black, mostly whole rows of them, where Vulkan is `software` (Open3D 0.20, Mesa 22.3).
@@ -80,14 +80,14 @@ def open3d_draws(state: State, software: bool) -> bool:
     return state.engine is Engine.OPEN3D and (state.as_points or not software)
 
 
-def shown_moment(state: State, history: History) -> Moment | None:
+def current_moment(state: ViewerState, history: History) -> Moment | None:
     """The moment to show, None where nothing has come yet."""
     if state.held is not None:
         return state.held
     return history[-1] if history else None
 
 
-def press(state: State, history: History, key: str) -> State:
+def press(state: ViewerState, history: History, key: str) -> ViewerState:
     """The state after a key; keys that mean nothing leave it as it is."""
     for binding in BINDINGS:
         if binding.key == key:
@@ -95,20 +95,20 @@ def press(state: State, history: History, key: str) -> State:
     return state
 
 
-def go_to_camera(state: State, name: str | None) -> State:
+def go_to_camera(state: ViewerState, name: str | None) -> ViewerState:
     """The viewpoint of the camera called `name`; None leaves the cameras."""
     return replace(state, camera=name, follow=False)
 
 
-def go_to_moment(state: State, history: History, index: int) -> State:
+def go_to_moment(state: ViewerState, history: History, index: int) -> ViewerState:
     """The moment at `index` of the history; the last one means the newest, also when newer ones come."""
     if not history or (index >= len(history) - 1 and not state.paused):
         return replace(state, held=None)
     return replace(state, held=history[min(max(index, 0), len(history) - 1)])
 
 
-def moment_index(state: State, history: History) -> int:
-    """Where the shown moment is on the time axis. One that was thinned out is where it would be."""
+def moment_index(state: ViewerState, history: History) -> int:
+    """Returns the index of the current moment on the time axis. One that was thinned out is where it would be."""
     if state.held is None:
         return max(len(history) - 1, 0)
     later = [index for index, moment in enumerate(history) if moment.received_s >= state.held.received_s]
@@ -119,31 +119,31 @@ def _toggle(field: str) -> Change:
     return lambda state, _history: replace(state, **{field: not getattr(state, field)})
 
 
-def _pause(state: State, history: History) -> State:
+def _pause(state: ViewerState, history: History) -> ViewerState:
     """Stops at what is shown; goes on with the newest."""
     if state.paused:
         return replace(state, paused=False, held=None)
-    return replace(state, paused=True, held=shown_moment(state, history))
+    return replace(state, paused=True, held=current_moment(state, history))
 
 
-def _follow(state: State, _history: History) -> State:
+def _follow(state: ViewerState, _history: History) -> ViewerState:
     return replace(state, follow=not state.follow, camera=None)
 
 
-def _measure(state: State, _history: History) -> State:
+def _measure(state: ViewerState, _history: History) -> ViewerState:
     """Begins to measure; ends it, and forgets the points."""
     return replace(state, measuring=not state.measuring, measured=())
 
 
-def _undo(state: State, _history: History) -> State:
+def _undo(state: ViewerState, _history: History) -> ViewerState:
     return replace(state, edits=state.edits[:-1])
 
 
-def _engine(state: State, _history: History) -> State:
+def _engine(state: ViewerState, _history: History) -> ViewerState:
     return replace(state, engine=Engine.OPEN3D if state.engine is Engine.CORE else Engine.CORE)
 
 
-def _colouring(state: State, _history: History) -> State:
+def _colouring(state: ViewerState, _history: History) -> ViewerState:
     order = list(Colouring)
     return replace(state, colouring=order[(order.index(state.colouring) + 1) % len(order)])
 
@@ -158,8 +158,8 @@ def _blend(step: float) -> Change:
 
 
 def _camera(step: int) -> Change:
-    def change(state: State, history: History) -> State:
-        moment = shown_moment(state, history)
+    def change(state: ViewerState, history: History) -> ViewerState:
+        moment = current_moment(state, history)
         names = [camera.name for camera in moment.snapshot.cameras] if moment else []
         if not names:
             return state
@@ -174,11 +174,11 @@ def _time(step: int) -> Change:
     return lambda state, history: go_to_moment(state, history, moment_index(state, history) + step)
 
 
-def _next_map(state: State, _history: History) -> State:
+def _next_map(state: ViewerState, _history: History) -> ViewerState:
     return replace(state, which_map=state.which_map + 1, camera=None, follow=False, held=None, paused=False)
 
 
-def _leave(state: State, _history: History) -> State:
+def _leave(state: ViewerState, _history: History) -> ViewerState:
     return replace(state, camera=None, follow=False, help=False)
 
 
@@ -230,5 +230,5 @@ MOUSE = (
 
 
 def help_lines() -> list[tuple[str, str]]:
-    """What can be done: with what, and what it does."""
+    """Lists the commands: key or mouse, and what it does."""
     return [*MOUSE, *((binding.key, binding.help) for binding in BINDINGS), *COMMANDS.items()]

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.viewer.canvas import in_camera
+from splatnode.viewer.canvas import transform_to_camera
 
 _LONGER_SIDE = 160  # pixels of the depth images that tell what is hidden
 _BEHIND = 1.05  # a Gaussian this many times as far as the surface that a camera sees there is hidden from it
@@ -36,17 +36,17 @@ def support(gaussians: GaussianArrays, cameras: tuple[CameraEstimate, ...]) -> S
     """For each Gaussian, the cameras whose image shows its centre unhidden."""
     sizes = np.zeros((len(gaussians), len(cameras)), np.float32)
     for index, camera in enumerate(cameras if len(gaussians) else ()):
-        sizes[:, index] = seen(gaussians, camera)
+        sizes[:, index] = compute_apparent_sizes(gaussians, camera)
     return Support(sizes)
 
 
-def seen(gaussians: GaussianArrays, camera: CameraEstimate) -> npt.NDArray[np.float64]:
+def compute_apparent_sizes(gaussians: GaussianArrays, camera: CameraEstimate) -> npt.NDArray[np.float64]:
     """(N,) how large the camera sees each Gaussian, in pixels a world unit; 0 where it does not see it."""
     scale = min(1.0, _LONGER_SIDE / max(camera.width, camera.height))
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     T_camera_world = np.linalg.inv(camera.T_world_camera)
-    points = in_camera(gaussians.means, T_camera_world)
+    points = transform_to_camera(gaussians.means, T_camera_world)
     depth = points[:, 2]
     ahead = depth > 1e-3
     pixels = points[:, :2] / np.where(ahead, depth, 1.0)[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]

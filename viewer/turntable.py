@@ -22,7 +22,7 @@ _CLEARANCE = 0.02  # of the distance to the scene: no lower above the ground
 
 @dataclass(frozen=True, eq=False)
 class Arc:
-    """Where the cameras were, as seen from the pivot: angles in radians around `up`, and above the level."""
+    """The arc of the cameras, as seen from the pivot: angles in radians around `up`, and above the level."""
 
     azimuths: tuple[float, float]  # least and greatest, from the direction of the cameras' mean
     elevations: tuple[float, float]
@@ -35,13 +35,13 @@ def turntable_views(moment: Moment, frames: int) -> list[Viewpoint]:
     A full circle would mostly show what no photograph shows.
     """
     start, cameras, below = overview(moment), moment.snapshot.cameras, ground(moment)
-    level = _level(cameras, start) if cameras else None
+    level = _mean_level_direction(cameras, start) if cameras else None
     if level is None or len(cameras) < 2:
         width, height, level = *_ALONE, (start.T_world_camera[:3, 3] - start.pivot) / start.distance
         middle, distance = (0.0, math.asin(float(np.clip(level @ start.up, -1.0, 1.0)))), start.distance
-        level = _flat(level, start.up)
+        level = _project_to_level(level, start.up)
     else:
-        arc = seen_arc(cameras, start.pivot, start.up)
+        arc = compute_arc(cameras, start.pivot, start.up)
         (left, right), (low, high), distance = arc.azimuths, arc.elevations, arc.distance
         width, height = min((right - left) / 2.0, _WIDEST[0]), min((high - low) / 2.0, _WIDEST[1])
         middle = (left + right) / 2.0, (low + high) / 2.0
@@ -52,11 +52,11 @@ def turntable_views(moment: Moment, frames: int) -> list[Viewpoint]:
     ]
 
 
-def seen_arc(cameras: tuple[CameraEstimate, ...], pivot: Array, up: Array) -> Arc:
+def compute_arc(cameras: tuple[CameraEstimate, ...], pivot: Array, up: Array) -> Arc:
     """The arc of at least one camera's centre around the `pivot` (3,)."""
     offsets = np.array([camera.T_world_camera[:3, 3] for camera in cameras]) - pivot
     distances = np.maximum(np.linalg.norm(offsets, axis=1), 1e-12)
-    level = _flat(offsets.mean(0), up)
+    level = _project_to_level(offsets.mean(0), up)
     azimuths = np.arctan2(offsets @ np.cross(up, level), offsets @ level)
     elevations = np.arcsin(np.clip(offsets @ up / distances, -1.0, 1.0))
     return Arc(
@@ -66,13 +66,13 @@ def seen_arc(cameras: tuple[CameraEstimate, ...], pivot: Array, up: Array) -> Ar
     )
 
 
-def _level(cameras: tuple[CameraEstimate, ...], start: Viewpoint) -> Array:
+def _mean_level_direction(cameras: tuple[CameraEstimate, ...], start: Viewpoint) -> Array:
     """(3,) the level direction from the pivot to the middle of the cameras."""
     centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
-    return _flat(centres.mean(0) - start.pivot, start.up)
+    return _project_to_level(centres.mean(0) - start.pivot, start.up)
 
 
-def _flat(direction: Array, up: Array) -> Array:
+def _project_to_level(direction: Array, up: Array) -> Array:
     flat = direction - (direction @ up) * up
     if np.linalg.norm(flat) < 1e-9:  # straight above: any level direction will do
         flat = np.cross(up, np.roll(up, 1))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.process.arguments import address, port, positive, size
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
@@ -68,5 +68,10 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("view", "show a result, a scene or a running node", _view_arguments, lazily("splatnode.viewer.cli", "view")),
+    Verb(
+        "view",
+        "show a result, a scene or a running node",
+        _view_arguments,
+        import_lazily("splatnode.viewer.cli", "view"),
+    ),
 )

@@ -58,7 +58,7 @@ def look_at(centre: Array, target: Array, up: Array) -> Array:
     return T
 
 
-def orbited(view: Viewpoint, right_rad: float, up_rad: float) -> Viewpoint:
+def orbit(view: Viewpoint, right_rad: float, up_rad: float) -> Viewpoint:
     """After a walk around the pivot: to the right around the world's up, then upwards, not over the pole."""
     outwards = (view.T_world_camera[:3, 3] - view.pivot) / view.distance
     elevation = math.asin(float(np.clip(outwards @ view.up, -1.0, 1.0)))
@@ -70,28 +70,28 @@ def orbited(view: Viewpoint, right_rad: float, up_rad: float) -> Viewpoint:
     return replace(view, T_world_camera=look_at(view.pivot + view.distance * direction, view.pivot, view.up))
 
 
-def panned(view: Viewpoint, right_px: float, down_px: float, focal_px: float) -> Viewpoint:
+def pan(view: Viewpoint, right_px: float, down_px: float, focal_px: float) -> Viewpoint:
     """After a drag of the scene by pixels: what is at the pivot's distance stays under the pointer."""
     T = view.T_world_camera.copy()
     T[:3, 3] -= view.distance / focal_px * (right_px * T[:3, 0] + down_px * T[:3, 1])
     return replace(view, T_world_camera=T)
 
 
-def zoomed(view: Viewpoint, factor: float) -> Viewpoint:
-    """With the distance to the pivot multiplied by `factor`."""
+def zoom(view: Viewpoint, factor: float) -> Viewpoint:
+    """Returns the view with its distance to the pivot multiplied by `factor`."""
     distance = max(view.distance * factor, _NEAREST)
     T = view.T_world_camera.copy()
     T[:3, 3] = view.pivot - distance * T[:3, 2]
     return replace(view, T_world_camera=T, distance=distance)
 
 
-def at_camera(view: Viewpoint, camera: CameraEstimate) -> Viewpoint:
+def move_to_camera(view: Viewpoint, camera: CameraEstimate) -> Viewpoint:
     """The viewpoint of an estimated camera, with its lens."""
     lens = camera.K, float(camera.width), float(camera.height)
     return replace(view, T_world_camera=camera.T_world_camera, lens=lens)
 
 
-def at_depth(view: Viewpoint, pivot: Array) -> Viewpoint:
+def set_pivot_depth(view: Viewpoint, pivot: Array) -> Viewpoint:
     """The same picture, with the point that orbits go around as deep as the `pivot` (3,)."""
     depth = float((pivot - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2])
     return replace(view, distance=max(depth, _SHALLOWEST))
@@ -104,7 +104,7 @@ def first_view(moment: Moment) -> Viewpoint:
         return view
     centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
     middle = cameras[int(np.linalg.norm(centres - centres.mean(0), axis=1).argmin())]
-    return at_depth(at_camera(view, middle), scene_pivot(moment))
+    return set_pivot_depth(move_to_camera(view, middle), scene_pivot(moment))
 
 
 def overview(moment: Moment, also: Sequence[Array] = ()) -> Viewpoint:

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from urllib.parse import urlsplit
 
 from splatnode.viewer.sources import Source
-from splatnode.viewer.viser_stage import Stage
+from splatnode.viewer.viser_stage import ViserStage
 from splatnode.viewer.web.access import LOOPBACK, Access
 
 viser: Any = importlib.import_module("viser")  # by its name: where it is not installed, pyright takes this file for it
@@ -33,28 +33,28 @@ _EVERYWHERE = ("0.0.0.0", "::")
 
 def show(source: Source, listen: str | None, port: int, say: Callable[[str], None]) -> NoReturn:
     """Serves until the process is told to end. Raises OSError where it cannot listen, and what the source raises."""
-    with contextlib.closing(source), serving(listen or LOOPBACK, port) as server:
-        stage = Stage(server)
+    with contextlib.closing(source), open_server(listen or LOOPBACK, port) as server:
+        stage = ViserStage(server)
         say(_invitation(listen, server.get_port()))
         while True:
             moment = source.take()
             if moment is not None:
                 stage.draw(moment)
-            stage.track(source.tracked)
-            stage.attend()
+            stage.track(source.live_camera)
+            stage.apply_client_changes()
             time.sleep(_POLL_S)
 
 
 @contextlib.contextmanager
-def serving(address: str, port: int) -> Iterator[Any]:
+def open_server(address: str, port: int) -> Iterator[Any]:
     """A server of viser's that listens there, port 0: any that is free. Raises OSError where it cannot listen."""
     port = _free_port(address, port)  # viser would wait for ever, or go elsewhere
     importlib.import_module("rich").get_console().quiet = True  # to which viser prints; the address is told by us
-    with _only_its_own_page(address) as guarded:
+    with _refuse_foreign_origins(address) as guarded:
         server = _Server(host=address, port=port, label=_TITLE, verbose=False)
     try:
         if server.get_port() != port:
-            raise _taken(address, port)
+            raise _port_in_use_error(address, port)
         if not guarded:
             raise RuntimeError(
                 "this release of viser starts in another way than 1.1.1, and would answer any site's page"
@@ -73,11 +73,11 @@ def _free_port(address: str, port: int) -> int:
             return tried.getsockname()[1]
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise _taken(address, port) from None
+            raise _port_in_use_error(address, port) from None
         raise OSError(f"cannot listen on {address}, port {port}: {error.strerror}") from None
 
 
-def _taken(address: str, port: int) -> OSError:
+def _port_in_use_error(address: str, port: int) -> OSError:
     return OSError(f"cannot listen on {address}, port {port}: another program listens there. --port takes another port")
 
 
@@ -103,7 +103,7 @@ class _Server(viser.ViserServer):
 
 
 @contextlib.contextmanager
-def _only_its_own_page(address: str) -> Iterator[list[int]]:
+def _refuse_foreign_origins(address: str) -> Iterator[list[int]]:
     """While a server starts: it is made to refuse what pages of other sites ask of it, which viser does not.
 
     Gives the ports for which that was done.
@@ -115,10 +115,12 @@ def _only_its_own_page(address: str) -> Iterator[list[int]]:
     loopback = Access(address, 0, None) if ipaddress.ip_address(address).is_loopback else None
     ports: list[int] = []
 
-    def guarded(handler: object, host: str, port: int, *, process_request: Callable[..., Any], **options: Any) -> Any:
+    def serve_same_origin(
+        handler: object, host: str, port: int, *, process_request: Callable[..., Any], **options: Any
+    ) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             asked, origin = request.headers.get("Host"), request.headers.get("Origin")
-            by_its_name = loopback is None or loopback.host_is_fine(asked)
+            by_its_name = loopback is None or loopback.is_allowed_host(asked)
             if not by_its_name or (origin is not None and urlsplit(origin).netloc != asked):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "This server answers its own page.\n")
             return process_request(connection, request)
@@ -126,7 +128,7 @@ def _only_its_own_page(address: str) -> Iterator[list[int]]:
         ports.append(port)
         return original(handler, host, port, process_request=answer, **options)
 
-    websockets.serve = guarded
+    websockets.serve = serve_same_origin
     try:
         yield ports
     finally:

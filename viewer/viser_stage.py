@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.process.printable import printable
-from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.colours import source_colour
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, frustum_depth
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview
+from splatnode.viewer.viewpoint import Viewpoint, move_to_camera, overview
 
 _LIVE = "/live camera"
 _NEAR = 0.01  # world units, of what is drawn
@@ -28,7 +28,7 @@ _LARGEST_VARIANCE = 3e4  # covariances travel as 16-bit floats, which end at 655
 _LARGEST_GROWTH = 64.0  # of the scene on its way: beyond it, small Gaussians gain nothing
 
 
-class Stage:
+class ViserStage:
     """The scene, and the switches beside it, which are the same for all visitors; each has an own viewpoint."""
 
     def __init__(self, server: Any) -> None:
@@ -53,25 +53,27 @@ class Stage:
         with server.atomic():
             before, self._nodes, self._frusta = self._nodes, {}, []
             if len(snapshot.gaussians):
-                self._nodes["/gaussians"] = server.scene.add_gaussian_splats("/gaussians", **sent(snapshot.gaussians))
+                self._nodes["/gaussians"] = server.scene.add_gaussian_splats(
+                    "/gaussians", **make_splat_arguments(snapshot.gaussians)
+                )
             for index, camera in enumerate(snapshot.cameras):
                 self._draw_camera(index, camera, moment)
             for name in sorted(before.keys() - self._nodes.keys(), reverse=True):  # the others replaced their namesakes
                 before[name].remove()
             for text in self._texts:
                 text.remove()
-            self._texts = [_text(server, title, text) for title, text in _told(snapshot)]
+            self._texts = [_text(server, title, text) for title, text in _describe_snapshot(snapshot)]
         if moment.scene_id != self._scene_id and self._nodes:  # before, there was nothing to be taken to
             self._scene_id = moment.scene_id
-            self._begin(overview(moment))
+            self._set_initial_view(overview(moment))
 
-    def _begin(self, view: Viewpoint) -> None:
+    def _set_initial_view(self, view: Viewpoint) -> None:
         """Takes visitors there, and those who come later. Not within a scene: viser moves all who look already."""
         server, first = self.server, self.server.initial_camera
         with server.atomic():
             server.scene.set_up_direction(tuple(view.up))
             first.up, first.position, first.look_at = view.up, view.T_world_camera[:3, 3], view.pivot
-            first.fov = _field(view.lens[0], view.lens[2])
+            first.fov = _vertical_field_of_view(view.lens[0], view.lens[2])
         for client in server.get_clients().values():
             _go(client, view)
 
@@ -87,7 +89,7 @@ class Stage:
             frustum = None
         self._tracked = camera, frustum
 
-    def attend(self) -> None:
+    def apply_client_changes(self) -> None:
         """Does what visitors have asked for since."""
         switched = self.cameras.value, self.photographs.value
         if switched != self._switched:
@@ -102,19 +104,19 @@ class Stage:
             client.camera.near = 2.0 * self._depth if (away < self._depth).any() else _NEAR
 
     def _draw_camera(self, index: int, camera: CameraEstimate, moment: Moment) -> None:
-        own = printable(camera.name).replace("/", "∕")  # a stroke in a name would be a branch of the tree
+        own = sanitize_text(camera.name).replace("/", "∕")  # a stroke in a name would be a branch of the tree
         name = f"/cameras/{own}"
         photograph = moment.snapshot.images.get(camera.name)
         shown = photograph if self._switched[1] else None
         frustum = _frustum(self.server, name, camera, self._depth, source_colour(index), shown)
         frustum.visible = self._switched[0]
-        frustum.on_click(_going_to(camera, moment))
+        frustum.on_click(_make_click_handler(camera, moment))
         self._frusta.append((frustum, photograph))
-        label = self.server.scene.add_label(f"{name}/name", printable(camera.name), font_screen_scale=0.7)
+        label = self.server.scene.add_label(f"{name}/name", sanitize_text(camera.name), font_screen_scale=0.7)
         self._nodes |= {name: frustum, f"{name}/name": label}
 
 
-def sent(gaussians: GaussianArrays) -> dict[str, Any]:
+def make_splat_arguments(gaussians: GaussianArrays) -> dict[str, Any]:
     """The arguments of `add_gaussian_splats`: view-dependent colour is left out, which viser does not draw.
 
     The scene is sent larger and drawn smaller by as much, so that covariances of small Gaussians are no 0 in 16 bits.
@@ -125,7 +127,7 @@ def sent(gaussians: GaussianArrays) -> dict[str, Any]:
     return {
         "centers": (growth * gaussians.means).astype(np.float32),
         "covariances": (growth**2 * covariances).astype(np.float32),
-        "rgbs": base_rgb(gaussians),
+        "rgbs": compute_base_rgb(gaussians),
         "opacities": gaussians.opacities[:, None],
         "scale": 1.0 / growth,
     }
@@ -143,7 +145,7 @@ def _frustum(
     aspect = camera.width / camera.height
     return server.scene.add_camera_frustum(
         name,
-        fov=_field(camera.K, camera.height),
+        fov=_vertical_field_of_view(camera.K, camera.height),
         aspect=aspect,
         scale=depth * np.cbrt(aspect * up * up / 3.0),  # viser draws frusta of one scale with one volume
         thickness=1.5,
@@ -157,9 +159,9 @@ def _frustum(
     )
 
 
-def _going_to(camera: CameraEstimate, moment: Moment) -> Callable[[Any], None]:
-    """What takes the visitor who clicks a camera to its view."""
-    view = at_camera(overview(moment), camera)
+def _make_click_handler(camera: CameraEstimate, moment: Moment) -> Callable[[Any], None]:
+    """Returns the callback that takes the visitor who clicks a camera to its view."""
+    view = move_to_camera(overview(moment), camera)
     return lambda event: _go(event.client, view)
 
 
@@ -168,7 +170,7 @@ def _go(client: Any, view: Viewpoint) -> None:
     with client.atomic():
         at.up_direction = -view.T_world_camera[:3, 1]
         at.position, at.look_at = view.T_world_camera[:3, 3], view.pivot
-        at.fov = _field(view.lens[0], view.lens[2])
+        at.fov = _vertical_field_of_view(view.lens[0], view.lens[2])
 
 
 def _text(server: Any, title: str, text: str) -> Any:
@@ -176,19 +178,19 @@ def _text(server: Any, title: str, text: str) -> Any:
     return server.gui.add_text(title, text, multiline=True, disabled=True)
 
 
-def _told(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
+def _describe_snapshot(snapshot: Snapshot) -> Iterator[tuple[str, str]]:
     """Titles and texts beside the picture."""
     verdict = snapshot.verdict
-    yield verdict.code.value, printable(" ".join(filter(None, (verdict.message, verdict.advice))))
+    yield verdict.code.value, sanitize_text(" ".join(filter(None, (verdict.message, verdict.advice))))
     state = "final" if snapshot.final else "being made"
     yield "Scene", f"{len(snapshot.cameras)} cameras, {len(snapshot.gaussians)} Gaussians, {state}"
     if snapshot.dropped:
         yield (
             "Left out",
-            "\n".join(printable(f"{each.name}: {each.reason}") for each in snapshot.dropped[:_MOST_DROPPED]),
+            "\n".join(sanitize_text(f"{each.name}: {each.reason}") for each in snapshot.dropped[:_MOST_DROPPED]),
         )
 
 
-def _field(K: npt.NDArray[np.float64], height: float) -> float:
+def _vertical_field_of_view(K: npt.NDArray[np.float64], height: float) -> float:
     """Radians from the upper edge of the picture to the lower one."""
     return 2.0 * float(np.arctan2(height / 2.0, K[1, 1]))

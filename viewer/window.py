@@ -23,7 +23,7 @@ from splatnode.viewer.help_sheet import HelpSheet
 from splatnode.viewer.panel.panel import Panel
 from splatnode.viewer.pointer import Pointer
 from splatnode.viewer.session import Session
-from splatnode.viewer.stage import Image, Stage
+from splatnode.viewer.stage import Image, WindowStage
 from splatnode.viewer.state import Engine, open3d_draws
 
 _IDLE_AFTER_S = 1.0  # without anything to do, ticks begin to sleep
@@ -86,16 +86,16 @@ class _Window:
         self._software = software
         self._app, self._session, self._screenshots = app, session, screenshots
         self._window = app.create_window("splatnode", *size)
-        self._stage = Stage(self._window, software)
-        self._panel = Panel(self._window, self._guarded(self._change), self._guarded(self._command))
+        self._stage = WindowStage(self._window, software)
+        self._panel = Panel(self._window, self._guard_callback(self._change), self._guard_callback(self._command))
         self._help = HelpSheet(self._window)
         for widget in (self._stage.picture, self._stage.scene, *self._panel.widgets, self._help.root):
             self._window.add_child(widget)
-        self._stage.picture.set_on_mouse(self._guarded(self._mouse, gui.ImageWidget.EventCallbackResult.HANDLED))
-        self._stage.scene.set_on_mouse(self._guarded(self._mouse, gui.Widget.EventCallbackResult.CONSUMED))
-        self._window.set_on_layout(self._guarded(self._layout))
-        self._window.set_on_key(self._guarded(self._key, False))
-        self._window.set_on_tick_event(self._guarded(self._tick, False))
+        self._stage.picture.set_on_mouse(self._guard_callback(self._mouse, gui.ImageWidget.EventCallbackResult.HANDLED))
+        self._stage.scene.set_on_mouse(self._guard_callback(self._mouse, gui.Widget.EventCallbackResult.CONSUMED))
+        self._window.set_on_layout(self._guard_callback(self._layout))
+        self._window.set_on_key(self._guard_callback(self._key, False))
+        self._window.set_on_tick_event(self._guard_callback(self._tick, False))
         self._asked = True  # by the person, for another picture
         self._pointer = Pointer(session)
         self._analysed: object = None
@@ -110,7 +110,7 @@ class _Window:
         """The handler of a signal: closes the window at the next tick."""
         self._stopped_by = number
 
-    def _guarded(self, function: Callable, otherwise: object = None) -> Callable:
+    def _guard_callback(self, function: Callable, otherwise: object = None) -> Callable:
         """`function`, whose exception ends the run of the window and is raised where it was opened."""
 
         def call(*arguments):
@@ -142,7 +142,7 @@ class _Window:
         if not (news or self._asked):
             if time.monotonic() - self._busy_at > _IDLE_AFTER_S:
                 time.sleep(_IDLE_SLEEP_S)
-            return self._stage.redraws()
+            return self._stage.redraw_if_due()
         asked, self._asked, self._busy_at = self._asked, False, time.monotonic()
         self._stage.draw(self._session, asked, self._pointer.dragging)
         self._say()
@@ -152,7 +152,7 @@ class _Window:
         self._words_at = time.monotonic()
         state = self._session.state
         refused = state.engine is Engine.OPEN3D and not open3d_draws(state, self._software)
-        self._panel.show(self._session, self._stage.painted_s, words.NO_SPLATS if refused else self._notice)
+        self._panel.show(self._session, self._stage.paint_time_s, words.NO_SPLATS if refused else self._notice)
         self._help.show(self._session.state.help)
 
     def _layout(self, context: gui.LayoutContext) -> None:
@@ -205,12 +205,14 @@ class _Window:
 
     def _mouse(self, event: gui.MouseEvent):
         frame = self._stage.picture.frame
-        self._asked |= self._pointer.moved(event, float(event.x - frame.x), float(event.y - frame.y), self._stage.size)
+        self._asked |= self._pointer.handle_event(
+            event, float(event.x - frame.x), float(event.y - frame.y), self._stage.size
+        )
         return gui.Widget.EventCallbackResult.CONSUMED
 
     def _screenshot(self) -> None:
         path = self._screenshots / time.strftime("splatnode_%Y%m%d_%H%M%S.png")
-        self._stage.take_image(self._session, self._guarded(lambda image: self._save(path, image)))
+        self._stage.take_image(self._session, self._guard_callback(lambda image: self._save(path, image)))
 
     def _save(self, path: Path, image: Image) -> None:
         write_files(path.parent, {path.name: encode_png(image)})

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from splatnode.recon.result.bounds_in_words import of_camera, of_cameras
-from splatnode.recon.result.consistent_depth import percent
+from splatnode.recon.result.bounds_in_words import format_camera_bounds, format_widest_bounds
+from splatnode.recon.result.consistent_depth import format_percent
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
 from splatnode.viewer.graph import place_lines as graph_lines
 from splatnode.viewer.ground import Ground
-from splatnode.viewer.lengths import in_words
+from splatnode.viewer.lengths import format_length
 from splatnode.viewer.moment import History, Moment
-from splatnode.viewer.state import State, moment_index
+from splatnode.viewer.state import ViewerState, moment_index
 
 _STALE_S = 5.0  # a node that is at work is heard from more often
 _MOST_DROPPED = 6
@@ -54,15 +54,15 @@ def scale_lines(moment: Moment, ground: Ground | None) -> list[str]:
     """The unit of all lengths, and how wide the cells of the ground's grid are."""
     scale = moment.snapshot.scale
     lines = [f"Scale: {scale.sentence}"]
-    return lines if ground is None else [*lines, f"Ground: cells of {in_words(ground.cell, scale)}"]
+    return lines if ground is None else [*lines, f"Ground: cells of {format_length(ground.cell, scale)}"]
 
 
 def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
     """How well `camera` is known, or where there is none, or one without bounds: how well all are at least."""
     snapshot = moment.snapshot
     if camera is not None and camera.bounds is not None:
-        return [f"{camera.name}: {of_camera(camera.bounds, snapshot.scale)}"]
-    known = of_cameras(snapshot.cameras, snapshot.scale)
+        return [f"{camera.name}: {format_camera_bounds(camera.bounds, snapshot.scale)}"]
+    known = format_widest_bounds(snapshot.cameras, snapshot.scale)
     return [f"Cameras: {known}"] if known else []
 
 
@@ -70,13 +70,13 @@ def depth_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[st
     """How many pixels of `camera`, or where there is none, of all, have multi-view consistent depth, if it is known."""
     if camera is not None:
         known = camera.consistent_depth
-        return [] if known is None else [f"{camera.name}: other views confirm {percent(known)} of its depth"]
+        return [] if known is None else [f"{camera.name}: other views confirm {format_percent(known)} of its depth"]
     total = moment.snapshot.consistent_depth
     if total is None:
         return []
     least = min(view_shares(moment), key=lambda share: share[1])
-    of_all = f"Depth: other views confirm it in {percent(total)} of the pixels"
-    return [f"{of_all}, least in {least[0]}: {percent(least[1])}"]
+    of_all = f"Depth: other views confirm it in {format_percent(total)} of the pixels"
+    return [f"{of_all}, least in {least[0]}: {format_percent(least[1])}"]
 
 
 def view_shares(moment: Moment) -> list[tuple[str, float]]:
@@ -88,11 +88,11 @@ def view_shares(moment: Moment) -> list[tuple[str, float]]:
 def view_depth_lines(moment: Moment, most: int) -> list[str]:
     """The share of each view, the smallest first; of more than `most` views the number of the others."""
     shares = sorted(view_shares(moment), key=lambda share: share[1])
-    lines = [f"{name}: {percent(share)}" for name, share in shares[:most]]
+    lines = [f"{name}: {format_percent(share)}" for name, share in shares[:most]]
     return lines + [f"{len(shares) - most} more, with larger shares"] * (len(shares) > most)
 
 
-def dropped_lines(moment: Moment, most: int = _MOST_DROPPED) -> list[str]:
+def rejection_lines(moment: Moment, most: int = _MOST_DROPPED) -> list[str]:
     """The frames that were left out, the latest last, each with its reason; of more than `most` only their number."""
     dropped = moment.snapshot.dropped
     lines = [f"left out {frame.name}: {frame.reason}" for frame in dropped[-most:]]
@@ -111,8 +111,8 @@ def advice_line(advice: Advice | None, moment: Moment) -> str:
     return "looking for the best next view" if advice is None else advice.sentence
 
 
-def time_line(state: State, history: History) -> str:
-    """Where on the time axis the shown moment is."""
+def time_line(state: ViewerState, history: History) -> str:
+    """Describes the position of the current moment on the time axis."""
     if not history:
         return "nothing has come yet"
     index, count = moment_index(state, history), len(history)
@@ -137,7 +137,7 @@ def feed_line(age_s: float | None, final: bool) -> str:
 
 
 def waiting_line(age_s: float | None) -> str:
-    """What there is to say before there is a scene."""
+    """Describes the state of the feed before there is a scene."""
     if age_s is not None and age_s <= _STALE_S:
         return "splatnode recon is there: waiting for its first scene"
     return feed_line(age_s, final=False)

@@ -50,7 +50,7 @@ class Board:
 
     @property
     def num_corners(self) -> int:
-        """Where four squares meet: what is measured."""
+        """Returns the number of corners where four squares meet: what is measured."""
         return (self.columns - 1) * (self.rows - 1)
 
     @property
@@ -69,7 +69,7 @@ class Board:
 
 
 def marker_rectangles(dictionary: str, marker: int, x_mm: float, y_mm: float, side_mm: float) -> list[Rectangle]:
-    """What is black of an ArUco marker whose left upper corner is at (x, y), with its black border of one bit."""
+    """Returns the black rectangles of an ArUco marker at (x, y), its upper left corner, with its border of one bit."""
     definition = cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary])
     bits = definition.markerSize + 2  # a border bit on each side
     dark = cv2.aruco.generateImageMarker(definition, marker, bits) == 0
@@ -79,7 +79,7 @@ def marker_rectangles(dictionary: str, marker: int, x_mm: float, y_mm: float, si
 
 
 def _runs(dark: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Where what is dark begins and ends, along a row."""
+    """Finds where the dark parts of a row begin and end."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], dark, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 

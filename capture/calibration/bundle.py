@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.calibration.projection import projected
+from splatnode.capture.calibration.projection import project_points
 from splatnode.capture.calibration.rotations import cross_matrices, rotations
 
 Array = npt.NDArray[np.float64]
@@ -35,7 +35,7 @@ class Corners:
     def starts(self) -> npt.NDArray[np.intp]:  # (V,)
         return np.flatnonzero(np.diff(self.view, prepend=-1))
 
-    def some(self, kept: npt.NDArray[np.bool_]) -> Corners:
+    def select_corners(self, kept: npt.NDArray[np.bool_]) -> Corners:
         """Those of `kept` (M,), with their views renumbered."""
         return Corners(self.pixels[kept], self.points[kept], np.unique(self.view[kept], return_inverse=True)[1])
 
@@ -71,7 +71,7 @@ def solve(corners: Corners, numbers: Array, Ts: Array, kind: str, fixed: bool = 
         if not np.isfinite(here.cost):
             break
         step, turns = _step(here, damping, fixed)
-        moved = numbers + step, _moved(Ts, turns)
+        moved = numbers + step, _update_poses(Ts, turns)
         there = _normal(corners, *moved, kind)
         if not there.cost < here.cost:
             damping *= 8.0
@@ -82,12 +82,12 @@ def solve(corners: Corners, numbers: Array, Ts: Array, kind: str, fixed: bool = 
         (numbers, Ts), here, damping = moved, there, max(damping / 5.0, 1e-9)
         if gained < _SMALLEST_GAIN * here.cost + 1e-15:
             break
-    return Solution(numbers, Ts, here.residuals, here.cost, *_reduced(here))
+    return Solution(numbers, Ts, here.residuals, here.cost, *_eliminate_poses(here))
 
 
 def _normal(corners: Corners, numbers: Array, Ts: Array, kind: str) -> _Normal:
     turned = np.einsum("mij,mj->mi", Ts[corners.view, :3, :3], corners.points)
-    seen = projected(turned + Ts[corners.view, :3, 3], numbers, kind)
+    seen = project_points(turned + Ts[corners.view, :3, 3], numbers, kind)
     residuals = corners.pixels - seen.pixels
     by_pose = np.concatenate([-seen.by_point @ cross_matrices(turned), seen.by_point], axis=-1)  # (M, 2, 6)
     starts = corners.starts
@@ -127,8 +127,8 @@ def _step(here: _Normal, damping: float, fixed: bool) -> tuple[Array, Array]:
     return step, np.asarray(solved[..., -1] - solved[..., :-1] @ step, np.float64)
 
 
-def _reduced(here: _Normal) -> tuple[Array, Array]:
-    """What is known of the lens, and each view's pull at it, when the poses have been solved for."""
+def _eliminate_poses(here: _Normal) -> tuple[Array, Array]:
+    """Eliminates the poses: returns the lens's information, and the right-hand side, of the reduced system."""
     if not np.isfinite(here.cost):
         return np.zeros_like(here.lens), np.zeros_like(here.lens_pull)
     pose = here.pose + 1e-9 * np.eye(6)
@@ -137,7 +137,7 @@ def _reduced(here: _Normal) -> tuple[Array, Array]:
     return information, here.lens_pull - np.einsum("vpi,vi->vp", here.mixed, solved[..., -1])
 
 
-def _moved(Ts: Array, turns: Array) -> Array:
+def _update_poses(Ts: Array, turns: Array) -> Array:
     """Poses (V, 4, 4), turned by the first and shifted by the last three of `turns` (V, 6), in the camera's frame."""
     moved = Ts.copy()
     moved[:, :3, :3] = rotations(turns[:, :3]) @ Ts[:, :3, :3]

@@ -13,20 +13,28 @@ from splatnode.capture.calibration.board import Board, board_page
 from splatnode.capture.calibration.coverage import Coverage
 from splatnode.capture.calibration.gathering import Gathering
 from splatnode.capture.calibration.hold_out import Choice, choose
-from splatnode.capture.calibration.lacking import ENOUGH, GOOD, LEAST_VIEWS, TooLittle, too_few, uncovered, unknown
+from splatnode.capture.calibration.lacking import (
+    ENOUGH,
+    GOOD,
+    LEAST_VIEWS,
+    TooLittle,
+    describe_missing_coverage,
+    describe_missing_views,
+    describe_uncertainty,
+)
 from splatnode.capture.calibration.models import MODELS, Model
-from splatnode.capture.calibration.other_board import what_is_shown
+from splatnode.capture.calibration.other_board import explain_missing_board
 from splatnode.capture.calibration.pdf import PAPERS, pdf_of
-from splatnode.capture.calibration.report import lens_file, told
+from splatnode.capture.calibration.report import describe_choice, lens_file
 from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import SUFFIXES
 from splatnode.capture.lerobot.data_set import is_data_set
-from splatnode.capture.process.config import load_config, merged, parse_changes, typed
-from splatnode.capture.process.durable import write_whole
-from splatnode.capture.process.progress import Step, Tell, telling
+from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config
+from splatnode.capture.process.durable import write_atomically
+from splatnode.capture.process.progress import ProgressStep, Tell, show_progress
 from splatnode.capture.process.terminal import say
-from splatnode.capture.reader import Reader, State
+from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import is_recording
 
 _FILMS = ("video", "mcap", "lerobot")  # cameras before which the board was moved
@@ -49,10 +57,10 @@ def calibrate(args: argparse.Namespace) -> int:
     _check_free(args.out)
     config = _config(args.source, args.set)
     models = list(MODELS.values()) if args.model == "auto" else [MODELS[args.model]]
-    with telling() as tell:
-        choice, coverage = _shown(config, board, models, args.seconds, tell)
-    write_whole(args.out, [lens_file(choice, coverage, board).encode()])
-    for line in told(choice, coverage):
+    with show_progress() as tell:
+        choice, coverage = _calibrate_stream(config, board, models, args.seconds, tell)
+    write_atomically(args.out, [lens_file(choice, coverage, board).encode()])
+    for line in describe_choice(choice, coverage):
         say(line)
     say(f"written to {args.out}; use it by: splatnode replay photographs --intrinsics {args.out} --out out")
     return 0
@@ -62,7 +70,7 @@ def _print_board(args: argparse.Namespace, board: Board) -> int:
     if args.source is not None:
         raise ValueError("give --board to print the board, or a source to calibrate by it, not both")
     _check_free(args.board)
-    write_whole(args.board, [pdf_of([board_page(board, PAPERS[args.paper])], f"ChArUco board, {board}")])
+    write_atomically(args.board, [pdf_of([board_page(board, PAPERS[args.paper])], f"ChArUco board, {board}")])
     say(
         f"written to {args.board}: print it at 100 % on {args.paper}, glue it to something flat, and measure a square; "
         f"where it is not {board.square_mm:g} mm wide, calibrate with --square-mm"
@@ -78,10 +86,10 @@ def _check_free(path: Path) -> None:
 
 
 def _config(source: Path, changes: list[str]) -> CaptureConfig:
-    """What is read: a folder, a recording and a film need no configuration."""
+    """Loads the configuration: a folder, a recording and a film need none."""
     if source.suffix.lower() in (".yaml", ".yml"):
         return load_config(source, CaptureConfig, changes)
-    return typed(merged({"camera": _camera(source)}, parse_changes(changes)), CaptureConfig)
+    return parse_config(merge_config({"camera": _camera(source)}, parse_changes(changes)), CaptureConfig)
 
 
 def _camera(source: Path) -> dict[str, Any]:
@@ -100,7 +108,7 @@ def _is_moving(camera: Camera) -> bool:
     return is_live(camera) or camera.kind in _FILMS or recorded
 
 
-def _shown(
+def _calibrate_stream(
     config: CaptureConfig, board: Board, models: list[Model], seconds: float | None, tell: Tell
 ) -> tuple[Choice, Coverage]:
     """The lens, once it is known well, or well enough where further views only replace others; or from all there is."""
@@ -110,34 +118,34 @@ def _shown(
     with Reader(camera_opener(camera, config.body_mask), is_live(camera), config.reader) as reader:
         for frame in _frames(reader, seconds, tell):
             taken = gathering.take(frame)
-            tell(Step("looking for the board", len(gathering.views), 0, "view"))
+            tell(ProgressStep("looking for the board", len(gathering.views), 0, "view"))
             views, coverage = gathering.views, gathering.coverage
             if taken is None or coverage is None:
                 continue
-            if gathering.moving and coverage.drawn != drawn:
-                drawn = coverage.drawn
+            if gathering.moving and coverage.text_rows != drawn:
+                drawn = coverage.text_rows
                 _draw(coverage, tell)
             pause = _TRY_FULL if gathering.is_full else _TRY_EVERY
-            ready = gathering.kept >= max(LEAST_VIEWS, tried + pause) and uncovered(coverage) is None
+            ready = gathering.kept >= max(LEAST_VIEWS, tried + pause) and describe_missing_coverage(coverage) is None
             if ready and camera.kind not in _OF_AN_END:
                 tried = gathering.kept
-                tell(Step("looking for the lens", 0, 0, ""))
+                tell(ProgressStep("looking for the lens", 0, 0, ""))
                 choice = choose(views, board, coverage.width, coverage.height, models)
                 limits = ENOUGH if gathering.is_full else GOOD
-                wanted = [] if choice is None else unknown(choice.taken.estimate, coverage, limits)
+                wanted = [] if choice is None else describe_uncertainty(choice.taken.estimate, coverage, limits)
                 if choice is not None and not wanted:
                     return choice, coverage
                 if gathering.is_full and (choice is None or gathering.kept >= _GIVEN_UP):
                     break
                 for sentence in wanted:
                     tell(f"{len(views)} views: {sentence}")
-    return _judged(gathering, models, tell)
+    return _calibrate_views(gathering, models, tell)
 
 
 def _frames(reader: Reader, seconds: float | None, tell: Tell) -> Iterator[Frame]:
     """Until the camera ends, or for so long; what cannot be read is said."""
     ends_s = None if seconds is None else time.monotonic() + seconds
-    while reader.state is not State.FINISHED and (ends_s is None or time.monotonic() < ends_s):
+    while reader.state is not ReaderState.FINISHED and (ends_s is None or time.monotonic() < ends_s):
         item = reader.next(_POLL_S)
         if isinstance(item, DroppedFrame):
             tell(f"{item.name} is left out: {item.reason}")
@@ -145,7 +153,7 @@ def _frames(reader: Reader, seconds: float | None, tell: Tell) -> Iterator[Frame
             yield item
 
 
-def _judged(gathering: Gathering, models: list[Model], tell: Tell) -> tuple[Choice, Coverage]:
+def _calibrate_views(gathering: Gathering, models: list[Model], tell: Tell) -> tuple[Choice, Coverage]:
     """The lens of what there is. Raises TooLittle, with all that is missing."""
     views, coverage = gathering.views, gathering.coverage
     if coverage is None:
@@ -153,18 +161,18 @@ def _judged(gathering: Gathering, models: list[Model], tell: Tell) -> tuple[Choi
     if not views and gathering.unseen:
         raise TooLittle(
             f"none of {gathering.pictures} pictures shows the board ({gathering.board}): "
-            f"{what_is_shown(gathering.unseen, gathering.board)}"
+            f"{explain_missing_board(gathering.unseen, gathering.board)}"
         )
-    few = too_few(len(views), gathering.pictures, gathering.moving)
-    missing = [sentence for sentence in (few, uncovered(coverage)) if sentence]
+    few = describe_missing_views(len(views), gathering.pictures, gathering.moving)
+    missing = [sentence for sentence in (few, describe_missing_coverage(coverage)) if sentence]
     choice = None
     if len(views) >= LEAST_VIEWS:
-        tell(Step("looking for the lens", 0, 0, ""))
+        tell(ProgressStep("looking for the lens", 0, 0, ""))
         choice = choose(views, gathering.board, coverage.width, coverage.height, models)
         if choice is None:
             missing.append("no lens explains the views: another board than was given, or one that is not flat")
         else:
-            missing += unknown(choice.taken.estimate, coverage, ENOUGH)
+            missing += describe_uncertainty(choice.taken.estimate, coverage, ENOUGH)
     _draw(coverage, tell)
     if missing or choice is None:
         raise TooLittle("no lens yet:\n" + "\n".join(f"- {sentence}" for sentence in missing))
@@ -173,5 +181,5 @@ def _judged(gathering: Gathering, models: list[Model], tell: Tell) -> tuple[Choi
 
 def _draw(coverage: Coverage, tell: Tell) -> None:
     tell("the picture: # where the board was seen, . where not yet")
-    for line in coverage.drawn:
+    for line in coverage.text_rows:
         tell(f"  |{line}|")

@@ -19,7 +19,7 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class BoardView:
     """The corners that one picture shows."""
 
     name: str  # of the picture
@@ -27,32 +27,32 @@ class View:
     pixels: Array  # (N, 2); the centre of the top-left pixel is (0.5, 0.5)
 
 
-def corner_finder(board: Board) -> Callable[[str, npt.NDArray[np.uint8]], View | None]:
-    """What finds the board in a picture (H, W, 3) RGB of a name; None where it shows too little of the board."""
+def corner_finder(board: Board) -> Callable[[str, npt.NDArray[np.uint8]], BoardView | None]:
+    """Returns the finder of the board in a named picture (H, W, 3) RGB; it gives None where too little is shown."""
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1  # beside a corner: else none is found within a square of the picture's border
     detector = cv2.aruco.CharucoDetector(board.charuco, parameters)
 
-    def find(name: str, image: npt.NDArray[np.uint8]) -> View | None:
+    def find(name: str, image: npt.NDArray[np.uint8]) -> BoardView | None:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         corners, ids, _, _ = detector.detectBoard(grey)
         if ids is None or len(ids) < LEAST_CORNERS:
             return None
         which = ids.ravel().astype(np.intp)
-        if _on_a_line(which, board):
+        if _is_collinear(which, board):
             return None
-        return View(name, which, _refined(grey, corners.reshape(-1, 2), which, board) + 0.5)
+        return BoardView(name, which, _refine_corners(grey, corners.reshape(-1, 2), which, board) + 0.5)
 
     return find
 
 
-def _on_a_line(ids: npt.NDArray[np.intp], board: Board) -> bool:
+def _is_collinear(ids: npt.NDArray[np.intp], board: Board) -> bool:
     """Whether the corners are too much in a row to fix a pose: fewer than two rows or columns of the board."""
     across = board.columns - 1
     return len(np.unique(ids // across)) < 2 or len(np.unique(ids % across)) < 2
 
 
-def _refined(grey: npt.NDArray, corners: npt.NDArray, ids: npt.NDArray[np.intp], board: Board) -> Array:
+def _refine_corners(grey: npt.NDArray, corners: npt.NDArray, ids: npt.NDArray[np.intp], board: Board) -> Array:
     """The corners (N, 2) to a fraction of a pixel, each looked at in a window that holds no other corner or marker."""
     place = {int(each): number for number, each in enumerate(ids)}
     across = board.columns - 1

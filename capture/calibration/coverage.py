@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.calibration.corners import View
+from splatnode.capture.calibration.corners import BoardView
 
 _COLUMNS = 10  # of the grid along the picture's longer side
 _DARK = 12.0  # grey levels, of a cell's mean: what is never lighter is no picture, as beyond a fisheye's circle
@@ -24,20 +24,22 @@ class Coverage:
     lightest: npt.NDArray[np.float64]  # (R, C) mean grey level of the cell in the picture where it was lightest
 
     @property
-    def lit(self) -> npt.NDArray[np.bool_]:  # (R, C)
-        """Where there is a picture at all. Where the board was seen, there is."""
+    def picture_mask(self) -> npt.NDArray[np.bool_]:  # (R, C)
+        """Returns the mask of cells with a picture. Where the board was seen, there is one."""
         return (self.lightest > _DARK) | self.seen
 
     @property
     def share(self) -> float:
-        """Of the cells with a picture, those in which the board was seen."""
-        return float(self.seen.sum() / max(1, self.lit.sum()))
+        """Returns the share of the cells with a picture in which the board was seen."""
+        return float(self.seen.sum() / max(1, self.picture_mask.sum()))
 
     @property
     def open_corners(self) -> tuple[str, ...]:
         """The picture's corners near which the board was not seen, though there is a picture."""
         near = {name: (_end(y, _AT_CORNER), _end(x, _AT_CORNER)) for name, (x, y) in CORNERS.items()}
-        return tuple(name for name, cells in near.items() if self.lit[cells].any() and not self.seen[cells].any())
+        return tuple(
+            name for name, cells in near.items() if self.picture_mask[cells].any() and not self.seen[cells].any()
+        )
 
     @property
     def outermost(self) -> npt.NDArray[np.float64]:  # (4, 2)
@@ -48,31 +50,31 @@ class Coverage:
         for x, y in CORNERS.values():
             way = middle + steps * ((x * self.width, y * self.height) - middle)
             rows, columns = _cells(way, self.width, self.height, self.seen.shape)
-            found.append(way[int(np.argmax(self.lit[rows, columns]))])
+            found.append(way[int(np.argmax(self.picture_mask[rows, columns]))])
         return np.array(found)
 
     @property
-    def drawn(self) -> list[str]:
+    def text_rows(self) -> list[str]:
         """A line a row of cells: # where the board was seen, . where not yet, a blank where there is no picture."""
-        signs = np.where(self.seen, "#", np.where(self.lit, ".", " "))
+        signs = np.where(self.seen, "#", np.where(self.picture_mask, ".", " "))
         return ["".join(row) for row in signs]
 
 
-def nothing_seen(width: int, height: int) -> Coverage:
-    """Of pictures of this size, before the first."""
+def create_coverage(width: int, height: int) -> Coverage:
+    """Creates the coverage of pictures of this size, before the first."""
     cell = max(width, height) / _COLUMNS
     shape = max(1, round(height / cell)), max(1, round(width / cell))
     return Coverage(width, height, np.zeros(shape, bool), np.zeros(shape))
 
 
-def with_picture(coverage: Coverage, image: npt.NDArray[np.uint8]) -> Coverage:
+def add_picture(coverage: Coverage, image: npt.NDArray[np.uint8]) -> Coverage:
     """And the light of a picture (H, W, 3), whether or not it shows the board."""
     rows, columns = coverage.seen.shape
     mean = cv2.resize(image, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.float64).mean(axis=-1)
     return replace(coverage, lightest=np.maximum(coverage.lightest, mean))
 
 
-def with_view(coverage: Coverage, view: View) -> Coverage:
+def add_view(coverage: Coverage, view: BoardView) -> Coverage:
     """And the corners of a view."""
     seen = coverage.seen.copy()
     seen[_cells(view.pixels, coverage.width, coverage.height, seen.shape)] = True

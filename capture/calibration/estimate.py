@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from splatnode.capture.calibration.board import Board
 from splatnode.capture.calibration.bundle import Corners, Solution, solve
-from splatnode.capture.calibration.corners import LEAST_CORNERS, View
+from splatnode.capture.calibration.corners import LEAST_CORNERS, BoardView
 from splatnode.capture.calibration.models import Model
 from splatnode.capture.calibration.poses import board_pose
 from splatnode.capture.frame import Intrinsics
@@ -36,7 +36,7 @@ class Estimate:
 
     @property
     def rms_px(self) -> float:
-        """Of the distance between a corner and where it is expected."""
+        """Returns the root mean square of the distance between a corner and its projection."""
         return float(np.sqrt((self.solution.residuals**2).sum(axis=1).mean()))
 
     @property
@@ -58,7 +58,7 @@ class Estimate:
         return np.linalg.norm(np.einsum("vij,vj->vi", Ts[:, :3, :3], middle) + Ts[:, :3, 3], axis=1)
 
 
-def _gathered(views: Sequence[View], board: Board) -> Corners:
+def _stack_corners(views: Sequence[BoardView], board: Board) -> Corners:
     """The corners of all views."""
     of_board = board.corners
     return Corners(
@@ -68,21 +68,21 @@ def _gathered(views: Sequence[View], board: Board) -> Corners:
     )
 
 
-def estimated(views: Sequence[View], board: Board, model: Model, width: int, height: int) -> Estimate | None:
+def estimate_lens(views: Sequence[BoardView], board: Board, model: Model, width: int, height: int) -> Estimate | None:
     """The lens of pictures `width` x `height` that explains the views best; None where none explains them."""
-    corners, names = _gathered(views, board), tuple(view.name for view in views)
-    solution = _from_nothing(corners, model, width, height)
+    corners, names = _stack_corners(views, board), tuple(view.name for view in views)
+    solution = _search_lens(corners, model, width, height)
     if solution is None or not np.isfinite(solution.cost):
         return None
-    kept = _seen_right(corners, solution)
+    kept = _select_inliers(corners, solution)
     if not kept.all():
         present = np.unique(corners.view[kept])
-        corners, names = corners.some(kept), tuple(names[view] for view in present)
+        corners, names = corners.select_corners(kept), tuple(names[view] for view in present)
         solution = solve(corners, solution.numbers, solution.Ts_camera_board[present], model.kind)
     return _estimate(model, corners, solution, names, int((~kept).sum()), width, height)
 
 
-def refitted(estimate: Estimate, to: Estimate) -> Estimate | None:
+def refit_lens(estimate: Estimate, to: Estimate) -> Estimate | None:
     """The same model fitted to the corners that `to` is of; None where it was not seen in all of its views."""
     known = {name: number for number, name in enumerate(estimate.names)}
     if not set(to.names) <= set(known):
@@ -120,13 +120,13 @@ def _covariance(corners: Corners, solution: Solution) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    """Where something is not determined at all, its variance is very large instead of infinite."""
+    """Inverts the information matrix: what is not determined has a very large variance instead of an infinite one."""
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     return (vectors / np.maximum(values, 1e-14)) @ vectors.T * np.outer(scale, scale)
 
 
-def _seen_right(corners: Corners, solution: Solution) -> npt.NDArray[np.bool_]:
+def _select_inliers(corners: Corners, solution: Solution) -> npt.NDArray[np.bool_]:
     """(M,) all corners but those far off; a view that keeps too few keeps none."""
     off = np.linalg.norm(solution.residuals, axis=1)
     sigma = max(float(np.median(off)) / 1.177, _LEAST_SIGMA_PX)  # of a Rayleigh distribution
@@ -135,7 +135,7 @@ def _seen_right(corners: Corners, solution: Solution) -> npt.NDArray[np.bool_]:
     return kept & enough[corners.view]
 
 
-def _from_nothing(corners: Corners, model: Model, width: int, height: int) -> Solution | None:
+def _search_lens(corners: Corners, model: Model, width: int, height: int) -> Solution | None:
     """The best of several searches, which begin at different angles of view."""
     best: Solution | None = None
     for field_deg in _FIELDS_DEG[model.kind]:

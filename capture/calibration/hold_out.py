@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from splatnode.capture.calibration.board import Board
 from splatnode.capture.calibration.bundle import solve
-from splatnode.capture.calibration.corners import View
-from splatnode.capture.calibration.estimate import Estimate, estimated, refitted
+from splatnode.capture.calibration.corners import BoardView
+from splatnode.capture.calibration.estimate import Estimate, estimate_lens, refit_lens
 from splatnode.capture.calibration.models import MODELS, Model
 
 Array = npt.NDArray[np.float64]
@@ -29,7 +29,7 @@ class Trial:
     errors: Array  # (V,) mean square distance of a view's corners from where they are predicted, square pixels
 
     @property
-    def held_out_px(self) -> float:
+    def validation_rms_px(self) -> float:
         """Root mean square over the views."""
         return float(np.sqrt(self.errors.mean()))
 
@@ -41,22 +41,22 @@ class Choice:
 
 
 def choose(
-    views: Sequence[View],
+    views: Sequence[BoardView],
     board: Board,
     width: int,
     height: int,
     models: Sequence[Model] = tuple(MODELS.values()),
 ) -> Choice | None:
     """The choice among `models`, which have more terms one after the other; None where none explains the views."""
-    fitted = [estimated(views, board, model, width, height) for model in models]
+    fitted = [estimate_lens(views, board, model, width, height) for model in models]
     found = [each for each in fitted if each is not None and len(each.names) >= FOLDS]
     if not found:
         return None
     closest = min(found, key=lambda each: float(np.median(np.abs(each.solution.residuals))))
-    again = [refitted(each, closest) for each in found]  # what was not seen right is of the pictures, not of a model
-    trials = tuple(Trial(each, _predicted(each)) for each in again if each is not None)
-    best = min(trials, key=lambda trial: trial.held_out_px)
-    if not np.isfinite(best.held_out_px):
+    again = [refit_lens(each, closest) for each in found]  # what was not seen right is of the pictures, not of a model
+    trials = tuple(Trial(each, _cross_validate(each)) for each in again if each is not None)
+    best = min(trials, key=lambda trial: trial.validation_rms_px)
+    if not np.isfinite(best.validation_rms_px):
         return None
     return Choice(next(trial for trial in trials if not _is_worse(trial, best)), trials)
 
@@ -70,15 +70,15 @@ def _is_worse(trial: Trial, best: Trial) -> bool:
     return bool(mean > _NOISE * noise and mean > _SLIGHT * best.errors.mean())
 
 
-def _predicted(whole: Estimate) -> Array:
+def _cross_validate(whole: Estimate) -> Array:
     """(V,) of its views; of a view that is left out, only the pose is found. Infinite where a fit fails."""
     corners, numbers = whole.corners, np.arange(len(whole.names))
     start, Ts, kind = whole.solution.numbers, whole.solution.Ts_camera_board, whole.model.kind
     errors = np.full(len(numbers), np.inf)
     for fold in range(FOLDS):
         out = numbers % FOLDS == fold
-        fitted = solve(corners.some(~out[corners.view]), start, Ts[~out], kind)
-        rest = corners.some(out[corners.view])
+        fitted = solve(corners.select_corners(~out[corners.view]), start, Ts[~out], kind)
+        rest = corners.select_corners(out[corners.view])
         posed = solve(rest, fitted.numbers, Ts[out], kind, fixed=True)
         if np.isfinite(posed.cost):
             counts = np.diff([*rest.starts, len(rest.view)])

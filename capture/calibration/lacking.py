@@ -18,7 +18,7 @@ _LARGEST_RMS = 0.0012  # of the longer side: corners that are farther from where
 
 @dataclass(frozen=True)
 class Limits:
-    """What is good enough; standard deviations."""
+    """The limits of what is good enough; standard deviations."""
 
     focal: float  # relative
     corner: float  # of where the picture's corners are seen, as a share of its longer side
@@ -34,7 +34,7 @@ class TooLittle(ValueError):
     exit_code = 65
 
 
-def too_few(views: int, pictures: int, moving: bool) -> str | None:
+def describe_missing_views(views: int, pictures: int, moving: bool) -> str | None:
     if views >= LEAST_VIEWS:
         return None
     show, own = ("shows", "its own") if views == 1 else ("show", "their own")
@@ -45,7 +45,7 @@ def too_few(views: int, pictures: int, moving: bool) -> str | None:
     )
 
 
-def uncovered(coverage: Coverage) -> str | None:
+def describe_missing_coverage(coverage: Coverage) -> str | None:
     if coverage.open_corners:
         return (
             f"the board was never seen near the picture's corner {' and '.join(coverage.open_corners)}: the lens bends "
@@ -59,8 +59,8 @@ def uncovered(coverage: Coverage) -> str | None:
     return None
 
 
-def unknown(estimate: Estimate, coverage: Coverage, limits: Limits) -> list[str]:
-    """What the estimate does not know well enough."""
+def describe_uncertainty(estimate: Estimate, coverage: Coverage, limits: Limits) -> list[str]:
+    """Lists what the estimate does not know well enough."""
     longer, tilts = max(estimate.lens.width, estimate.lens.height), estimate.tilts_deg
     if not estimate.rms_px <= _LARGEST_RMS * longer:
         return [

@@ -10,8 +10,8 @@ import cv2
 
 from splatnode.capture.calibration.board import DICTIONARIES, marker_rectangles
 from splatnode.capture.calibration.pdf import PAPERS, Page, Paper, Rectangle, Text, pdf_of
-from splatnode.capture.process.durable import write_whole
-from splatnode.capture.process.folders import made
+from splatnode.capture.process.durable import write_atomically
+from splatnode.capture.process.folders import make_folder
 from splatnode.capture.process.terminal import say
 
 DICTIONARY = "4X4_50"  # the coarsest bits, so that it is read from the farthest; a ChArUco board has others
@@ -91,8 +91,8 @@ def command(args: argparse.Namespace) -> int:
     markers = Markers(1e3 * args.side, args.first, args.count, args.dictionary)
     pages = marker_pages(markers, PAPERS[args.paper])
     try:
-        with made(args.file.parent):
-            write_whole(args.file, [pdf_of(pages, f"Markers of {markers.side_mm:g} mm")])
+        with make_folder(args.file.parent):
+            write_atomically(args.file, [pdf_of(pages, f"Markers of {markers.side_mm:g} mm")])
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(args.file)) from error
     shown = sum(len(page.texts) for page in pages)

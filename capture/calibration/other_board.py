@@ -13,7 +13,7 @@ from splatnode.capture.calibration.board import DICTIONARIES, Board
 _LEAST_MARKERS = 3  # in one picture: fewer are found in noise, too
 
 
-def what_is_shown(images: Sequence[npt.NDArray[np.uint8]], board: Board) -> str:
+def explain_missing_board(images: Sequence[npt.NDArray[np.uint8]], board: Board) -> str:
     """Why `board` was not found in any of `images` (H, W, 3), and what to do, in a sentence."""
     greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     own = _markers(greys, board.dictionary)

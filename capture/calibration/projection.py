@@ -17,7 +17,7 @@ _AHEAD = 1e-3  # of the distance: what a radial lens sees is at least so far bef
 
 
 @dataclass(frozen=True, eq=False)
-class Projected:
+class Projection:
     """M points through a lens of P numbers; not a number where the lens cannot see a point."""
 
     pixels: Array  # (M, 2)
@@ -25,7 +25,7 @@ class Projected:
     by_lens: Array  # (M, 2, P): fx fy cx cy and the terms
 
 
-def projected(points: Array, numbers: Array, kind: str) -> Projected:
+def project_points(points: Array, numbers: Array, kind: str) -> Projection:
     """Points (M, 3) of the camera's frame through the lens fx fy cx cy and terms, which is "opencv" or "fisheye"."""
     bent = _fisheye if kind == "fisheye" else _opencv
     flat, by_point, by_terms = bent(points, numbers[4:])
@@ -34,11 +34,11 @@ def projected(points: Array, numbers: Array, kind: str) -> Projected:
     by_lens[:, 0, 0], by_lens[:, 1, 1] = flat[:, 0], flat[:, 1]
     by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
     by_lens[:, :, 4:] = by_terms * focal[:, None]
-    return Projected(flat * focal + numbers[2:4], by_point * focal[:, None], by_lens)
+    return Projection(flat * focal + numbers[2:4], by_point * focal[:, None], by_lens)
 
 
 def _fisheye(points: Array, terms: Array) -> tuple[Array, Array, Array]:
-    """Where points are seen in focal lengths (M, 2), by the point (M, 2, 3), and by the terms (M, 2, T)."""
+    """Projects points in focal lengths (M, 2), with derivatives by point (M, 2, 3) and by term (M, 2, T)."""
     x, y, z = points.T
     across = np.maximum(np.hypot(x, y), _NEAREST * np.abs(z) + 1e-12)
     angle = np.arctan2(across, z)

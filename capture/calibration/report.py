@@ -47,18 +47,18 @@ def lens_file(choice: Choice, coverage: Coverage, board: Board) -> str:
         "corners": len(estimate.corners.view),
         "corners_left_out": estimate.left_out,
         "residual_px": round(estimate.rms_px, 4),
-        "held_out_px": {trial.estimate.model.name: _rounded(trial.held_out_px) for trial in choice.trials},
+        "held_out_px": {trial.estimate.model.name: _round_digits(trial.validation_rms_px) for trial in choice.trials},
         "sigma": {
-            **{name: _rounded(sigma) for name, sigma in zip(("fx", "fy", "cx", "cy"), sigmas[:4], strict=True)},
-            "distortion": [_rounded(sigma) for sigma in sigmas[4:]],
+            **{name: _round_digits(sigma) for name, sigma in zip(("fx", "fy", "cx", "cy"), sigmas[:4], strict=True)},
+            "distortion": [_round_digits(sigma) for sigma in sigmas[4:]],
         },
-        "corner_sigma_px": {name: _rounded(sigma) for name, sigma in zip(CORNERS, corners, strict=True)},
+        "corner_sigma_px": {name: _round_digits(sigma) for name, sigma in zip(CORNERS, corners, strict=True)},
         "tilt_deg": [round(float(end), 1) for end in (estimate.tilts_deg.min(), estimate.tilts_deg.max())],
         "distance_mm": [round(float(end)) for end in (estimate.distances_mm.min(), estimate.distances_mm.max())],
         "covered_percent": round(100 * coverage.share),
     }
     told = {"intrinsics": intrinsics, "calibration": calibration}
-    grid = [f'  - "{line}"' for line in coverage.drawn]
+    grid = [f'  - "{line}"' for line in coverage.text_rows]
     return "\n".join(
         [
             _HEAD + yaml.safe_dump(told, sort_keys=False, default_flow_style=None, width=110).rstrip(),
@@ -69,7 +69,7 @@ def lens_file(choice: Choice, coverage: Coverage, board: Board) -> str:
     )
 
 
-def told(choice: Choice, coverage: Coverage) -> list[str]:
+def describe_choice(choice: Choice, coverage: Coverage) -> list[str]:
     """The lines for whoever calibrates."""
     estimate = choice.taken.estimate
     lens, sigmas = estimate.lens, np.sqrt(np.diag(estimate.covariance))
@@ -81,7 +81,7 @@ def told(choice: Choice, coverage: Coverage) -> list[str]:
     )
     tilts, distances = estimate.tilts_deg, estimate.distances_mm
     worst = float(np.max(pixel_sigmas(estimate, coverage.outermost)))
-    trials = ", ".join(f"{trial.estimate.model.name} {trial.held_out_px:.3f}" for trial in choice.trials)
+    trials = ", ".join(f"{trial.estimate.model.name} {trial.validation_rms_px:.3f}" for trial in choice.trials)
     lines = [
         f"{estimate.model.name} ({estimate.model.told}) from {len(estimate.names)} views: {numbers} pixels",
         f"corners are {estimate.rms_px:.3f} pixels (rms) from where this lens shows them; in views that were held out: "
@@ -107,6 +107,6 @@ def _warnings(estimate: Estimate) -> list[str]:
     return []
 
 
-def _rounded(value: float) -> float:
+def _round_digits(value: float) -> float:
     """Three digits are enough of what says how well something is known."""
     return float(f"{value:.3g}")

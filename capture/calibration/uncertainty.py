@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.calibration.estimate import Estimate
-from splatnode.capture.calibration.projection import projected
+from splatnode.capture.calibration.projection import project_points
 from splatnode.capture.lenses import lens as lenses
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +24,7 @@ def pixel_sigmas(estimate: Estimate, pixels: Array) -> Array:
     there = np.flatnonzero(np.isfinite(rays).all(axis=1))
     apart = np.linalg.norm(lenses.project(rays[there], estimate.lens) - pixels[there], axis=1)
     seen = there[apart < _SAME_PX]
-    by_lens = projected(rays[seen], estimate.solution.numbers, estimate.model.kind).by_lens
+    by_lens = project_points(rays[seen], estimate.solution.numbers, estimate.model.kind).by_lens
     variances = np.einsum("kip,pq,kiq->k", by_lens, estimate.covariance, by_lens)
     sigmas[seen] = np.sqrt(np.maximum(variances, 0.0))
     return sigmas

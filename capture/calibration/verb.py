@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.process.arguments import millimetres, positive, seconds
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 
 _MODELS = ("auto", "pinhole", "opencv2", "opencv4", "fisheye", "opencv5", "opencv8")
 
@@ -38,5 +38,5 @@ CALIBRATE = Verb(
     "calibrate",
     "find a camera's lens from a printed board",
     _arguments,
-    lazily("splatnode.capture.calibration.command", "calibrate"),
+    import_lazily("splatnode.capture.calibration.command", "calibrate"),
 )

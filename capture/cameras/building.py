@@ -19,12 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.diorama.building import view
-from splatnode.capture.diorama.building.overlap import Seen, seen, shared
+from splatnode.capture.diorama.building.overlap import CoarseView, compute_overlap, render_coarse_view
 from splatnode.capture.diorama.building.rooms import CHAIR_ROOM
 from splatnode.capture.diorama.building.walk import Walk, walk
 from splatnode.capture.diorama.cast import Camera
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.pace import FramesPerSecond, Pace, paced
+from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
 from splatnode.capture.stamp import Clock, Stamp
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
@@ -50,13 +50,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     """The photographs in the order of the walk, each made when it is asked for."""
-    return paced(_frames(config), config.pace)
+    return pace_frames(_frames(config), config.pace)
 
 
 def _frames(config: Config) -> Iterator[Frame]:
     for index in range(config.keyframes):
         stamp_ns = round(index / config.frames_per_second * 1e9)
-        image, captured_at = photograph(config, index), Stamp(stamp_ns, Clock.RECORDING)
+        image, captured_at = render_image(config, index), Stamp(stamp_ns, Clock.RECORDING)
         yield Frame(index, frame_name(index), stamp_ns, image, intrinsics=None, captured_at=captured_at)
 
 
@@ -74,12 +74,12 @@ def scene_camera(config: Config, index: float) -> Camera:
     return _walk(config).T_world_camera(_position(config, index)), intrinsic_matrix(config)
 
 
-def held_out_camera(config: Config, index: int) -> Camera:
+def evaluation_camera(config: Config, index: int) -> Camera:
     """A camera for testing: midway on the walk from keyframe `index` to the next."""
     return scene_camera(config, index + 0.5)
 
 
-def photograph(config: Config, index: float) -> npt.NDArray[np.uint8]:
+def render_image(config: Config, index: float) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB as the camera of keyframe `index` (held out where it ends with .5) sees the building of then."""
     T_world_camera, K = scene_camera(config, index)
     dense = T_world_camera, np.diag([config.samples, config.samples, 1.0]) @ K
@@ -94,22 +94,22 @@ def depth(config: Config, index: float) -> npt.NDArray[np.float32]:
     return view.depth(state(config, index), scene_camera(config, index), config.width, config.height)
 
 
-def shared_surface(config: Config, first: int, second: int) -> float:
+def measure_shared_surface(config: Config, first: int, second: int) -> float:
     """0 to 1: how much of the surface that one keyframe shows the other shows, too; of both ways the lesser."""
-    return shared(_seen(config, first), _seen(config, second))
+    return compute_overlap(_render_coarse_view(config, first), _render_coarse_view(config, second))
 
 
 def same_place(config: Config, first: int, second: int) -> bool:
     """Whether two keyframes show the same place. A chair that was moved in between makes no other place of it."""
-    return shared_surface(config, first, second) >= SAME_PLACE
+    return measure_shared_surface(config, first, second) >= SAME_PLACE
 
 
-def state(config: Config, index: float) -> view.State:
+def state(config: Config, index: float) -> view.BuildingState:
     """The building when a keyframe is taken: the chair is moved whenever its room has been left."""
     position = _position(config, index)
     left = sum(visit.room == CHAIR_ROOM and visit.last < position for visit in _walk(config).visits)
     density = float(np.clip(0.28 * max(config.width, config.height), 48, 512))
-    return view.State(config.seed, density, left % 2)
+    return view.BuildingState(config.seed, density, left % 2)
 
 
 def room(config: Config, index: float) -> int | None:
@@ -131,11 +131,11 @@ def _walk(config: Config) -> Walk:
 def _position(config: Config, index: float) -> float:
     if not config.kidnap_at or index < config.kidnap_at:
         return index
-    return index + _carried(config)
+    return index + _count_missed_keyframes(config)
 
 
 @lru_cache(maxsize=8)
-def _carried(config: Config) -> float:
+def _count_missed_keyframes(config: Config) -> float:
     """Keyframes that the kidnapped robot misses: it goes on in the middle of the next tour of another room."""
     here = _walk(config).visit_at(config.kidnap_at)
     for visit in _walk(config).visits:
@@ -146,6 +146,6 @@ def _carried(config: Config) -> float:
 
 
 @lru_cache(maxsize=4096)
-def _seen(config: Config, index: int) -> Seen:
+def _render_coarse_view(config: Config, index: int) -> CoarseView:
     bare = replace(state(config, index), density=BARE)
-    return seen(bare, scene_camera(config, index), config.width, config.height)
+    return render_coarse_view(bare, scene_camera(config, index), config.width, config.height)

@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.exposure_settings import ExposureSettings, as_told
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.exposure_settings import ExposureSettings, parse_exposure
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
 from splatnode.capture.right_image import Baseline, RightImage, grey
@@ -54,7 +54,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Source:
-    """What of a pipeline is read and commanded."""
+    """The parts of a pipeline that are read and commanded."""
 
     queue: Any
     cameras: tuple[Any, ...]  # nodes
@@ -69,7 +69,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     Whether there is a camera is asked first: opening one that is not there takes 11 seconds to fail.
     """
     dai = _depthai()
-    info = _chosen(dai, config.device)
+    info = _select_device(dai, config.device)
     try:
         with dai.Device(info) as device, dai.Pipeline(device) as pipeline:
             source = _pairs(dai, device, pipeline, config) if config.stereo else _colour(dai, pipeline, config)
@@ -77,7 +77,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
             pipeline.start()
             if config.focus is not None:
                 _send(controls, _control(dai, focus=config.focus))
-            yield from read(dai, source, config, hold=lambda: _send(controls, holding(dai, config)))
+            yield from read(dai, source, config, hold=lambda: _send(controls, make_exposure_lock(dai, config)))
     except RuntimeError as error:
         if isinstance(error, CameraUnavailable):
             raise
@@ -98,7 +98,7 @@ def _colour(dai: ModuleType, pipeline: Any, config: Config) -> Source:
         fps=config.frames_per_second,
         enableUndistortion=config.undistort,
     )
-    return Source(output.createOutputQueue(maxSize=2, blocking=False), (camera,), to_frame)
+    return Source(output.createOutputQueue(maxSize=2, blocking=False), (camera,), convert_frame)
 
 
 def _pairs(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Source:
@@ -115,7 +115,7 @@ def _pairs(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Sourc
     stereo.rectifiedRight.link(sync.inputs["right"])
     sync.setSyncThreshold(timedelta(seconds=0.5 / config.frames_per_second))
     queue = sync.out.createOutputQueue(maxSize=2, blocking=False)
-    return Source(queue, cameras, partial(to_pair, baseline), lambda group: group["left"])
+    return Source(queue, cameras, partial(convert_stereo_pair, baseline), lambda group: group["left"])
 
 
 def _baseline(dai: ModuleType, device: Any, left: Any, right: Any) -> Baseline:
@@ -163,7 +163,7 @@ def read(dai: ModuleType, source: Source, config: Config, hold: Callable[[], Non
         yield item
 
 
-def to_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
+def convert_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
     """An ImgFrame as a Frame: its stamp is of the host's monotonic clock, synchronised by DepthAI.
 
     It has the exposure that the camera says it was taken with.
@@ -173,7 +173,7 @@ def to_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
     intrinsics = _intrinsics(message.getTransformation(), image.shape[1], image.shape[0])
     name = f"{stamp_ns / 1e9:.6f}"
     captured_at, exposure = wall_clock(stamp_ns), _exposure(message)
-    return framed(frame_id, name, stamp_ns, image, intrinsics, captured_at=captured_at, exposure=exposure)
+    return make_frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=captured_at, exposure=exposure)
 
 
 def _exposure(message: Any) -> ExposureSettings | None:
@@ -181,12 +181,12 @@ def _exposure(message: Any) -> ExposureSettings | None:
     shutter, iso = message.getExposureTime(), message.getSensitivity()
     if not isinstance(shutter, timedelta) or not isinstance(iso, int):
         return None
-    return as_told(shutter.total_seconds(), iso)
+    return parse_exposure(shutter.total_seconds(), iso)
 
 
-def to_pair(baseline: Baseline, group: Any, frame_id: int) -> Frame | DroppedFrame:
+def convert_stereo_pair(baseline: Baseline, group: Any, frame_id: int) -> Frame | DroppedFrame:
     """A group of a left and a right ImgFrame as the left one's Frame, with the right image."""
-    left, seen = to_frame(group["left"], frame_id), _rgb(group["right"].getCvFrame())
+    left, seen = convert_frame(group["left"], frame_id), _rgb(group["right"].getCvFrame())
     if isinstance(left, DroppedFrame):
         return left
     try:
@@ -201,7 +201,7 @@ def _rgb(image: Any) -> npt.NDArray[np.uint8]:
     return cv2.cvtColor(image, code).astype(np.uint8, copy=False)
 
 
-def holding(dai: ModuleType, config: Config) -> Any:
+def make_exposure_lock(dai: ModuleType, config: Config) -> Any:
     """The command that holds exposure and white balance where they are, or where the configuration says."""
     control = dai.CameraControl()
     if config.exposure_us is None:
@@ -235,7 +235,7 @@ def _intrinsics(transformation: Any, width: int, height: int) -> Intrinsics | No
     return replace(pinhole, distortion=distortion if any(distortion) else ())
 
 
-def _chosen(dai: ModuleType, device: str) -> Any:
+def _select_device(dai: ModuleType, device: str) -> Any:
     found = dai.Device.getAllAvailableDevices()
     if device and found:
         for info in found:

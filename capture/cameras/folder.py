@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from splatnode.capture import heif_file, recording
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed, renamed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame, rename_frame
 from splatnode.capture.given_lens import same_aspect
-from splatnode.capture.given_pose import LARGEST_M, given_pose
+from splatnode.capture.given_pose import LARGEST_M, make_given_pose
 from splatnode.capture.given_pose import SIGMA_DEG as POSE_SIGMA_DEG
 from splatnode.capture.given_pose import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.image_file import (
@@ -24,16 +24,16 @@ from splatnode.capture.image_file import (
     DecodedImage,
     MaxPixels,
     UnusableImage,
-    decode_photograph,
+    decode_any_image,
     find_common_range,
     read_image_file,
 )
 from splatnode.capture.image_header import image_kind
-from splatnode.capture.masks import Mask, masked
+from splatnode.capture.masks import Mask, apply_mask
 from splatnode.capture.name_time import name_time
-from splatnode.capture.pace import FramesPerSecond, Pace, paced
+from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
 from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.printable import printable, printable_name
+from splatnode.capture.process.printable import sanitize_name, sanitize_text
 from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey, partners
 from splatnode.capture.value_range import ValueRange
 
@@ -73,7 +73,7 @@ class Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the camera was, by odometry, a tracker or a drone's log, in metres; each photograph carries its pose."""
+    """The camera's poses by odometry, a tracker or a drone's log, in metres; each photograph carries its own."""
 
     file: Path  # a TUM trajectory, nerfstudio's transforms.json, or the folder of a COLMAP model
     sigma_m: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_M)] = POSE_SIGMA_M  # of each position, metres
@@ -109,33 +109,35 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         if config.poses is not None:
             raise ValueError(f"{str(config.folder)!r} is a recording, which has its poses in it: leave out poses")
         recorded = recording.read(config.folder)
-        return paced(_looped(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace)
-    paths = chosen_images(config.folder, config.names)  # at once, before the first frame, so that mistakes show at once
+        return pace_frames(
+            _repeat_frames(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace
+        )
+    paths = select_images(config.folder, config.names)  # at once, before the first frame, so that mistakes show at once
     rights = {} if config.right is None else _partners(config.right.folder, paths)
-    poses = None if config.poses is None else _known_poses(config.poses.file, paths)
-    return paced(_looped(lambda: _frames(paths, rights, poses, config), config.loops), config.pace)
+    poses = None if config.poses is None else _load_poses(config.poses.file, paths)
+    return pace_frames(_repeat_frames(lambda: _frames(paths, rights, poses, config), config.loops), config.pace)
 
 
 def _partners(folder: Path, lefts: list[Path]) -> dict[str, Path]:
     """The right photographs by the names of the left ones. Raises where no left one has a partner."""
-    rights = {path.name: path for path in chosen_images(folder)}
+    rights = {path.name: path for path in select_images(folder)}
     return {left: rights[right] for left, right in partners([path.name for path in lefts], list(rights)).items()}
 
 
-def _known_poses(file: Path, paths: list[Path]) -> Trajectory:
-    """What the file says. Raises ValueError where it names photographs, and none of these; OSError."""
+def _load_poses(file: Path, paths: list[Path]) -> Trajectory:
+    """Loads the poses. Raises ValueError where the file names photographs, and none of these; OSError."""
     from splatnode.capture.poses_file import read_poses  # brings what interpolates
 
     poses = read_poses(file)
     if poses.by_name and not any(poses.names(frame_name(path)) for path in paths):
         raise ValueError(
-            f"{str(file)!r} has poses of photographs such as {printable(min(poses.by_name), 100)}, and none of those "
+            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(poses.by_name), 100)}, and none of those "
             f"here, such as {frame_name(paths[0])}; give the poses of these photographs"
         )
     return poses
 
 
-def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> Iterator[Frame | DroppedFrame]:
+def _repeat_frames(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> Iterator[Frame | DroppedFrame]:
     """The frames `loops` times; stamps and ids go on, and names tell from the second time on which one it is."""
     first_id = first_ns = 0
     for loop in range(loops):
@@ -145,7 +147,7 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
             if isinstance(item, Frame):
                 step = item.stamp_ns - last.stamp_ns if last else step
                 last = item
-                yield renamed(item, first_id + item.frame_id, prefix + item.name, first_ns + item.stamp_ns)
+                yield rename_frame(item, first_id + item.frame_id, prefix + item.name, first_ns + item.stamp_ns)
             else:
                 yield replace(item, name=prefix + item.name)
         if last is None:
@@ -158,9 +160,9 @@ def _frames(
 ) -> Iterator[Frame | DroppedFrame]:
     frame_id, used = 0, find_common_range(paths, config.max_pixels)
     if used is not None:
-        log.warning("%s", in_words_of_range(used))
+        log.warning("%s", describe_value_range(used))
     for path in paths:
-        if (unreadable := foreign_file(path)) is not None:
+        if (unreadable := explain_unreadable_file(path)) is not None:
             yield unreadable
             continue
         name = frame_name(path)
@@ -178,12 +180,12 @@ def _frames(
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
             # A file whose values are stretched is no file of this image: a recording would store it as it was.
             known = image, intrinsics, data if used is None else None, decoded.captured_at or name_time(name)
-            item = framed(
+            item = make_frame(
                 frame_id, name, stamp_ns, *known, right=right, exposure=decoded.exposure, camera=decoded.camera
             )
-            item = with_transparency(item, decoded.mask)
+            item = apply_alpha_mask(item, decoded.mask)
             frame_id += isinstance(item, Frame)
-            yield _with_pose(item, poses, config.poses)
+            yield _attach_pose(item, poses, config.poses)
     if not config.names:
         yield from _hidden_images(config.folder)
 
@@ -193,19 +195,19 @@ def _read(
 ) -> tuple[bytes, DecodedImage, RightImage | None]:
     """The file's bytes, the photograph, and what the right camera saw. Raises UnusableImage, OSError."""
     data = read_image_file(path, config.max_pixels)
-    return data, decode_photograph(data, config.max_pixels, used), _right_of(path, rights, config)
+    return data, decode_any_image(data, config.max_pixels, used), _load_right_image(path, rights, config)
 
 
-def in_words_of_range(used: ValueRange) -> str:
-    """What is told of images of 16 bits whose values are stretched."""
+def describe_value_range(used: ValueRange) -> str:
+    """Describes the value range of 16-bit images that is stretched to 8 bits."""
     return f"16-bit photographs use only {used}: this range is stretched to 8 bits, alike for all of them"
 
 
-def with_transparency(item: Frame | DroppedFrame, mask: Mask | None) -> Frame | DroppedFrame:
+def apply_alpha_mask(item: Frame | DroppedFrame, mask: Mask | None) -> Frame | DroppedFrame:
     """Without what its alpha channel hides, which is no part of the photograph."""
     if isinstance(item, DroppedFrame) or mask is None:
         return item
-    masked_item = masked(item, mask)
+    masked_item = apply_mask(item, mask)
     if isinstance(masked_item, DroppedFrame):
         return DroppedFrame(item.name, f"its alpha channel hides {100 * (1 - mask.mean()):.1f} % of it")
     return masked_item
@@ -229,39 +231,39 @@ def _image_kind(path: Path) -> str | None:
         return image_kind(file.read(16))
 
 
-def _with_pose(item: Frame | DroppedFrame, poses: Trajectory | None, given: Poses | None) -> Frame | DroppedFrame:
-    """With its pose, where it has one; left out, with the reason, where that cannot be sent."""
+def _attach_pose(item: Frame | DroppedFrame, poses: Trajectory | None, given: Poses | None) -> Frame | DroppedFrame:
+    """Attaches the frame's pose, where it has one; drops the frame, with the reason, where that cannot be sent."""
     if isinstance(item, DroppedFrame) or poses is None or given is None:
         return item
     T_world_camera = poses.pose_of(item)
     if T_world_camera is None:
         return item
     try:
-        return replace(item, given_pose=given_pose(T_world_camera, given.sigma_m, given.sigma_deg))
+        return replace(item, given_pose=make_given_pose(T_world_camera, given.sigma_m, given.sigma_deg))
     except ValueError as error:
         return DroppedFrame(item.name, f"its pose cannot be used: {error}")
 
 
-def _right_of(path: Path, right_photographs: Mapping[str, Path], config: Config) -> RightImage | None:
-    """What the right camera saw when the photograph was taken; None where that is not there. Raises as reading does."""
+def _load_right_image(path: Path, right_photographs: Mapping[str, Path], config: Config) -> RightImage | None:
+    """Loads the right image of a photograph; None where it is not there. Raises as reading does."""
     partner = right_photographs.get(path.name)
     if partner is None or config.right is None:
         return None
-    seen = decode_photograph(read_image_file(partner, config.max_pixels), config.max_pixels)[0]
+    seen = decode_any_image(read_image_file(partner, config.max_pixels), config.max_pixels)[0]
     return RightImage(grey(seen), config.right.baseline)
 
 
-def foreign_file(path: Path) -> DroppedFrame | None:
+def explain_unreadable_file(path: Path) -> DroppedFrame | None:
     """The photograph left out, where its format is one that cannot be read here; else None."""
     suffix = path.suffix.lower()
-    remedy = _remedy(suffix)
+    remedy = _conversion_advice(suffix)
     return None if remedy is None else DroppedFrame(frame_name(path), f"{suffix} files cannot be read. {remedy}")
 
 
-def _remedy(suffix: str) -> str | None:
-    """What to do with files of this suffix, where they cannot be read here; else None."""
+def _conversion_advice(suffix: str) -> str | None:
+    """Says what to do with files of this suffix, where they cannot be read here; else None."""
     if suffix in heif_file.SUFFIXES:
-        return heif_file.lacking()
+        return heif_file.installation_advice()
     return "Convert it to JPEG or PNG" if suffix in FOREIGN_SUFFIXES else None
 
 
@@ -271,7 +273,7 @@ def frame_name(path: Path) -> str:
     Names go into messages, JSON and lists of cameras, where a stray byte or a line break would end the reconstruction.
     So would two frames of one name: files whose names differ have names that differ.
     """
-    return printable_name(path.name)
+    return sanitize_name(path.name)
 
 
 def image_paths(folder: Path) -> list[Path]:
@@ -299,13 +301,13 @@ def _may_be_file(path: Path) -> bool:
 
 
 def names_in(folder: Path) -> list[str]:
-    """What `Config.names` can choose from, in order. Raises as `stream` does."""
+    """Lists the names that `Config.names` can choose from, in order. Raises as `stream` does."""
     if recording.is_recording(folder):
         return recording.read(folder).names
-    return [frame_name(path) for path in chosen_images(folder)]
+    return [frame_name(path) for path in select_images(folder)]
 
 
-def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
+def select_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
     """The photographs of `folder` called `names`, or all. Raises where one is missing.
 
     A photograph is called by its file's name, with or without suffix, and by the name of its frame.
@@ -318,11 +320,11 @@ def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
         advice = f"{hidden[0]}{f', and {len(hidden) - 1} more' if len(hidden) > 1 else ''}" if hidden else advice
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
     suffixes = sorted({path.suffix.lower() for path in paths})
-    remedies = [_remedy(suffix) for suffix in suffixes]
+    remedies = [_conversion_advice(suffix) for suffix in suffixes]
     if remedies[0] is not None and None not in remedies:
         raise ValueError(f"{str(folder)!r} holds only {', '.join(suffixes)} files. {remedies[0]}")
     called = {path: {path.name, path.stem, frame_name(path)} for path in paths}
-    missing = [printable(name) for name in names if not any(name in own for own in called.values())]
+    missing = [sanitize_text(name) for name in names if not any(name in own for own in called.values())]
     if missing:
         present = ", ".join(frame_name(path) for path in paths[:5]) + (", ..." if len(paths) > 5 else "")
         raise ValueError(f"no photograph named {', '.join(missing)} in {str(folder)!r}; it holds {present}")

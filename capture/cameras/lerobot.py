@@ -10,11 +10,11 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.cameras import video
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, renamed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, rename_frame
 from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.lerobot.data_set import Film, film
-from splatnode.capture.pace import Pace, paced
-from splatnode.capture.process.printable import LONGEST_NAME, printable_name
+from splatnode.capture.pace import Pace, pace_frames
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_name
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
 
@@ -46,12 +46,12 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         to_s=found.to_s,
     )
     early_s = _EARLY / found.rate if found.rate else 0.0
-    return paced(_frames(video.stream(part, early_s), found), config.pace)
+    return pace_frames(_frames(video.stream(part, early_s), found), config.pace)
 
 
 def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:
     """Each has the number by which the data set knows its time; where it says no rate, that after the one before."""
-    stem = printable_name(f"episode_{found.episode:06d}_{found.key}", _LONGEST_STEM)
+    stem = sanitize_name(f"episode_{found.episode:06d}_{found.key}", _LONGEST_STEM)
     index, begins_ns = -1, math.inf
     for each in frames:
         if isinstance(each, DroppedFrame):
@@ -62,5 +62,5 @@ def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Fra
         if math.isinf(begins_ns):
             begins_ns = each.stamp_ns - (round(index / found.rate * 1e9) if found.rate else 0)
         stamp_ns = each.stamp_ns - round(begins_ns)
-        item = renamed(each, index, f"{stem}_{index:06d}.png", stamp_ns)
+        item = rename_frame(each, index, f"{stem}_{index:06d}.png", stamp_ns)
         yield replace(item, captured_at=Stamp(stamp_ns, Clock.RECORDING)) if isinstance(item, Frame) else item

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
 from splatnode.capture.logged.calibration import calibration_topic, lens
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
 from splatnode.capture.logged.message import Calibration, UnusableMessage
 from splatnode.capture.logged.order import MessageTime, read_in_order, read_picture, read_times
-from splatnode.capture.logged.pixels import is_photograph, rgb
+from splatnode.capture.logged.pixels import is_colour_image, rgb
 from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES, READ
-from splatnode.capture.pace import Pace, paced
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.pace import Pace, pace_frames
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.printable import LONGEST_NAME, printable, printable_name
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_name, sanitize_text
 
 log = logging.getLogger(__name__)
 
@@ -44,42 +44,44 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     """
     if not config.file.is_file():
         raise FileNotFoundError(f"no file {str(config.file)!r}; give an MCAP file")
-    topic = _chosen(config)
-    return paced(_frames(config, topic), config.pace)
+    topic = _select_topic(config)
+    return pace_frames(_frames(config, topic), config.pace)
 
 
 def image_topics(file: Path) -> list[Topic]:
     """Those whose messages are photographs, by name. Raises UnusableLog, OSError, ModuleNotFoundError without mcap."""
     pictures = [topic for topic in topics(file) if topic.kind in PICTURES and not topic.name.endswith(_NOT_PHOTOGRAPHS)]
-    return [topic for topic in pictures if topic.schema.endswith("CompressedImage") or _shows_photographs(file, topic)]
+    return [topic for topic in pictures if topic.schema.endswith("CompressedImage") or _has_colour_images(file, topic)]
 
 
-def _shows_photographs(file: Path, topic: Topic) -> bool:
+def _has_colour_images(file: Path, topic: Topic) -> bool:
     """Whether the first image of a topic is a photograph, and not depth; one that cannot be read may be."""
     first = next(messages(file, {topic.name}), None)
     if first is None:
         return False
     try:
-        return is_photograph(read_picture(first))
+        return is_colour_image(read_picture(first))
     except UnusableMessage:
         return True
 
 
-def _chosen(config: Config) -> Topic:
+def _select_topic(config: Config) -> Topic:
     """The topic that is configured, or the only one."""
     there = image_topics(config.file)
-    names = ", ".join(printable(topic.name, LONGEST_NAME) for topic in there)
-    shown = repr(printable(str(config.file)))
+    names = ", ".join(sanitize_text(topic.name, LONGEST_NAME) for topic in there)
+    shown = repr(sanitize_text(str(config.file)))
     if not there:
         others = sorted({topic.schema for topic in topics(config.file) if topic.schema})
-        held = f"it holds {printable(', '.join(others))}" if others else "it holds no messages of any schema"
+        held = f"it holds {sanitize_text(', '.join(others))}" if others else "it holds no messages of any schema"
         raise ValueError(f"{shown} must have a topic of images ({READ}); {held}")
     if not config.topic and len(there) > 1:
         raise ValueError(f"{shown} has {len(there)} topics of images: {names}; name one, as in FILE.mcap#TOPIC")
     for topic in there:
         if config.topic in ("", topic.name):
             return topic
-    raise ValueError(f"{shown} has no images of a topic {printable(config.topic, LONGEST_NAME)!r}; there are: {names}")
+    raise ValueError(
+        f"{shown} has no images of a topic {sanitize_text(config.topic, LONGEST_NAME)!r}; there are: {names}"
+    )
 
 
 def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
@@ -90,7 +92,7 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
             item = _frame(message, time, index, config, known)
             if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
                 sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
-                event(log, logging.WARNING, "lens_of_another_size", topic=printable(topic.name), **sizes)
+                event(log, logging.WARNING, "lens_of_another_size", topic=sanitize_text(topic.name), **sizes)
                 told = True
             yield item
             index += 1
@@ -99,7 +101,7 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
             raise
         yield DroppedFrame(f"{_stem(topic)}_rest", str(error))
     if index == 0:
-        raise ValueError(f"{str(config.file)!r} has no message of {printable(topic.name, LONGEST_NAME)}")
+        raise ValueError(f"{str(config.file)!r} has no message of {sanitize_text(topic.name, LONGEST_NAME)}")
 
 
 def _frame(
@@ -108,34 +110,34 @@ def _frame(
     name = f"{_stem(message.topic)}_{index:06d}.png"
     try:
         picture = read_picture(message)
-        with foreign(UnusableMessage):
+        with guard_untrusted(UnusableMessage):
             image = rgb(picture, config.max_pixels)
     except UnusableMessage as error:
         return DroppedFrame(name, str(error))
     height, width = image.shape[:2]
     fits = known is not None and same_aspect(known, width, height)
     own = known.resized(width, height) if known is not None and fits else None
-    return framed(index, name, time.stream_ns, image, own, captured_at=time.captured_at)
+    return make_frame(index, name, time.stream_ns, image, own, captured_at=time.captured_at)
 
 
 def _lens(file: Path, topic: Topic) -> Intrinsics | None:
-    """What the file tells of the topic's camera; where that cannot be used, it is said and None."""
+    """Reads the lens of the topic's camera; where it cannot be used, logs that and returns None."""
     told = [each.name for each in topics(file) if each.kind in CALIBRATIONS]
     known: dict[str, Calibration] = {}
     sensor = _sensor(file, topic)
     for name in told:
         first = next(messages(file, {name}), None)
         try:
-            with foreign(UnusableMessage):
+            with guard_untrusted(UnusableMessage):
                 if first is not None:
                     known[name] = CALIBRATIONS[first.topic.kind](first.data)
         except UnusableMessage as error:
-            event(log, logging.WARNING, "calibration_unreadable", topic=printable(name), error=printable(error))
+            event(log, logging.WARNING, "calibration_unreadable", topic=sanitize_text(name), error=sanitize_text(error))
     chosen = calibration_topic(topic.name, sensor, known)
     try:
         return None if chosen is None else lens(topic.name, known[chosen])
     except UnusableMessage as error:
-        event(log, logging.WARNING, "calibration_unusable", topic=printable(chosen), error=printable(error))
+        event(log, logging.WARNING, "calibration_unusable", topic=sanitize_text(chosen), error=sanitize_text(error))
         return None
 
 
@@ -149,4 +151,4 @@ def _sensor(file: Path, topic: Topic) -> str:
 
 def _stem(topic: Topic) -> str:
     """The topic in the name of a frame, which may name a file."""
-    return printable_name(topic.name.strip("/").replace("/", "_"), _LONGEST_STEM) or "image"
+    return sanitize_name(topic.name.strip("/").replace("/", "_"), _LONGEST_STEM) or "image"

@@ -54,17 +54,17 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def stream(config: Config) -> Iterator[Frame]:
     """The photographs in the order of the path."""
-    measured = measured_motions(config)
+    measured = simulate_odometry(config)
     for index, camera in enumerate(scene_cameras(config)):
         stamp_ns = round(index / config.frames_per_second * 1e9)
-        image, captured_at = photograph(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
+        image, captured_at = render_image(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
         right = None if config.baseline_m is None else _right_image(config, camera, index, config.baseline_m)
         frame = Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at, right=right)
         yield replace(frame, motion=measured[index][0], gravity=measured[index][1]) if measured else frame
 
 
-def measured_motions(config: Config) -> list[tuple[Motion, Gravity]]:
-    """What the photographs of the stream carry of their camera's way; nothing where no odometry is configured."""
+def simulate_odometry(config: Config) -> list[tuple[Motion, Gravity]]:
+    """Simulates the motions of the stream's keyframes; returns nothing where no odometry is configured."""
     if config.odometry is None:
         return []
     Ts = [T for T, _ in scene_cameras(config)]
@@ -91,7 +91,7 @@ def scene_cameras(config: Config) -> list[Camera]:
     return [_camera_on_path(config, float(index)) for index in range(config.views)]
 
 
-def held_out_cameras(config: Config) -> list[Camera]:
+def evaluation_cameras(config: Config) -> list[Camera]:
     """Cameras for testing: midway between each two neighbours of the stream."""
     return [_camera_on_path(config, index + 0.5) for index in range(config.views - 1)]
 
@@ -101,7 +101,7 @@ def video_cameras(config: Config, between: int) -> list[Camera]:
     return [_camera_on_path(config, number / between) for number in range((config.views - 1) * between + 1)]
 
 
-def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArray[np.uint8]:
+def render_image(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB as `camera` sees the place of `config`: antialiased, with sensor noise."""
     T_world_camera, K = camera
     dense = config.width * config.samples, config.height * config.samples
@@ -116,11 +116,11 @@ def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArr
 
 
 def _right_image(config: Config, camera: Camera, index: int, baseline_m: float) -> RightImage:
-    seen = photograph(config, right_of(camera, baseline_m), _RIGHT_SEED + index)
+    seen = render_image(config, offset_right_camera(camera, baseline_m), _RIGHT_SEED + index)
     return RightImage(grey(seen), Baseline(baseline_m))
 
 
-def right_of(camera: Camera, baseline_m: float) -> Camera:
+def offset_right_camera(camera: Camera, baseline_m: float) -> Camera:
     """The right one of a stereo camera whose left one is `camera`: of the same axes and lens."""
     T_world_camera, K = camera
     beside = T_world_camera.copy()

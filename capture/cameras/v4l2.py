@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.given_lens import check_fits
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond
@@ -112,7 +112,7 @@ def _frame(raw: RawFrame, chosen: Format, frame_id: int, intrinsics: Intrinsics 
     if intrinsics is not None:
         intrinsics = intrinsics.resized(image.shape[1], image.shape[0])
     encoded = raw.data if chosen.pixels == "MJPG" else None
-    return framed(frame_id, name, raw.stamp_ns, image, intrinsics, encoded, wall_clock(raw.stamp_ns))
+    return make_frame(frame_id, name, raw.stamp_ns, image, intrinsics, encoded, wall_clock(raw.stamp_ns))
 
 
 def _decode(data: bytes, chosen: Format) -> npt.NDArray[np.uint8]:
@@ -130,7 +130,7 @@ def _decode(data: bytes, chosen: Format) -> npt.NDArray[np.uint8]:
 def _only_camera(system: System | None) -> str:
     found = find(system)
     if len(found) != 1:
-        raise CameraUnavailable(f"camera.device must say which camera; {_listed(found)}")
+        raise CameraUnavailable(f"camera.device must say which camera; {_describe_cameras(found)}")
     return found[0]["device"]
 
 
@@ -139,13 +139,13 @@ def _explain(error: OSError, path: str, system: System | None) -> str:
         errno.ENODEV: f"{path} was unplugged",
         errno.EBUSY: f"{path} is used by another program; close it",
         errno.EACCES: f"no right to open {path}; add this user to the group video",
-        errno.ENOENT: f"no camera at {path}; {_listed(find(system))}",
-        errno.ENOTTY: f"{path} is no camera; {_listed(find(system))}",
+        errno.ENOENT: f"no camera at {path}; {_describe_cameras(find(system))}",
+        errno.ENOTTY: f"{path} is no camera; {_describe_cameras(find(system))}",
     }
     return reasons.get(error.errno or 0, f"{path}: {error.strerror or error}")
 
 
-def _listed(found: list[dict[str, str]]) -> str:
+def _describe_cameras(found: list[dict[str, str]]) -> str:
     if not found:
         return "none is connected. Plug one in, then: splatnode find"
     return "found: " + "; ".join(f"{camera['device']} {camera['description']}" for camera in found)

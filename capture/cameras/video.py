@@ -9,14 +9,14 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.given_lens import check_fits, same_aspect
 from splatnode.capture.image_file import MaxPixels
-from splatnode.capture.pace import Pace, paced
+from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.printable import LONGEST_NAME, printable_name
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_name
 from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
-from splatnode.capture.video_process import MAX_VIDEO_PIXELS, Span, VideoError, VideoFrame, decoded
+from splatnode.capture.video_process import MAX_VIDEO_PIXELS, Span, VideoError, VideoFrame, decode_video
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ def stream(config: Config, early_s: float = 0.0) -> Iterator[Frame | DroppedFram
     """
     if not config.file.is_file():
         raise FileNotFoundError(f"no file {str(config.file)!r}; give a video, such as an MP4")
-    return paced(_frames(config, early_s), config.pace)
+    return pace_frames(_frames(config, early_s), config.pace)
 
 
 def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
@@ -51,7 +51,7 @@ def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
     from_ns = max(0, round((config.from_s - early_s) * 1e9))
     span = Span(from_ns, None if config.to_s is None else max(0, round((config.to_s - early_s) * 1e9)))
     try:
-        for found in decoded(config.file, config.every, config.max_pixels, span):
+        for found in decode_video(config.file, config.every, config.max_pixels, span):
             if frame_id == 0:
                 _begin(found, config)
             yield _frame(found, frame_id, config)
@@ -83,7 +83,7 @@ def _begin(first: VideoFrame, config: Config) -> None:
 
 
 def _stem(config: Config) -> str:
-    return printable_name(config.file.stem, _LONGEST_STEM)
+    return sanitize_name(config.file.stem, _LONGEST_STEM)
 
 
 def _frame(found: VideoFrame, frame_id: int, config: Config) -> Frame | DroppedFrame:
@@ -92,4 +92,4 @@ def _frame(found: VideoFrame, frame_id: int, config: Config) -> Frame | DroppedF
     lens = known.resized(width, height) if known is not None and same_aspect(known, width, height) else None
     name = f"{_stem(config)}_{found.index:06d}.png"
     captured_at = Stamp(found.time_ns, Clock.RECORDING) if found.time_ns <= LARGEST_NS else None
-    return framed(frame_id, name, found.time_ns, found.image, lens, captured_at=captured_at)
+    return make_frame(frame_id, name, found.time_ns, found.image, lens, captured_at=captured_at)

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths, with_transparency
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.cameras.folder import apply_alpha_mask, explain_unreadable_file, frame_name, image_paths
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import (
     MAX_PIXELS,
@@ -19,12 +19,12 @@ from splatnode.capture.image_file import (
     MaxPixels,
     UnusableImage,
     check_whole,
-    decode_photograph,
+    decode_any_image,
     measure_values,
     read_image_file,
 )
 from splatnode.capture.name_time import name_time
-from splatnode.capture.nothing_new import NothingNew
+from splatnode.capture.nothing_new import KeepAlive
 from splatnode.capture.process.memory_shortage import is_shortage, outlast
 from splatnode.capture.stamp import Clock, Stamp, nearest_stamp
 from splatnode.capture.unavailable import CameraUnavailable
@@ -47,7 +47,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _FileState:
     """A file as it was when it last changed."""
 
     size: int  # -1: it could not be asked
@@ -61,11 +61,11 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
     Hidden and temporary files are not looked at. Raises CameraUnavailable where the folder is not there, or goes.
     """
-    return (item for item in opener(config)() if not isinstance(item, NothingNew))
+    return (item for item in opener(config)() if not isinstance(item, KeepAlive))
 
 
-def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame | NothingNew]]:
-    """What opens the folder, again after each loss: then what came meanwhile is taken, and nothing a second time.
+def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]]:
+    """Returns the function that opens the folder, again after each loss: no photograph is taken twice or missed.
 
     Each look at the folder ends with NothingNew.
     """
@@ -81,34 +81,34 @@ class _Watched:
         self._done: dict[str, tuple[int, int] | None] = {}  # by name, the longest known first: which file it was
         self._here: set[str] = set()  # names at the last look
 
-    def stream(self) -> Iterator[Frame | DroppedFrame | NothingNew]:
+    def stream(self) -> Iterator[Frame | DroppedFrame | KeepAlive]:
         """Raises CameraUnavailable."""
         if self._opened:
             self._here = set()  # while it was away, any name may have been given to another photograph
         elif not self._config.existing:
-            self._done = {path.name: _version(path) for path in _listed(self._config.folder)}
+            self._done = {path.name: _version(path) for path in _list_images(self._config.folder)}
             self._here = set(self._done)
         self._opened = True
         return self._frames()
 
-    def _frames(self) -> Iterator[Frame | DroppedFrame | NothingNew]:
-        seen: dict[str, _Seen] = {}
+    def _frames(self) -> Iterator[Frame | DroppedFrame | KeepAlive]:
+        seen: dict[str, _FileState] = {}
         frame_id = 0
         while True:
-            for path in self._to_look_at():
+            for path in self._list_candidates():
                 version = _version(path)
-                item = _look(path, seen, self._config, frame_id)
+                item = _read_when_complete(path, seen, self._config, frame_id)
                 if item is not None:
                     self._done[path.name] = version
                     seen.pop(path.name, None)
                     frame_id += isinstance(item, Frame)
                     yield item
-            yield NothingNew()
+            yield KeepAlive()
             time.sleep(self._config.poll_s)
 
-    def _to_look_at(self) -> list[Path]:
+    def _list_candidates(self) -> list[Path]:
         """A name that was free may be given to another photograph; the same one may be back, with all of its folder."""
-        listed = _listed(self._config.folder)
+        listed = _list_images(self._config.folder)
         for path in listed:
             if path.name in self._done and path.name not in self._here and _version(path) != self._done[path.name]:
                 del self._done[path.name]
@@ -129,16 +129,18 @@ def _version(path: Path) -> tuple[int, int] | None:
     return found.st_size, found.st_mtime_ns
 
 
-def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> Frame | DroppedFrame | None:
+def _read_when_complete(
+    path: Path, seen: dict[str, _FileState], config: Config, frame_id: int
+) -> Frame | DroppedFrame | None:
     """The photograph; None while it is being written, or where it has gone."""
-    if (unreadable := foreign_file(path)) is not None:
+    if (unreadable := explain_unreadable_file(path)) is not None:
         return unreadable
     name, now = frame_name(path), time.monotonic()
     try:
         found = path.stat()
         before = seen.get(path.name)
         if before is None or (before.size, before.changed_ns) != (found.st_size, found.st_mtime_ns):
-            seen[path.name] = _Seen(found.st_size, found.st_mtime_ns, now, before.first if before else now)
+            seen[path.name] = _FileState(found.st_size, found.st_mtime_ns, now, before.first if before else now)
             return None
         if now - before.since < config.settle_s:
             return None
@@ -151,22 +153,22 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
         if is_shortage(error):  # no fault of the file, which has all of its time again
             seen.pop(path.name, None)
             return None
-        _listed(config.folder)  # raises where it is the folder that has gone
-        first = seen.setdefault(path.name, _Seen(-1, -1, now, now)).first
-        return _given_up(name, f"cannot be read: {error.strerror}", now - first, config)
+        _list_images(config.folder)  # raises where it is the folder that has gone
+        first = seen.setdefault(path.name, _FileState(-1, -1, now, now)).first
+        return _drop_when_overdue(name, f"cannot be read: {error.strerror}", now - first, config)
     except UnusableImage as error:
-        return _given_up(name, str(error), now - seen[path.name].first, config)
-    return _decoded(name, data, nearest_stamp(found.st_mtime_ns, Clock.FILE), config, frame_id)
+        return _drop_when_overdue(name, str(error), now - seen[path.name].first, config)
+    return _decode_frame(name, data, nearest_stamp(found.st_mtime_ns, Clock.FILE), config, frame_id)
 
 
-def _given_up(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
+def _drop_when_overdue(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
     """None while it may still become whole, or readable."""
     return None if waited_s < config.give_up_s else DroppedFrame(name, f"{why}, after {waited_s:.0f} s")
 
 
-def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
+def _decode_frame(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
     try:
-        decoded, used = outlast(lambda: _in_eight_bits(data, config.max_pixels), name)
+        decoded, used = outlast(lambda: _convert_to_eight_bits(data, config.max_pixels), name)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
     image, intrinsics = decoded.image, decoded.intrinsics
@@ -175,18 +177,18 @@ def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id
         intrinsics = config.intrinsics.resized(width, height)
     captured_at = decoded.captured_at or name_time(name) or written_at
     known = image, intrinsics, data if used is None else None, captured_at
-    item = framed(frame_id, name, time.monotonic_ns(), *known, exposure=decoded.exposure, camera=decoded.camera)
-    return with_transparency(item, decoded.mask)
+    item = make_frame(frame_id, name, time.monotonic_ns(), *known, exposure=decoded.exposure, camera=decoded.camera)
+    return apply_alpha_mask(item, decoded.mask)
 
 
-def _in_eight_bits(data: bytes, max_pixels: int) -> tuple[DecodedImage, ValueRange | None]:
+def _convert_to_eight_bits(data: bytes, max_pixels: int) -> tuple[DecodedImage, ValueRange | None]:
     """The photograph, and the range of 16 bits that it was stretched from. Raises UnusableImage."""
     extent = measure_values(data, max_pixels)
     used = None if extent is None else find_range([extent])
-    return decode_photograph(data, max_pixels, used), used
+    return decode_any_image(data, max_pixels, used), used
 
 
-def _listed(folder: Path) -> list[Path]:
+def _list_images(folder: Path) -> list[Path]:
     try:
         paths = outlast(lambda: image_paths(folder), frame_name(folder))
     except OSError as error:

@@ -84,12 +84,12 @@ class Builder:
         self.add(Shape.CYLINDER, centre, (diameter, diameter, height), painter, TOWARDS_CAMERAS)
 
 
-def scaled(colour: paint.Colour, factor: float) -> paint.Colour:
+def scale_colour(colour: paint.Colour, factor: float) -> paint.Colour:
     red, green, blue = colour
     return red * factor, green * factor, blue * factor
 
 
-def only(face: int, painter: paint.Painter, others: paint.Painter = paint.unseen) -> list[paint.Painter]:
+def only(face: int, painter: paint.Painter, others: paint.Painter = paint.blank) -> list[paint.Painter]:
     """Painters of a box of which only one face matters."""
     return [painter if index == face else others for index in range(Shape.BOX.num_faces)]
 

@@ -31,7 +31,7 @@ def cast(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """(H, W, 3) 8-bit colours of the nearest surfaces and (H, W) their z, camera frame, inf for nothing."""
     z, nearest = trace(solids, camera, width, height)
-    return coloured(solids, camera, z, nearest), z
+    return colour_pixels(solids, camera, z, nearest), z
 
 
 def trace(
@@ -63,7 +63,7 @@ def trace(
     return z, nearest
 
 
-def coloured(
+def colour_pixels(
     solids: Sequence[Solid], camera: Camera, z: npt.NDArray[np.float32], nearest: npt.NDArray[np.int32]
 ) -> npt.NDArray[np.float32]:
     """(H, W, 3) 8-bit colours of what `trace` found; black where it found nothing."""
@@ -99,7 +99,7 @@ def _ray_parts(solid: Solid, camera: Camera, shape: tuple[int, int]) -> tuple[li
     rows, columns = (np.arange(size) + 0.5 for size in shape)
     along_row = [(a * columns + c).astype(np.float32) for a, _, c in local_from_pixel]
     along_column = [(b * rows).astype(np.float32) for _, b, _ in local_from_pixel]
-    return [np.float32(value) for value in solid.to_local(T_world_camera[:3, 3])], along_row, along_column
+    return [np.float32(value) for value in solid.transform_to_local(T_world_camera[:3, 3])], along_row, along_column
 
 
 def _window(solid: Solid, camera: Camera, width: int, height: int) -> Window | None:

@@ -20,10 +20,10 @@ from splatnode.capture.diorama.builder import (
     Builder,
     Palette,
     only,
-    scaled,
+    scale_colour,
 )
 from splatnode.capture.diorama.furniture import cartons, plant, table
-from splatnode.capture.diorama.light import Light, lit
+from splatnode.capture.diorama.light import Light, bake_light
 from splatnode.capture.diorama.solids import Solid
 
 BRICK_WALL = 1  # its index among the solids of a place
@@ -36,17 +36,17 @@ def place(seed: int, density: float) -> tuple[Solid, ...]:
     builder = Builder(seed, density)
     rng = builder.rng
     _room(builder, palette)
-    _on_the_walls(builder, palette)
+    _furnish_walls(builder, palette)
     x, y = rng.uniform((0.85, 0.80), (1.05, 1.0))
     table(builder, palette, x, y, yaw_deg=rng.uniform(-12, 12))
     sides = rng.permutation([rng.uniform((1.95, 0.45), (2.25, 0.55)), rng.uniform((0.45, 1.95), (0.55, 2.25))])
     plant(builder, palette, *sides[0])
     cartons(builder, palette, *sides[1])
-    _on_the_rug(builder, palette)
+    _furnish_rug(builder, palette)
     height = rng.uniform(1.0, 1.3)
     towards_sun = rng.uniform(0.55, 0.8), rng.uniform(0.35, 0.6), height
     light = Light(towards_sun, texels_per_metre=density / 14)
-    return tuple(lit(builder.solids, light, rng))
+    return tuple(bake_light(builder.solids, light, rng))
 
 
 def _room(builder: Builder, palette: Palette) -> None:
@@ -59,7 +59,7 @@ def _room(builder: Builder, palette: Palette) -> None:
     builder.box((2.5, 0.02, 2.45), (5.0, 0.04, 0.07), skirting)
 
 
-def _on_the_walls(builder: Builder, palette: Palette) -> None:
+def _furnish_walls(builder: Builder, palette: Palette) -> None:
     rng, accents = builder.rng, palette.accents
     frame, paper = paint.wood((92, 66, 50)), paint.plain(PAPER)
     inks = [accents[1], accents[0], accents[3], accents[2], INK]
@@ -78,20 +78,20 @@ def _on_the_walls(builder: Builder, palette: Palette) -> None:
     while left < shelf_left + 0.86:
         thickness, height = rng.uniform(0.028, 0.06), rng.uniform(0.20, 0.31)
         spine = accents[int(rng.integers(len(accents)))]
-        cover = prints.book(scaled(spine, rng.uniform(0.75, 1.15)), PAPER if sum(spine) < 420 else INK)
+        cover = prints.book(scale_colour(spine, rng.uniform(0.75, 1.15)), PAPER if sum(spine) < 420 else INK)
         size = (thickness, 0.16, height)
         builder.box((left + thickness / 2, 0.10, shelf_z + 0.015 + height / 2), size, [cover] * 4 + [prints.pages] * 2)
         left += thickness + 0.003
     builder.ball((shelf_left + 1.03, 0.11, shelf_z + 0.105), 0.18, paint.marble(accents[0], CREAM))
 
 
-def _on_the_rug(builder: Builder, palette: Palette) -> None:
+def _furnish_rug(builder: Builder, palette: Palette) -> None:
     rng, accents = builder.rng, palette.accents
     builder.box((1.75, 1.75, 0.006), (1.7, 1.25, 0.012), paint.rug([CREAM, *accents]), -45 + rng.uniform(-8, 8))
     spots = rng.permutation([rng.uniform((1.25, 1.75), (1.4, 1.95)), rng.uniform((1.95, 1.2), (2.15, 1.35))])
     (ball_x, ball_y), (x, y) = spots
     builder.ball((ball_x, ball_y, 0.012 + 0.15), 0.30, paint.ball([accents[0], PAPER, accents[1]]), 35)
-    builder.cylinder((x, y, 0.012), 0.36, 0.40, paint.glazed(accents[2], CREAM))
+    builder.cylinder((x, y, 0.012), 0.36, 0.40, paint.glaze(accents[2], CREAM))
     for step in range(3):
         colour = accents[(step + 1) % len(accents)]
         cover = prints.book(colour, PAPER if sum(colour) < 420 else INK)

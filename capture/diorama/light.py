@@ -27,12 +27,12 @@ class Light:
     sky_samples: int = 36
 
 
-def lit(solids: Sequence[Solid], light: Light, rng: np.random.Generator) -> list[Solid]:
+def bake_light(solids: Sequence[Solid], light: Light, rng: np.random.Generator) -> list[Solid]:
     """The solids with the light of their place multiplied into their skins."""
-    return [replace(solid, skins=_lit_skins(solid, solids, light, rng)) for solid in solids]
+    return [replace(solid, skins=_bake_skins(solid, solids, light, rng)) for solid in solids]
 
 
-def _lit_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.random.Generator):
+def _bake_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.random.Generator):
     others = [other for other in solids if other is not solid]
     skins = []
     for face, skin in enumerate(solid.skins):
@@ -40,14 +40,14 @@ def _lit_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.rand
             skins.append(skin)
             continue
         irradiance = _irradiance(solid, face, others, light, rng)
-        skins.append(under_light(skin, irradiance))
+        skins.append(apply_irradiance(skin, irradiance))
     return tuple(skins)
 
 
-def under_light(skin: npt.NDArray[np.uint8], irradiance: Array) -> npt.NDArray[np.uint8]:
+def apply_irradiance(skin: npt.NDArray[np.uint8], irradiance: Array) -> npt.NDArray[np.uint8]:
     """A skin (h, w, 3) under the light of a coarser grid (m, n, 3), linear RGB."""
     smooth = cv2.resize(irradiance, (skin.shape[1], skin.shape[0]), interpolation=cv2.INTER_LINEAR)
-    return to_srgb(from_srgb(skin) * smooth)
+    return encode_srgb(decode_srgb(skin) * smooth)
 
 
 def _irradiance(solid: Solid, face: int, others: Sequence[Solid], light: Light, rng: np.random.Generator) -> Array:
@@ -56,18 +56,18 @@ def _irradiance(solid: Solid, face: int, others: Sequence[Solid], light: Light, 
     shape = points.shape
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
     in_front = [other for other in others if ((other.corners @ normals.T) > (points * normals).sum(1)).any()]
-    irradiance = gathered(points, normals, in_front, light, rng)
+    irradiance = gather_irradiance(points, normals, in_front, light, rng)
     return cv2.GaussianBlur(irradiance.reshape(shape).astype(np.float32), (0, 0), 0.7).astype(np.float32)
 
 
-def gathered(
+def gather_irradiance(
     points: Array, normals: Array, occluders: Sequence[Solid], light: Light, rng: np.random.Generator
 ) -> Array:
     """(P, 3) linear RGB that arrives at points (P, 3) just above surfaces with unit normals (P, 3)."""
     towards_sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
     to_sun = towards_sun + light.sun_radius * rng.normal(size=(len(points), light.sun_samples, 3)) / 1.7
     to_sky = _cosine_directions(normals, light.sky_samples, rng)
-    is_open = _unblocked(points, np.concatenate([to_sun, to_sky], axis=1), occluders)
+    is_open = _find_open_rays(points, np.concatenate([to_sun, to_sky], axis=1), occluders)
     sunlit = np.maximum(normals @ towards_sun, 0) * is_open[:, : light.sun_samples].mean(1)
     open_sky = is_open[:, light.sun_samples :].mean(1)[:, None]
     return sunlit[:, None] * light.sun + open_sky * light.sky + (1 - open_sky) * light.bounced
@@ -97,12 +97,12 @@ def _cosine_directions(normals: Array, samples: int, rng: np.random.Generator) -
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1) @ basis
 
 
-def _unblocked(points: Array, directions: Array, occluders: Sequence[Solid]) -> npt.NDArray[np.bool_]:
+def _find_open_rays(points: Array, directions: Array, occluders: Sequence[Solid]) -> npt.NDArray[np.bool_]:
     """(P, S) whether a ray from points (P, 3) along directions (P, S, 3) meets no solid."""
     unblocked = np.ones(directions.shape[:2], bool)
     directions = directions.astype(np.float32)
     for solid in occluders:
-        o = solid.to_local(points).astype(np.float32)[:, None]
+        o = solid.transform_to_local(points).astype(np.float32)[:, None]
         d = directions @ solid.inverse.T.astype(np.float32)
         origin, direction = (o[..., 0], o[..., 1], o[..., 2]), (d[..., 0], d[..., 1], d[..., 2])
         near, far = ray_interval(solid.shape, origin, direction)
@@ -110,12 +110,12 @@ def _unblocked(points: Array, directions: Array, occluders: Sequence[Solid]) -> 
     return unblocked
 
 
-def from_srgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+def decode_srgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     """8-bit sRGB -> linear [0, 1]."""
     return _LINEAR[image]
 
 
-def to_srgb(linear: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+def encode_srgb(linear: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """Linear light -> 8-bit sRGB; highlights roll off towards white instead of clipping."""
     return _SRGB[np.minimum(linear * _STEPS_PER_UNIT, len(_SRGB) - 1).astype(np.int32)]
 

@@ -29,7 +29,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def odometry(names: Sequence[str], Ts: Sequence[Matrix], config: Config, seed: int) -> list[tuple[Motion, Gravity]]:
-    """Of photographs with these names, taken from T_world_camera (4, 4) each.
+    """Simulates the odometry of frames with these names, taken from T_world_camera (4, 4) each.
 
     The standard deviations that are told are those of the errors.
     """
@@ -47,7 +47,7 @@ def _next(motion: Motion, step: Matrix, config: Config, rng: np.random.Generator
     sigma_m = config.drift / math.sqrt(3.0) * float(np.linalg.norm(step[:3, 3]))
     measured[:3, 3] += rng.normal(0.0, sigma_m, 3)
     measured[:3, :3] = step[:3, :3] @ _turn(config.noise_deg, rng)
-    return motion.then(measured, max(sigma_m, _LEAST_M), max(config.noise_deg, _LEAST_DEG))
+    return motion.append_step(measured, max(sigma_m, _LEAST_M), max(config.noise_deg, _LEAST_DEG))
 
 
 def _turn(noise_deg: float, rng: np.random.Generator) -> Matrix:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from splatnode.capture.diorama.prints import book, words, write
-from splatnode.capture.diorama.textures import Colour, Image, Painter, noise, shaded, texels, to_image
+from splatnode.capture.diorama.textures import Colour, Image, Painter, noise, quantize_colours, shade_colour, texels
 
 
 def wallpaper(colour: Colour, inks: Sequence[Colour]) -> Painter:
@@ -17,7 +17,7 @@ def wallpaper(colour: Colour, inks: Sequence[Colour]) -> Painter:
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
         stripes = 0.02 * np.sign(np.sin(2 * np.pi * np.arange(width) / (0.23 * density)))
-        image = shaded(colour, 1 + stripes + 0.03 * noise(rng, shape, 0.2 * density, 4))
+        image = shade_colour(colour, 1 + stripes + 0.03 * noise(rng, shape, 0.2 * density, 4))
         for _ in range(round(34 * width_m * height_m)):
             at = round(rng.uniform(0, width)), round(rng.uniform(0, height))
             ink = np.array(inks[int(rng.integers(len(inks)))]) * rng.uniform(0.8, 1.15)
@@ -36,7 +36,7 @@ def upholstery(colour: Colour, inks: Sequence[Colour]) -> Painter:
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
         worn = 0.08 * noise(rng, shape, 0.15 * density, 4) + 0.07 * noise(rng, shape, 0.02 * density, 2)
-        image = shaded(colour, 1 + worn)
+        image = shade_colour(colour, 1 + worn)
         for _ in range(round(12 + 60 * width_m * height_m)):
             start = rng.uniform((0, 0), (width, height))
             end = start + rng.normal(scale=0.06 * density, size=2)
@@ -81,7 +81,7 @@ def drawers(colour: Colour, rows: int, columns: int) -> Painter:
         row, column = (y * rows / height).astype(int), (x * columns / width).astype(int)
         tint = rng.normal(size=(rows + 1, columns + 1)).astype(np.float32)[row, column]
         grain = 0.06 * np.sin(2 * np.pi * (y / density / 0.03 + 1.3 * wave + 3 * tint))
-        image = shaded(colour, 1 + grain + 0.07 * wave + 0.08 * tint)
+        image = shade_colour(colour, 1 + grain + 0.07 * wave + 0.08 * tint)
         for i in range(rows):
             for j in range(columns):
                 corner = round(j * width / columns), round(i * height / rows)
@@ -106,7 +106,7 @@ def tiles(colours: Sequence[Colour], size: float = 0.3) -> Painter:
         veins = 0.3 * np.exp(-((noise(rng, shape, 0.12 * density, 5) / 0.1) ** 2))
         shade = 1 + 0.07 * tint - veins + 0.04 * noise(rng, shape, 0.02 * density, 3)
         joint = np.minimum.reduce([x - column, column + 1 - x, y - row, row + 1 - y]) < 0.02
-        return to_image(np.array(colours, np.float32)[chosen] * np.where(joint, 0.62, shade)[..., None])
+        return quantize_colours(np.array(colours, np.float32)[chosen] * np.where(joint, 0.62, shade)[..., None])
 
     return paint
 
@@ -116,7 +116,7 @@ def screen(ink: Colour) -> Painter:
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
-        image = shaded((52, 84, 112), 1 + 0.25 * noise(rng, shape, 0.15 * density, 4))
+        image = shade_colour((52, 84, 112), 1 + 0.25 * noise(rng, shape, 0.15 * density, 4))
         for _ in range(3):
             left, top = rng.uniform((0.03, 0.05), (0.5, 0.5)) * (width, height)
             right, bottom = left + 0.45 * width, top + 0.45 * height
@@ -133,7 +133,7 @@ def abstract(paper: Colour, inks: Sequence[Colour]) -> Painter:
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
-        image = shaded(paper, 1 + 0.03 * noise(rng, shape, 0.1 * density, 4))
+        image = shade_colour(paper, 1 + 0.03 * noise(rng, shape, 0.1 * density, 4))
         for _ in range(int(rng.integers(9, 16))):
             x, y = (round(value) for value in rng.uniform((0, 0), (width, height)))
             ink = tuple(float(value) for value in inks[int(rng.integers(len(inks)))])
@@ -147,6 +147,6 @@ def abstract(paper: Colour, inks: Sequence[Colour]) -> Painter:
                 turn, long = rng.uniform(0, np.pi), size * rng.uniform(1, 3)
                 end = round(x + long * np.cos(turn)), round(y + long * np.sin(turn))
                 cv2.line(image, (x, y), end, ink, max(1, round(size / (2 if kind == 2 else 7))), cv2.LINE_AA)
-        return to_image(image * (1 + 0.05 * noise(rng, shape, 0.03 * density, 3))[..., None])
+        return quantize_colours(image * (1 + 0.05 * noise(rng, shape, 0.03 * density, 3))[..., None])
 
     return paint

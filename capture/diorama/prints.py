@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from splatnode.capture.diorama.textures import Colour, Image, Painter, noise, shaded, texels, to_image
+from splatnode.capture.diorama.textures import Colour, Image, Painter, noise, quantize_colours, shade_colour, texels
 
 _VOCABULARY = (
     "light field view scene depth north river orbit lens sun paper garden stone harbour window signal atlas motion "
@@ -40,7 +40,9 @@ def poster(paper: Colour, inks: Sequence[Colour]) -> Painter:
         picture = image[top:bottom, margin : width - margin]
         rows, columns = picture.shape[:2]
         fade = np.linspace(0, 1, rows)[:, None, None]
-        picture[:] = to_image(np.broadcast_to((1 - fade) * np.array(inks[0]) + fade * np.array(paper), picture.shape))
+        picture[:] = quantize_colours(
+            np.broadcast_to((1 - fade) * np.array(inks[0]) + fade * np.array(paper), picture.shape)
+        )
         centre = round(rng.uniform(0.25, 0.75) * columns), round(rng.uniform(0.22, 0.4) * rows)
         cv2.circle(picture, centre, round(rng.uniform(0.13, 0.2) * columns), inks[1], -1, cv2.LINE_AA)
         for layer, ink in enumerate(inks[2:]):
@@ -48,13 +50,13 @@ def poster(paper: Colour, inks: Sequence[Colour]) -> Painter:
             line = (0.45 + 0.17 * layer) * rows + 0.07 * rows * crest[0]
             below = np.arange(rows)[:, None] > line
             shade = 1 + 0.10 * noise(rng, (rows, columns), 0.06 * density, 4)
-            picture[below] = to_image(shade[..., None] * np.array(ink))[below]
+            picture[below] = quantize_colours(shade[..., None] * np.array(ink))[below]
         write(image, words(rng, 2).upper(), margin, 0.775 * height, width - 2 * margin, inks[-1], 3)
         for line in range(5):
             share = rng.uniform(0.72, 1.0) if line < 4 else 0.45
             baseline = (0.835 + 0.033 * line) * height
             write(image, words(rng, 6), margin, baseline, share * (width - 2 * margin), inks[-1], 1.5)
-        return to_image(image * (1 + 0.02 * noise(rng, (height, width), 0.2 * density))[..., None])
+        return quantize_colours(image * (1 + 0.02 * noise(rng, (height, width), 0.2 * density))[..., None])
 
     return paint
 
@@ -65,9 +67,9 @@ def carton(colour: Colour, ink: Colour) -> Painter:
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
         ribs = 0.02 * np.sin(2 * np.pi * np.arange(width) / (0.008 * density))
-        image = shaded(colour, 1 + ribs + 0.05 * noise(rng, shape, 0.09 * density, 5))
+        image = shade_colour(colour, 1 + ribs + 0.05 * noise(rng, shape, 0.09 * density, 5))
         tape = slice(round(0.45 * width), round(0.55 * width))
-        image[: round(0.22 * height), tape] = to_image(image[: round(0.22 * height), tape] * 0.80 + 26.0)
+        image[: round(0.22 * height), tape] = quantize_colours(image[: round(0.22 * height), tape] * 0.80 + 26.0)
         write(image, words(rng, 1).upper(), 0.08 * width, 0.50 * height, 0.52 * width, ink, 3)
         write(image, words(rng, 3), 0.08 * width, 0.62 * height, 0.6 * width, ink, 1.5)
         for arrow in (0.78, 0.88):
@@ -93,7 +95,7 @@ def book(colour: Colour, ink: Colour) -> Painter:
         if height_m > 2 * width_m:
             return np.ascontiguousarray(np.rot90(paint(rng, height_m, width_m, density), -1))
         height, width = shape = texels(width_m, height_m, density)
-        image = shaded(colour, 1 + 0.06 * noise(rng, shape, 0.03 * density, 4))
+        image = shade_colour(colour, 1 + 0.06 * noise(rng, shape, 0.03 * density, 4))
         for edge in (0.05, 0.93):
             image[:, round(edge * width) : round((edge + 0.02) * width) + 1] = np.array(ink, np.uint8)
         write(image, words(rng, 2).upper(), 0.14 * width, 0.62 * height, 0.7 * width, ink, 2)
@@ -108,4 +110,4 @@ def pages(rng: np.random.Generator, width_m: float, height_m: float, density: fl
     """The cut edge of a book."""
     height, width = texels(width_m, height_m, density)
     lines = rng.normal(size=(height, 1)) if width > height else rng.normal(size=(1, width))
-    return to_image(np.array([226, 216, 192]) * (1 + 0.05 * np.broadcast_to(lines, (height, width)))[..., None])
+    return quantize_colours(np.array([226, 216, 192]) * (1 + 0.05 * np.broadcast_to(lines, (height, width)))[..., None])

@@ -45,7 +45,7 @@ class Solid:
         signs = np.stack(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0], indexing="ij"), -1).reshape(8, 3)
         return signs @ self.axes.T + self.centre
 
-    def to_local(self, points: Array) -> Array:
+    def transform_to_local(self, points: Array) -> Array:
         """(..., 3) world -> (..., 3) in the unit shape's frame."""
         return (points - self.centre) @ self.inverse.T
 

@@ -34,21 +34,21 @@ def noise(rng: np.random.Generator, shape: tuple[int, int], cell: float, octaves
     return (total - total.mean()) / (total.std() + 1e-6)
 
 
-def to_image(colours: Field) -> Image:
+def quantize_colours(colours: Field) -> Image:
     """(h, w, 3) rounded to bytes; what is out of range is clipped."""
     return np.clip(np.rint(colours), 0, 255).astype(np.uint8)
 
 
-def shaded(colour: Colour, shade: Field) -> Image:
+def shade_colour(colour: Colour, shade: Field) -> Image:
     """One colour, as bright as `shade` (h, w) says, of mean 1."""
-    return to_image(shade[..., None] * _f32(colour))
+    return quantize_colours(shade[..., None] * _f32(colour))
 
 
 def _f32(colour: Colour) -> npt.NDArray[np.float32]:
     return np.array(colour, np.float32)
 
 
-def unseen(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
+def blank(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
     """For a face that no camera can see: it is neither painted nor lit."""
     return np.zeros((1, 1, 3), np.uint8)
 
@@ -59,7 +59,7 @@ def plain(colour: Colour, contrast: float = 0.03, cell_m: float = 0.12) -> Paint
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         shape = texels(width_m, height_m, density)
         shade = 1 + contrast * noise(rng, shape, cell_m * density)
-        return shaded(colour, shade)
+        return shade_colour(colour, shade)
 
     return paint
 
@@ -71,7 +71,7 @@ def plaster(colour: Colour) -> Painter:
         shape = texels(width_m, height_m, density)
         shade = 1 + 0.030 * noise(rng, shape, 0.9 * density, 3) + 0.022 * noise(rng, shape, 0.05 * density, 5, 2.2)
         specks = noise(rng, shape, 0.022 * density, 2) > 3.0
-        return to_image((shade - 0.10 * cv2.blur(specks.astype(np.float32), (3, 3)))[..., None] * _f32(colour))
+        return quantize_colours((shade - 0.10 * cv2.blur(specks.astype(np.float32), (3, 3)))[..., None] * _f32(colour))
 
     return paint
 
@@ -95,7 +95,7 @@ def bricks(colour: Colour, mortar: Colour) -> Painter:
         joint = _f32(mortar) * (1 + 0.10 * noise(rng, shape, 0.03 * density, 4))[..., None]
         filled = np.clip((edge - 0.0055) / 0.004, 0, 1)[..., None]
         bevel = 1 - 0.25 * np.exp(-(((edge - 0.008) / 0.004) ** 2))[..., None]
-        return to_image((joint * 0.86 * (1 - filled) + face * filled) * bevel)
+        return quantize_colours((joint * 0.86 * (1 - filled) + face * filled) * bevel)
 
     return paint
 
@@ -117,7 +117,7 @@ def planks(colour: Colour, width: float = 0.14, length: float = 1.3) -> Painter:
         shade = 1 + 0.12 * board[..., 0] + grain - 0.55 * knots
         gap = np.minimum((y - row * width), (along - column) * length)
         shade *= 1 - 0.62 * np.exp(-((gap / 0.0035) ** 2))
-        return to_image(shade[..., None] * (_f32(colour) + board[..., 1:2] * _f32((5.0, 1.0, -5.0))))
+        return quantize_colours(shade[..., None] * (_f32(colour) + board[..., 1:2] * _f32((5.0, 1.0, -5.0))))
 
     return paint
 
@@ -132,7 +132,7 @@ def wood(colour: Colour) -> Painter:
         wave = noise(rng, shape, 0.12 * density, 4, 6)
         y = np.arange(shape[0], dtype=np.float32)[:, None] / density
         grain = 0.06 * np.sin(2 * np.pi * (y / 0.03 + 1.2 * wave)) + 0.07 * noise(rng, shape, 0.012 * density, 3, 10)
-        return shaded(colour, 1 + grain + 0.06 * wave)
+        return shade_colour(colour, 1 + grain + 0.06 * wave)
 
     return paint
 
@@ -162,7 +162,7 @@ def rug(colours: Sequence[Colour]) -> Painter:
         woven = cv2.resize(np.array(colours, np.float32)[pattern], shape[::-1], interpolation=cv2.INTER_NEAREST)
         y, x = np.mgrid[: shape[0], : shape[1]] / density
         threads = 0.07 * np.sin(2 * np.pi * x / 0.009) * np.sin(2 * np.pi * y / 0.009)
-        return to_image(woven * (1 + threads + 0.09 * noise(rng, shape, 0.05 * density, 5))[..., None])
+        return quantize_colours(woven * (1 + threads + 0.09 * noise(rng, shape, 0.05 * density, 5))[..., None])
 
     return paint
 
@@ -175,7 +175,7 @@ def globe(water: Colour, land: Colour, snow: Colour) -> Painter:
         image = np.where((relief > 0.2)[..., None], np.array(land), np.array(water)) * (1 + 0.13 * relief[..., None])
         image = np.where((relief + 5 * (latitude - 0.8) > 1.2)[..., None], np.array(snow), image)
         shore = np.exp(-(((relief - 0.2) / 0.06) ** 2))[..., None]
-        image = to_image(image * (1 - 0.35 * shore))
+        image = quantize_colours(image * (1 - 0.35 * shore))
         for meridian in np.linspace(0, width, 13)[1:-1]:
             cv2.line(image, (round(meridian), 0), (round(meridian), height), (70, 70, 80), 1, cv2.LINE_AA)
         for parallel in np.linspace(0, height, 7)[1:-1]:
@@ -193,7 +193,7 @@ def ball(colours: Sequence[Colour]) -> Painter:
         wedge = np.arange(width) * len(colours) * 2 // width % len(colours)
         image = np.repeat(np.array(colours, np.float64)[wedge][None], height, 0)
         image[: round(0.12 * height)] = image[-round(0.12 * height) :] = (238, 234, 226)
-        image = to_image(image * (1 + 0.07 * noise(rng, shape, 0.05 * density, 5))[..., None])
+        image = quantize_colours(image * (1 + 0.07 * noise(rng, shape, 0.05 * density, 5))[..., None])
         for _ in range(30):
             at = int(rng.integers(0, width)), round(rng.uniform(0.2, 0.8) * height)
             tint = tuple(int(value) for value in np.array(colours[int(rng.integers(len(colours)))]) * 0.8)
@@ -203,14 +203,14 @@ def ball(colours: Sequence[Colour]) -> Painter:
     return paint
 
 
-def glazed(colour: Colour, band: Colour) -> Painter:
+def glaze(colour: Colour, band: Colour) -> Painter:
     """Pottery: a glaze with crackle, and a painted band of strokes."""
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
         field = noise(rng, shape, 0.06 * density, 5)
         shade = 1 + 0.07 * field - 0.18 * np.exp(-((noise(rng, shape, 0.03 * density, 3) / 0.05) ** 2))
-        image = shaded(colour, shade)
+        image = shade_colour(colour, shade)
         for _ in range(round(6 + 40 * width_m)):
             x, y = rng.uniform(0, width), rng.uniform(0.25, 0.6) * height
             dx, dy = rng.uniform(-0.03, 0.03) * width, rng.uniform(0.03, 0.2) * height
@@ -226,7 +226,7 @@ def marble(colour: Colour, vein: Colour) -> Painter:
         veins = np.exp(-((noise(rng, shape, 0.22 * density, 6) / 0.16) ** 2)) * 0.6
         veins += np.exp(-((noise(rng, shape, 0.10 * density, 5) / 0.07) ** 2)) * 0.35
         mixed = _f32(colour) + (_f32(vein) - _f32(colour)) * np.clip(veins, 0, 1)[..., None]
-        return to_image(mixed * (1 + 0.025 * noise(rng, shape, 0.03 * density))[..., None])
+        return quantize_colours(mixed * (1 + 0.025 * noise(rng, shape, 0.03 * density))[..., None])
 
     return paint
 
@@ -236,7 +236,7 @@ def leaf(colour: Colour) -> Painter:
         shape = texels(width_m, height_m, density)
         across = np.linspace(0, 14 * np.pi, shape[1])[None] + np.abs(np.linspace(-4, 4, shape[0]))[:, None]
         shade = 1 + 0.10 * np.sin(across) + 0.12 * noise(rng, shape, 0.03 * density, 4)
-        return shaded(colour, shade)
+        return shade_colour(colour, shade)
 
     return paint
 

@@ -24,7 +24,7 @@ def project(rays: Array, lens: Intrinsics) -> Array:
     across = np.hypot(rays[:, 0], rays[:, 1])
     angles = np.arctan2(across, rays[:, 2])
     directions = rays[:, :2] / np.maximum(across, 1e-300)[:, None]
-    pixels = directions * bent(angles, lens)[:, None] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+    pixels = directions * distort_angles(angles, lens)[:, None] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
     pixels[angles > largest_angle(lens)] = np.nan
     return pixels
 
@@ -34,10 +34,10 @@ def unproject(pixels: Array, lens: Intrinsics) -> Array:
     points = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
     radii = np.linalg.norm(points, axis=1)
     low, high = np.zeros(len(radii)), np.full(len(radii), largest_angle(lens))
-    reached = radii <= bent(high, lens)
+    reached = radii <= distort_angles(high, lens)
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2
-        further = bent(middle, lens) < radii
+        further = distort_angles(middle, lens) < radii
         low, high = np.where(further, middle, low), np.where(further, high, middle)
     angles = (low + high) / 2
     directions = points / np.maximum(radii, 1e-300)[:, None]
@@ -46,7 +46,7 @@ def unproject(pixels: Array, lens: Intrinsics) -> Array:
     return rays
 
 
-def bent(angles: Array, lens: Intrinsics) -> Array:
+def distort_angles(angles: Array, lens: Intrinsics) -> Array:
     """How far from the principal point, in focal lengths, rays at `angles` (M,) from the axis, radians, are seen."""
     squared = angles**2
     growth = np.ones_like(angles)

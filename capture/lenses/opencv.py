@@ -20,7 +20,7 @@ def project(rays: Array, lens: Intrinsics) -> Array:
     pixels = np.full((len(rays), 2), np.nan)
     if ahead.any():
         seen, _ = cv2.projectPoints(
-            rays[ahead] / rays[ahead, 2:], np.zeros(3), np.zeros(3), centred(lens), coefficients(lens)
+            rays[ahead] / rays[ahead, 2:], np.zeros(3), np.zeros(3), camera_matrix(lens), coefficients(lens)
         )
         pixels[ahead] = seen[:, 0] + 0.5
     return pixels
@@ -29,9 +29,9 @@ def project(rays: Array, lens: Intrinsics) -> Array:
 def unproject(pixels: Array, lens: Intrinsics) -> Array:
     """(M, 3) unit rays of the camera's frame that meet pixels (M, 2), found by iteration."""
     points = np.ascontiguousarray(pixels[:, None] - 0.5)
-    at_depth_1 = cv2.undistortPoints(points, centred(lens), coefficients(lens), None, np.eye(3), np.eye(3), _CRITERIA)[
-        :, 0
-    ]
+    at_depth_1 = cv2.undistortPoints(
+        points, camera_matrix(lens), coefficients(lens), None, np.eye(3), np.eye(3), _CRITERIA
+    )[:, 0]
     rays = np.column_stack([at_depth_1, np.ones(len(at_depth_1))])
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
@@ -43,6 +43,6 @@ def coefficients(lens: Intrinsics) -> Array:
     return np.array([*values, *[0.0] * (wanted - len(values))])
 
 
-def centred(lens: Intrinsics) -> Array:
+def camera_matrix(lens: Intrinsics) -> Array:
     """K (3, 3) as OpenCV has it, with the centre of the top-left pixel at (0, 0)."""
     return lens.K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])

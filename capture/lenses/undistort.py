@@ -12,7 +12,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
 from splatnode.capture.lenses.wide_pinhole import wide_pinhole
-from splatnode.capture.masks import Mask, filled
+from splatnode.capture.masks import Mask, fill_masked
 from splatnode.capture.right_image import RightImage, grey
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +24,7 @@ _POINTS_A_SIDE = 33  # of the picture's border that are undistorted, to find the
 _MAX_ROUND_TRIP_PX = 0.5  # from a border point to its ray and back: a model that folds over misses by many pixels
 
 
-def undistorted(frame: Frame) -> Frame:
+def undistort_frame(frame: Frame) -> Frame:
     """The frame without its lens' distortion and with fx = fy; the frame itself where there is nothing to undo.
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
@@ -33,25 +33,28 @@ def undistorted(frame: Frame) -> Frame:
     ValueError for coefficients that fold the picture over.
     """
     if frame.right is None:
-        return _straight(frame)
+        return _undistort_single(frame)
     seen = cv2.cvtColor(frame.right.image, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
-    left, right = _straight(replace(frame, right=None)), _straight(replace(frame, image=seen, mask=None, right=None))
+    left, right = (
+        _undistort_single(replace(frame, right=None)),
+        _undistort_single(replace(frame, image=seen, mask=None, right=None)),
+    )
     return replace(left, right=RightImage(grey(right.image), frame.right.baseline))
 
 
-def _straight(frame: Frame) -> Frame:
+def _undistort_single(frame: Frame) -> Frame:
     """As `undistorted`, of a frame without a right image."""
     given = frame.intrinsics
     if given is None:
         return frame
     given = given.resized(frame.width, frame.height)
     if given.model == "fisheye":
-        return _without_fisheye(frame, given)
+        return _undistort_fisheye(frame, given)
     straight = not any(given.distortion)
     if straight and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE:
         return frame if given == frame.intrinsics else replace(frame, intrinsics=given)
     coefficients = opencv.coefficients(given)
-    left, top, right, bottom = _seen_rectangle(frame.name, given, coefficients)
+    left, top, right, bottom = _find_inner_rectangle(frame.name, given, coefficients)
     focal = max(frame.width / (right - left), frame.height / (bottom - top))
     pinhole = replace(
         given,
@@ -62,29 +65,29 @@ def _straight(frame: Frame) -> Frame:
         distortion=(),
     )
     columns, rows = cv2.initUndistortRectifyMap(
-        opencv.centred(given),
+        opencv.camera_matrix(given),
         coefficients,
         np.eye(3),
-        opencv.centred(pinhole),
+        opencv.camera_matrix(pinhole),
         (frame.width, frame.height),
         cv2.CV_32FC1,
     )
     image = cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    mask = None if frame.mask is None else _carried(frame.mask, columns, rows)
+    mask = None if frame.mask is None else _remap_mask(frame.mask, columns, rows)
     return replace(frame, image=image.astype(np.uint8), intrinsics=pinhole, mask=mask)
 
 
-def without_distortion(image: npt.NDArray[np.uint8], lens: Intrinsics | None) -> npt.NDArray[np.uint8]:
+def undistort_image(image: npt.NDArray[np.uint8], lens: Intrinsics | None) -> npt.NDArray[np.uint8]:
     """A photograph (H, W, 3), at any size, as `undistorted` shows it; itself without a lens. Raises likewise."""
-    return image if lens is None else undistorted(Frame(0, "photograph", 0, image, lens)).image
+    return image if lens is None else undistort_frame(Frame(0, "photograph", 0, image, lens)).image
 
 
-def _carried(mask: npt.NDArray[np.bool_], columns: npt.NDArray, rows: npt.NDArray) -> npt.NDArray[np.bool_]:
+def _remap_mask(mask: npt.NDArray[np.bool_], columns: npt.NDArray, rows: npt.NDArray) -> npt.NDArray[np.bool_]:
     """The mask (H, W) as its photograph is resampled; a pixel is used where all that it is made of is."""
     return cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > 0.999
 
 
-def _without_fisheye(frame: Frame, given: Intrinsics) -> Frame:
+def _undistort_fisheye(frame: Frame, given: Intrinsics) -> Frame:
     """The frame as a pinhole would have seen it; what the fisheye did not see is filled and masked."""
     pinhole = wide_pinhole(frame.name, given)
     across, down = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
@@ -96,13 +99,13 @@ def _without_fisheye(frame: Frame, given: Intrinsics) -> Frame:
     columns, rows = np.moveaxis(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, 0).astype(np.float32)
     image = cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
     if frame.mask is not None:
-        used = used & _carried(frame.mask, columns, rows)
+        used = used & _remap_mask(frame.mask, columns, rows)
     if used.all():
         return replace(frame, image=image, intrinsics=pinhole, mask=None)
-    return replace(frame, image=filled(image, used), intrinsics=pinhole, mask=used)
+    return replace(frame, image=fill_masked(image, used), intrinsics=pinhole, mask=used)
 
 
-def _seen_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[float, float, float, float]:
+def _find_inner_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[float, float, float, float]:
     """Left, top, right and bottom, at depth 1, of the largest upright rectangle of rays that the picture has.
 
     Raises ValueError where the distortion folds the picture over.
@@ -114,7 +117,7 @@ def _seen_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[
         np.stack([np.full_like(down, across[-1]), down], 1),
         np.stack([across, np.full_like(across, down[-1])], 1),
     ]
-    matrix = opencv.centred(given)
+    matrix = opencv.camera_matrix(given)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     straight = [
         cv2.undistortPoints(side[:, None], matrix, coefficients, None, np.eye(3), np.eye(3), criteria)[:, 0]

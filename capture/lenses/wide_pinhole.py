@@ -27,7 +27,7 @@ def wide_pinhole(name: str, given: Intrinsics) -> Intrinsics:
     corners = [(x - given.cx, y - given.cy) for x in (0, given.width) for y in (0, given.height)]
     furthest = max(math.hypot(x / given.fx, y / given.fy) for x, y in corners)
     turn = fisheye.largest_angle(given)
-    if turn < _FURTHEST and float(fisheye.bent(np.array(turn), given)) < furthest:
+    if turn < _FURTHEST and float(fisheye.distort_angles(np.array(turn), given)) < furthest:
         raise ValueError(
             f"{name}: the fisheye terms {given.distortion} turn back {math.degrees(turn):.0f} degrees from the axis, "
             "within the picture, which no lens does. Calibrate again, with the pattern in the corners of the picture "

@@ -12,8 +12,8 @@ import msgspec
 
 from splatnode.capture.lerobot import tables
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import record_in
 
 VERSION = "v3.0"
@@ -44,7 +44,7 @@ class Feature(msgspec.Struct, frozen=True):
 
 
 class Info(msgspec.Struct, frozen=True):
-    """What of meta/info.json is read."""
+    """The fields of meta/info.json that are read."""
 
     codebase_version: str
     fps: float = 0.0
@@ -59,7 +59,7 @@ class Info(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Film:
-    """What one camera saw in one episode."""
+    """The video of one camera in one episode."""
 
     episode: int
     key: str  # of the camera's feature
@@ -75,11 +75,11 @@ def is_data_set(folder: Path) -> bool:
 
 def read_info(folder: Path) -> Info:
     """Raises UnusableDataSet where it is of another version, or has no videos; OSError."""
-    shown = _shown(folder)
-    with foreign(UnusableDataSet, f"{shown}: {INFO}"):
+    shown = _quote_path(folder)
+    with guard_untrusted(UnusableDataSet, f"{shown}: {INFO}"):
         info = record_in(read_bounded(folder / INFO, _MOST_BYTES, UnusableDataSet, shown), Info)
     if info.codebase_version != VERSION:
-        version = printable(info.codebase_version, 40)
+        version = sanitize_text(info.codebase_version, 40)
         raise UnusableDataSet(
             f"{shown} must be a LeRobot data set of version {VERSION}, it is of {version}; convert it with LeRobot's "
             "convert_dataset_v21_to_v30, or install a splatnode that reads it"
@@ -91,7 +91,7 @@ def read_info(folder: Path) -> Info:
     return info
 
 
-def parts(folder: Path) -> list[str]:
+def list_parts(folder: Path) -> list[str]:
     """The names of all episodes' cameras, in order, for `film`. Raises as `read_info`, and without pyarrow."""
     cameras = read_info(folder).cameras
     numbers = sorted(set(_numbers(folder)))
@@ -99,7 +99,7 @@ def parts(folder: Path) -> list[str]:
 
 
 def episode_name(number: int) -> str:
-    """What `parts` calls an episode."""
+    """Returns the name of an episode, as `list_parts` has it."""
     return f"{_NAMED}{number:06d}"
 
 
@@ -110,14 +110,14 @@ def film(folder: Path, part: str) -> Film:
     """
     info = read_info(folder)
     number, key = episode_and_camera(folder, info, part)
-    shown = _shown(folder)
+    shown = _quote_path(folder)
     wanted = tuple(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"))
     found = tables.row(_files(folder), _NUMBER, number, wanted, UnusableDataSet, _where(folder))
     if found is None:
         raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(set(_numbers(folder)))} episodes")
     chunk, file, from_s, to_s = found
     if not all(map(math.isfinite, found)) or not 0.0 <= from_s < to_s:
-        raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
+        raise UnusableDataSet(f"{shown}: episode {number} has no images of {sanitize_text(key)}")
     video = folder / _video(info, key, _whole(chunk, "chunk_index"), _whole(file, "file_index"))
     return Film(number, key, video, from_s, to_s, info.fps if 0 < info.fps <= _MOST_RATE else 0.0)
 
@@ -129,20 +129,20 @@ def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
     key = key or (info.cameras[0] if len(info.cameras) == 1 else "")
     is_number = number.isascii() and number.isdecimal() and len(number) <= len(str(_MOST_NUMBER))
     if not is_number or key not in info.cameras:
-        cameras = printable(", ".join(info.cameras))
+        cameras = sanitize_text(", ".join(info.cameras))
         raise UnusableDataSet(
-            f"{_shown(folder)}: behind the # must be an episode and a camera, as "
-            f"{episode_name(0)}/{info.cameras[0]}; got {printable(part, 100)!r}. The cameras are {cameras}"
+            f"{_quote_path(folder)}: behind the # must be an episode and a camera, as "
+            f"{episode_name(0)}/{info.cameras[0]}; got {sanitize_text(part, 100)!r}. The cameras are {cameras}"
         )
     return int(number), key
 
 
 def _numbers(folder: Path) -> list[int]:
-    """Of the episodes. Raises UnusableDataSet where there are none."""
+    """Reads the numbers of the episodes. Raises UnusableDataSet where there are none."""
     numbers = tables.column(_files(folder), _NUMBER, UnusableDataSet, _where(folder))
     if not len(numbers):
         raise UnusableDataSet(
-            f"{_shown(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; what is there has no "
+            f"{_quote_path(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; what is there has no "
             "rows: record an episode first"
         )
     return [_whole(number, _NUMBER) for number in numbers]
@@ -159,25 +159,27 @@ def _files(folder: Path) -> list[Path]:
     files = sorted((folder / EPISODES).glob("*/*.parquet"))
     if not files:
         raise UnusableDataSet(
-            f"{_shown(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such files: "
+            f"{_quote_path(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such files: "
             "copy or download the whole data set, or record an episode first"
         )
     return files
 
 
-def _shown(folder: Path) -> str:
-    return f"{printable(str(folder))!r}"
+def _quote_path(folder: Path) -> str:
+    return f"{sanitize_text(str(folder))!r}"
 
 
 def _where(folder: Path) -> str:
-    return f"{_shown(folder)}: {EPISODES}"
+    return f"{_quote_path(folder)}: {EPISODES}"
 
 
 def _video(info: Info, key: str, chunk: int, file: int) -> PurePosixPath:
     """The path in the data set, which leads nowhere else."""
     path = PurePosixPath(video_path(info.video_path or "", key, chunk, file))
     if path.is_absolute() or ".." in path.parts or not str(path).isprintable():
-        raise UnusableDataSet(f"video_path must lead to a file of the data set, it leads to {printable(path, 200)!r}")
+        raise UnusableDataSet(
+            f"video_path must lead to a file of the data set, it leads to {sanitize_text(path, 200)!r}"
+        )
     return path
 
 
@@ -193,7 +195,7 @@ def video_path(template: str, key: str, chunk: int, file: int) -> str:
     if set("{}") & set(_FIELD.sub("", template)):
         raise UnusableDataSet(
             "video_path must have the fields {video_key}, {chunk_index:03d} and {file_index:03d} and no others, "
-            f"it is {printable(template, 200)!r}"
+            f"it is {sanitize_text(template, 200)!r}"
         )
     values = {"video_key": key, "chunk_index": str(chunk), "file_index": str(file)}
     found = _FIELD.sub(lambda field: values[field[1]].rjust(int(field[2] or 0), "0"), template)

@@ -43,7 +43,7 @@ class UnusableTable(ValueError):
 
 
 @contextlib.contextmanager
-def bounded_table(path: Path) -> Iterator[pq.ParquetFile]:
+def open_bounded_table(path: Path) -> Iterator[pq.ParquetFile]:
     """The Parquet file `path`, once what it says of itself is within bounds. Raises UnusableTable, OSError.
 
     What it says may be a lie: `tables.check_whole` reads it where that ends nothing else.
@@ -105,7 +105,7 @@ def _unreadable(error: Exception) -> bytes:
 def _columns(request: Request) -> Columns:
     parts, rows = [], 0
     for file in request.files:
-        with bounded_table(Path(os.fsdecode(file))) as table:
+        with open_bounded_table(Path(os.fsdecode(file))) as table:
             if not request.names:
                 for index in range(table.num_row_groups):
                     table.read_row_group(index, use_threads=False)

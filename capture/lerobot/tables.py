@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process import apart
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import decoder_of
 
 MOST_ROWS = 1_000_000  # of all files together: more episodes than any data set has
@@ -32,14 +32,14 @@ Columns = npt.NDArray[np.float64]  # (rows, columns), NaN where there is no numb
 
 
 class Request(msgspec.Struct, frozen=True):
-    """What the process gets on its standard input, as MessagePack."""
+    """The request that the process gets on its standard input, as MessagePack."""
 
     files: tuple[bytes, ...]
     names: tuple[str, ...]  # of columns; the first must be there, and each of its rows must have a number; (): all
 
 
 class Lost(msgspec.Struct, frozen=True):
-    """What the disk does not give, as the process says it."""
+    """An error of the disk, as the process says it."""
 
     number: int
     reason: str
@@ -95,7 +95,7 @@ def _table(files: Sequence[Path], names: tuple[str, ...], refusal: type[Exceptio
         lost = decoder_of(Lost).decode(content)
         raise OSError(lost.number, lost.reason, lost.file)
     if kind == REFUSED:
-        raise refusal(f"{where}: {printable(content.decode(errors='replace'), 500)}")
+        raise refusal(f"{where}: {sanitize_text(content.decode(errors='replace'), 500)}")
     return np.frombuffer(content, np.float64).reshape(-1, len(names) or 1)
 
 

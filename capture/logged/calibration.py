@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.logged.message import Calibration, UnusableMessage
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 _MODELS = {  # how many coefficients a model has at most, and splatnode's name of it
     "": (0, "opencv"),
@@ -47,10 +47,12 @@ def lens(topic: str, found: Calibration) -> Intrinsics | None:
     terms = terms if any(terms) else ()
     if terms and model not in _MODELS:
         known = ", ".join(name for name in _MODELS if name)
-        raise UnusableMessage(f"a lens must be one of {known}, it is {printable(model, 40)}")
+        raise UnusableMessage(f"a lens must be one of {known}, it is {sanitize_text(model, 40)}")
     most, kind = _MODELS.get(model, (0, "opencv"))
     if len(terms) > most:
-        raise UnusableMessage(f"a lens of {printable(model, 40) or 'no model'} has {most} numbers, got {len(terms)}")
+        raise UnusableMessage(
+            f"a lens of {sanitize_text(model, 40) or 'no model'} has {most} numbers, got {len(terms)}"
+        )
     x, y, width, height = found.window
     size = (width, height) if width and height else (found.width, found.height)
     try:  # ROS and Foxglove: the centre of the top-left pixel is at (0, 0)

@@ -52,34 +52,34 @@ class _Calibration(msgspec.Struct, frozen=True):
     frame_id: str = ""
 
 
-def compressed_of_json(data: bytes) -> Picture:
-    found = _decoded(data, _Compressed)
+def parse_compressed_json(data: bytes) -> Picture:
+    found = _parse_json(data, _Compressed)
     return Picture(found.frame_id, found.timestamp.ns, found.data, None)
 
 
-def raw_of_json(data: bytes) -> Picture:
-    found = _decoded(data, _Raw)
+def parse_raw_json(data: bytes) -> Picture:
+    found = _parse_json(data, _Raw)
     layout = Layout(found.width, found.height, found.encoding, found.step)
     return Picture(found.frame_id, found.timestamp.ns, found.data, layout)
 
 
-def calibration_of_json(data: bytes) -> Calibration:
-    found = _decoded(data, _Calibration)
+def parse_calibration_json(data: bytes) -> Calibration:
+    found = _parse_json(data, _Calibration)
     return Calibration(found.frame_id, found.width, found.height, found.distortion_model, found.D, found.K, found.P)
 
 
-def compressed_of_protobuf(data: bytes) -> Picture:
+def parse_compressed_protobuf(data: bytes) -> Picture:
     fields = Fields(data)
     return Picture(fields.text(4), _time_ns(fields.message(1)), fields.bytes(2), None)
 
 
-def raw_of_protobuf(data: bytes) -> Picture:
+def parse_raw_protobuf(data: bytes) -> Picture:
     fields = Fields(data)
     layout = Layout(fields.integer(2), fields.integer(3), fields.text(4), fields.integer(5))
     return Picture(fields.text(7), _time_ns(fields.message(1)), fields.bytes(6), layout)
 
 
-def calibration_of_protobuf(data: bytes) -> Calibration:
+def parse_calibration_protobuf(data: bytes) -> Calibration:
     fields = Fields(data)
     size = fields.integer(2), fields.integer(3)
     return Calibration(fields.text(9), *size, fields.text(4), fields.doubles(5), fields.doubles(6), fields.doubles(8))
@@ -90,7 +90,7 @@ def _time_ns(stamp: Fields) -> int:
     return stamp.integer(1) * _NS + stamp.integer(2)
 
 
-def _decoded(data: bytes, kind: type[_Message]) -> _Message:
+def _parse_json(data: bytes, kind: type[_Message]) -> _Message:
     try:
         return record_in(data, kind)
     except msgspec.DecodeError as error:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 _MOST_BYTES = 1 << 29  # of a record, and of what it is decompressed to
 
@@ -27,7 +27,7 @@ class UnusableLog(ValueError):
 
 @dataclass(frozen=True)
 class Topic:
-    """What messages a topic has."""
+    """A topic of a log, and the kind of its messages."""
 
     name: str
     schema: str  # its name
@@ -50,8 +50,8 @@ def topics(file: Path) -> list[Topic]:
     from mcap.exceptions import EndOfFile
     from mcap.records import Channel, Schema
 
-    known = _Known()
-    with _opened(file) as stream:
+    known = _TopicTable()
+    with _open_log(file) as stream:
         summary = _summary(stream)
         records = _records(stream) if summary is None else [*summary.schemas.values(), *summary.channels.values()]
         with contextlib.suppress(EndOfFile):  # what there is before the end counts
@@ -70,16 +70,16 @@ def messages(file: Path, wanted: Collection[str]) -> Iterator[Message]:
     from mcap.records import Channel, Schema
     from mcap.records import Message as Record
 
-    known = _Known()
-    with _opened(file) as stream:
-        for record in _of_topics(stream, wanted, known):
+    known = _TopicTable()
+    with _open_log(file) as stream:
+        for record in _read_topic_records(stream, wanted, known):
             if isinstance(record, (Schema, Channel)):
                 known.add(record)
             elif isinstance(record, Record) and known.topics[record.channel_id].name in wanted:
                 yield Message(known.topics[record.channel_id], record.log_time, record.data)
 
 
-class _Known:
+class _TopicTable:
     """The topics that a file has told of so far."""
 
     def __init__(self) -> None:
@@ -96,12 +96,15 @@ class _Known:
 
 
 @contextlib.contextmanager
-def _opened(file: Path) -> Iterator[IO[bytes]]:
-    with file.open("rb") as stream, foreign(UnusableLog, f"{printable(str(file))!r} is no MCAP file that is whole"):
+def _open_log(file: Path) -> Iterator[IO[bytes]]:
+    with (
+        file.open("rb") as stream,
+        guard_untrusted(UnusableLog, f"{sanitize_text(str(file))!r} is no MCAP file that is whole"),
+    ):
         yield stream
 
 
-def _of_topics(stream: IO[bytes], wanted: Collection[str], known: _Known) -> Iterator[Any]:
+def _read_topic_records(stream: IO[bytes], wanted: Collection[str], known: _TopicTable) -> Iterator[Any]:
     """The records of the chunks that may hold these topics, or all; what the index knows is added to `known`."""
     summary = _summary(stream)
     if summary is None or not summary.chunk_indexes:
@@ -115,10 +118,10 @@ def _of_topics(stream: IO[bytes], wanted: Collection[str], known: _Known) -> Ite
         for chunk in summary.chunk_indexes
         if not (channels.isdisjoint(chunk.message_index_offsets) and chunk.message_index_offsets)
     }
-    yield from _of_chunks(stream, sorted(offsets))
+    yield from _read_chunks(stream, sorted(offsets))
 
 
-def _of_chunks(stream: IO[bytes], offsets: Sequence[int]) -> Iterator[Any]:
+def _read_chunks(stream: IO[bytes], offsets: Sequence[int]) -> Iterator[Any]:
     """The records of the chunks at these rising places, none of which begins within another one.
 
     So all of them together are no longer than the file, however many an index names.
@@ -132,7 +135,7 @@ def _of_chunks(stream: IO[bytes], offsets: Sequence[int]) -> Iterator[Any]:
         stream.seek(offset)
         chunk = next(_reader(stream, skip_magic=True).records)
         behind = stream.tell()
-        yield from unpacked(chunk)
+        yield from unpack_chunk(chunk)
 
 
 def _summary(stream: IO[bytes]) -> Any:
@@ -151,11 +154,11 @@ def _summary(stream: IO[bytes]) -> Any:
 def _records(stream: IO[bytes]) -> Iterator[Any]:
     stream.seek(0)
     for record in _reader(stream).records:
-        yield from unpacked(record)
+        yield from unpack_chunk(record)
 
 
-def unpacked(record: Any) -> Iterator[Any]:
-    """What a chunk holds; any other record itself. Raises UnusableLog where it would take too much memory."""
+def unpack_chunk(record: Any) -> Iterator[Any]:
+    """Unpacks a chunk; yields any other record itself. Raises UnusableLog where it would take too much memory."""
     from mcap.records import Chunk
 
     if not isinstance(record, Chunk):
@@ -163,7 +166,7 @@ def unpacked(record: Any) -> Iterator[Any]:
         return
     if record.uncompressed_size > _MOST_BYTES:
         raise UnusableLog(f"a chunk must have at most {_MOST_BYTES} bytes, it has {record.uncompressed_size}")
-    yield from _inside(_decompressed(record))
+    yield from _inside(_decompress_chunk(record))
 
 
 def _inside(chunk: Any) -> Iterator[Any]:
@@ -177,7 +180,7 @@ def _inside(chunk: Any) -> Iterator[Any]:
 
     if chunk.compression:
         raise UnusableLog(
-            f"a chunk must be compressed by lz4, zstd or not, it is by {printable(chunk.compression, 40)!r}"
+            f"a chunk must be compressed by lz4, zstd or not, it is by {sanitize_text(chunk.compression, 40)!r}"
         )
     if chunk.uncompressed_crc and zlib.crc32(chunk.data) != chunk.uncompressed_crc:
         raise UnusableLog("a chunk does not hold what was written: its checksum is another one")
@@ -194,7 +197,7 @@ def _inside(chunk: Any) -> Iterator[Any]:
             stream.read(length)
 
 
-def _decompressed(chunk: Any) -> Any:
+def _decompress_chunk(chunk: Any) -> Any:
     """The chunk as one that is not compressed: no more of it is decompressed than it says that it holds."""
     told, is_whole = chunk.uncompressed_size, True
     if chunk.compression == "lz4":

@@ -14,7 +14,7 @@ from pathlib import Path
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages
 from splatnode.capture.logged.message import Picture, UnusableMessage
 from splatnode.capture.logged.schemas import PICTURES
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
 
 EARLIEST_UTC_NS = 946_684_800 * 10**9  # the year 2000: a smaller stamp is of a clock that began with the recording
@@ -32,8 +32,8 @@ class MessageTime:
 
 
 def read_picture(message: Message) -> Picture:
-    """What a message of an image topic holds. Raises UnusableMessage."""
-    with foreign(UnusableMessage):
+    """Parses a message of an image topic. Raises UnusableMessage."""
+    with guard_untrusted(UnusableMessage):
         return PICTURES[message.topic.kind](message.data)
 
 

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.logged.message import Layout, Picture, UnusableMessage
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 _CODES = {  # bytes a pixel, and OpenCV's conversion to RGB; None: it is RGB
     "rgb8": (3, None),
@@ -31,7 +31,7 @@ _CODES = {  # bytes a pixel, and OpenCV's conversion to RGB; None: it is RGB
 }
 
 
-def is_photograph(picture: Picture) -> bool:
+def is_colour_image(picture: Picture) -> bool:
     """Whether its pixels are those of a photograph; depth, such as 16UC1 and 32FC1, are not."""
     return picture.layout is None or picture.layout.encoding in _CODES
 
@@ -43,13 +43,13 @@ def rgb(picture: Picture, max_pixels: int) -> npt.NDArray[np.uint8]:
             return decode_image(picture.data, max_pixels).image
         except UnusableImage as error:
             raise UnusableMessage(str(error)) from error
-    return _of_rows(picture.data, picture.layout, max_pixels)
+    return _decode_rows(picture.data, picture.layout, max_pixels)
 
 
-def _of_rows(data: bytes, layout: Layout, max_pixels: int) -> npt.NDArray[np.uint8]:
+def _decode_rows(data: bytes, layout: Layout, max_pixels: int) -> npt.NDArray[np.uint8]:
     if layout.encoding not in _CODES:
         raise UnusableMessage(
-            f"an image must have an encoding of {', '.join(_CODES)}, it has {printable(layout.encoding, 40) or 'none'}"
+            f"an image must have an encoding of {', '.join(_CODES)}, it has {sanitize_text(layout.encoding, 40) or 'none'}"
         )
     channels, code = _CODES[layout.encoding]
     width, height, row = layout.width, layout.height, layout.width * channels

@@ -15,7 +15,7 @@ _LONGEST_VARINT = 10  # bytes of 64 bits
 
 
 class Fields:
-    """What a message holds; what it does not hold is 0, empty, or no message, as protobuf says."""
+    """The fields of a message; one that it does not hold is 0, empty, or no message, as protobuf says."""
 
     def __init__(self, data: bytes) -> None:
         """Raises UnusableMessage."""

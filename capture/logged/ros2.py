@@ -6,14 +6,14 @@ from splatnode.capture.logged.cdr import Cdr
 from splatnode.capture.logged.message import Calibration, Layout, Picture
 
 
-def compressed(data: bytes) -> Picture:
+def parse_compressed_image(data: bytes) -> Picture:
     values = Cdr(data)
     captured_ns, sensor = values.time_ns(), values.text()
     values.text()  # its format, which the data tells as well
     return Picture(sensor, captured_ns, values.bytes(), None)
 
 
-def raw(data: bytes) -> Picture:
+def parse_raw_image(data: bytes) -> Picture:
     values = Cdr(data)
     captured_ns, sensor = values.time_ns(), values.text()
     height, width = values.integer(), values.integer()
@@ -21,7 +21,7 @@ def raw(data: bytes) -> Picture:
     return Picture(sensor, captured_ns, values.bytes(), Layout(width, height, encoding, step))
 
 
-def calibration(data: bytes) -> Calibration:
+def parse_camera_info(data: bytes) -> Calibration:
     values = Cdr(data)
     values.time_ns()
     sensor, height, width, model = values.text(), values.integer(), values.integer(), values.text()

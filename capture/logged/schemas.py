@@ -9,17 +9,17 @@ from splatnode.capture.logged.message import Calibration, Picture
 
 # By the schema's name and the messages' encoding, as MCAP has them.
 PICTURES: dict[tuple[str, str], Callable[[bytes], Picture]] = {
-    ("foxglove.CompressedImage", "json"): foxglove.compressed_of_json,
-    ("foxglove.CompressedImage", "protobuf"): foxglove.compressed_of_protobuf,
-    ("foxglove.RawImage", "json"): foxglove.raw_of_json,
-    ("foxglove.RawImage", "protobuf"): foxglove.raw_of_protobuf,
-    ("sensor_msgs/msg/CompressedImage", "cdr"): ros2.compressed,
-    ("sensor_msgs/msg/Image", "cdr"): ros2.raw,
+    ("foxglove.CompressedImage", "json"): foxglove.parse_compressed_json,
+    ("foxglove.CompressedImage", "protobuf"): foxglove.parse_compressed_protobuf,
+    ("foxglove.RawImage", "json"): foxglove.parse_raw_json,
+    ("foxglove.RawImage", "protobuf"): foxglove.parse_raw_protobuf,
+    ("sensor_msgs/msg/CompressedImage", "cdr"): ros2.parse_compressed_image,
+    ("sensor_msgs/msg/Image", "cdr"): ros2.parse_raw_image,
 }
 CALIBRATIONS: dict[tuple[str, str], Callable[[bytes], Calibration]] = {
-    ("foxglove.CameraCalibration", "json"): foxglove.calibration_of_json,
-    ("foxglove.CameraCalibration", "protobuf"): foxglove.calibration_of_protobuf,
-    ("sensor_msgs/msg/CameraInfo", "cdr"): ros2.calibration,
+    ("foxglove.CameraCalibration", "json"): foxglove.parse_calibration_json,
+    ("foxglove.CameraCalibration", "protobuf"): foxglove.parse_calibration_protobuf,
+    ("sensor_msgs/msg/CameraInfo", "cdr"): ros2.parse_camera_info,
 }
 READ = (
     "foxglove.CompressedImage and RawImage in JSON or protobuf, and sensor_msgs/msg/CompressedImage and Image of ROS 2"

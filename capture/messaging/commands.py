@@ -20,7 +20,7 @@ QUEUE = 16  # requests that wait, and that one call of `serve` replies to
 CONNECT_POLL_MS = 20  # between looks at whether the service refuses this machine
 
 
-class Seen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="seen"):
+class MarkProblemsSeen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="seen"):
     """Somebody has seen the problems that the status tells; they need not be told again."""
 
 

@@ -13,7 +13,7 @@ from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
-from splatnode.capture.left_out import or_none
+from splatnode.capture.left_out import read_optional_field
 from splatnode.capture.motion import Motion
 from splatnode.capture.right_image import Baseline, RightImage
 from splatnode.capture.stamp import Stamp
@@ -22,7 +22,7 @@ Array = npt.NDArray[np.generic]
 
 
 class FrameFields(Protocol):
-    """What a header tells of a frame, beside its arrays."""
+    """The fields of a header that describe a frame, beside its arrays."""
 
     @property
     def name(self) -> str: ...
@@ -69,10 +69,10 @@ def frame_in(header: FrameFields, frame_id: int, arrays: Sequence[npt.NDArray]) 
         header.intrinsics,
         captured_at=header.captured_at,
         mask=_mask(image, masks[0]) if masks else None,
-        given_pose=or_none(header.given_pose),
-        motion=or_none(header.motion),
-        gravity=or_none(header.gravity),
-        exposure=or_none(header.exposure),
+        given_pose=read_optional_field(header.given_pose),
+        motion=read_optional_field(header.motion),
+        gravity=read_optional_field(header.gravity),
+        exposure=read_optional_field(header.exposure),
         right=None if header.baseline is UNSET else RightImage(arrays[-1], header.baseline),
     )
 

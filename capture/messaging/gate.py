@@ -23,7 +23,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from splatnode.capture.process.crowd import network_of, next_to_go
-from splatnode.capture.process.problems import is_said
+from splatnode.capture.process.problems import is_logged
 
 log = logging.getLogger(__name__)
 
@@ -82,14 +82,14 @@ class Gate:
             self._shut(next_to_go({each: peer.network for each, peer in self._young.items()}))
 
     def _shut(self, descriptor: int) -> None:
-        """What is no connection of this peer any more is left alone; libzmq closes the others."""
+        """Leaves alone what is no connection of this peer any more; libzmq closes the others."""
         peer = self._young.pop(descriptor)
         if _peer(descriptor) != peer:
             return
         with _lent(descriptor) as connection, contextlib.suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
         self.shut += 1
-        if is_said(self.shut):
+        if is_logged(self.shut):
             log.warning("too many connections without a key: shut one of %s (%d so far)", peer.network, self.shut)
 
 

@@ -17,7 +17,7 @@ from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
-from splatnode.capture.left_out import or_left_out
+from splatnode.capture.left_out import make_optional_field
 from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.values import Name, Sequential, SessionId, Text
@@ -33,7 +33,7 @@ from splatnode.capture.messaging.wire import (
     plain_header,
 )
 from splatnode.capture.motion import Motion
-from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Stamp
 
@@ -71,7 +71,7 @@ class Delivery(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="del
     sequence: Sequential
 
 
-class Served(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="served"):
+class ConsumerStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="served"):
     """capture's answer to Ready: whether this recon gets its keyframes, or another one does."""
 
     served: bool
@@ -117,11 +117,11 @@ class ReceivedFrame:
         return Key(self.session, self.sequence)
 
 
-def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
+def encode_frame(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
     """The parts of the message that carries `frame`, with the next number."""
     if isinstance(frame, DroppedFrame):
-        name = printable(frame.name, LONGEST_NAME) or "?"
-        return encode(DroppedHeader(**numbering.next(), name=name, reason=printable(frame.reason, LONGEST_TEXT)))
+        name = sanitize_text(frame.name, LONGEST_NAME) or "?"
+        return encode(DroppedHeader(**numbering.next(), name=name, reason=sanitize_text(frame.reason, LONGEST_TEXT)))
     header = FrameHeader(
         **numbering.next(),
         frame_id=frame.frame_id,
@@ -129,21 +129,21 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         stamp_ns=frame.stamp_ns,
         intrinsics=frame.intrinsics,
         captured_at=frame.captured_at,
-        given_pose=or_left_out(frame.given_pose),
-        motion=or_left_out(frame.motion),
-        gravity=or_left_out(frame.gravity),
-        exposure=or_left_out(frame.exposure),
-        baseline=or_left_out(frame.right and frame.right.baseline),
+        given_pose=make_optional_field(frame.given_pose),
+        motion=make_optional_field(frame.motion),
+        gravity=make_optional_field(frame.gravity),
+        exposure=make_optional_field(frame.exposure),
+        baseline=make_optional_field(frame.right and frame.right.baseline),
     )
     return encode(header, arrays_of(frame))
 
 
-def delivered(key: Key, message: list[Part]) -> list[Part]:
+def add_delivery(key: Key, message: list[Part]) -> list[Part]:
     """The message with the Delivery that precedes it."""
     return [*encode(Delivery(*key)), *message]
 
 
-def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
+def decode_frame(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
     """The frame in what followed a Delivery. Raises WireError where it is none, or another one."""
     message: Message[FrameHeader | DroppedHeader] = decode(parts, FrameHeader | DroppedHeader, limits)
     header = message.header
@@ -161,4 +161,4 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
 
 def name_in(parts: list[Part]) -> str:
     """The name in a message that need not be a frame's; a question mark where it does not tell."""
-    return printable(plain_header(parts).get("name", "?"), LONGEST_NAME) or "?"
+    return sanitize_text(plain_header(parts).get("name", "?"), LONGEST_NAME) or "?"

@@ -30,24 +30,24 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_messages import (
     DELIVERY_PARTS,
     Acknowledge,
+    ConsumerStatus,
     Delivery,
     Ready,
     ReceivedFrame,
     Refuse,
     Request,
-    Served,
-    delivered,
+    add_delivery,
+    decode_frame,
+    encode_frame,
     name_in,
-    received,
-    to_message,
 )
 from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
 from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
 from splatnode.capture.messaging.spool import Key, Spool
-from splatnode.capture.messaging.turns import Connection, Turns
+from splatnode.capture.messaging.turns import Connection, ConsumerArbiter
 from splatnode.capture.messaging.wire import Numbering, Part, WireError, decode, encode, size_bytes
 from splatnode.capture.process.memory_shortage import is_shortage, may_be_shortage
-from splatnode.capture.process.printable import LONGEST_TEXT, printable
+from splatnode.capture.process.printable import LONGEST_TEXT, sanitize_text
 
 log = logging.getLogger(__name__)
 
@@ -72,31 +72,31 @@ class KeyframeServer(Endpoint):
         self.acknowledged = 0
         self.set_aside = 0  # by this process
         self.ignored = 0  # answers of recons that are not served
-        self._turns = Turns()
+        self._turns = ConsumerArbiter()
         self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=QUEUE)
         self._router.router_mandatory = True  # a connection that is gone says so
 
     @property
-    def queued(self) -> int:
+    def num_queued(self) -> int:
         """Frames that nobody has answered."""
         return len(self.spool)
 
     @property
-    def connected(self) -> bool:
-        return self._turns.served is not None
+    def is_connected(self) -> bool:
+        return self._turns.active is not None
 
     @property
-    def turned_away(self) -> int:
+    def num_rejected_consumers(self) -> int:
         """Recons that ask for keyframes while another one is served."""
-        return self._turns.waiting
+        return self._turns.num_rejected
 
     def offer(self, frame: Frame | DroppedFrame) -> Key:
         """Takes the frame over: on the disk when this returns. Raises SpoolFull, OSError, WireError (too large)."""
-        message = to_message(frame, self.numbering)
+        message = encode_frame(frame, self.numbering)
         if size_bytes(message) > self.network.limits.total_bytes:
             raise WireError(f"{frame.name}: {size_bytes(message) >> 20} MB; network.max_message_mb allows less")
         key = Key(self.numbering.session, self.numbering.sequence - 1)
-        self.spool.put(key, message)
+        self.spool.store(key, message)
         self._send_due()
         return key
 
@@ -118,24 +118,24 @@ class KeyframeServer(Endpoint):
     def _handle(self, identity: bytes, request: Request) -> None:
         now_s = time.monotonic()
         if isinstance(request, Ready):
-            served = self._turns.ready(identity, request, self.spool, now_s)
-            self._say(identity, encode(Served(served, self.network.limits.total_bytes)))
+            served = self._turns.handle_ready(identity, request, self.spool, now_s)
+            self._say(identity, encode(ConsumerStatus(served, self.network.limits.total_bytes)))
             return
-        self._turns.heard(identity, now_s)
-        if not self._turns.is_served(identity):
+        self._turns.record_keep_alive(identity, now_s)
+        if not self._turns.is_active(identity):
             self.ignored += 1
             return
         key = Key(request.session, request.sequence)
         if key not in self.spool:
             return
         if isinstance(request, Refuse):
-            self._set_aside(key, f"refused by recon: {request.reason}")
+            self._quarantine_frame(key, f"refused by recon: {request.reason}")
             return
         self.spool.remove(key)
         self.acknowledged += 1
-        self._turns.answered(key)
+        self._turns.mark_answered(key)
 
-    def _set_aside(self, key: Key, reason: str, parts: list[Part] | None = None) -> None:
+    def _quarantine_frame(self, key: Key, reason: str, parts: list[Part] | None = None) -> None:
         """Takes the frame out of the queue for good; says once which one it is, and why."""
         try:
             parts = parts or self.spool.get(key)
@@ -143,12 +143,12 @@ class KeyframeServer(Endpoint):
         except (OSError, ValueError):  # for whatever reason: without its name it is set aside all the same
             name = "?"
         log.warning("set aside %s: %s", name, reason)
-        self.spool.set_aside(key, name, reason)
+        self.spool.move_to_quarantine(key, name, reason)
         self.set_aside += 1
-        self._turns.answered(key)
+        self._turns.mark_answered(key)
 
     def _send_due(self) -> None:
-        client = self._turns.served
+        client = self._turns.active
         if client is None:
             return
         for key in self.spool:
@@ -164,26 +164,26 @@ class KeyframeServer(Endpoint):
         except (OSError, ValueError, MemoryError) as error:
             if is_shortage(error):  # no fault of the keyframe, which waits
                 return False
-            self._set_aside(key, f"lost on the disk: {error}")
+            self._quarantine_frame(key, f"lost on the disk: {error}")
             return True
         size = size_bytes(parts)
         if size > client.message_bytes:
             allowed = f"{client.message_bytes / 1e6:.1f} MB; raise network.max_message_mb there"
-            self._set_aside(key, f"it has {size / 1e6:.1f} MB, and recon takes at most {allowed}", parts)
+            self._quarantine_frame(key, f"it has {size / 1e6:.1f} MB, and recon takes at most {allowed}", parts)
             return True
-        if not self._say(client.identity, delivered(key, parts)):
+        if not self._say(client.identity, add_delivery(key, parts)):
             return False
         client.outstanding.add(key)
         return True
 
     def _say(self, identity: bytes, parts: list[Part]) -> bool:
-        """Whether it could be sent."""
+        """Sends a message; returns whether it could be sent."""
         try:
             self._router.send_multipart([identity, *parts], zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return False
         except zmq.ZMQError:  # that connection has ended
-            self._turns.gone(identity)
+            self._turns.remove_connection(identity)
             return False
         return True
 
@@ -213,7 +213,7 @@ class KeyframeClient(Endpoint):
         while True:
             self._check_links()
             self.say_ready()
-            self._take_in()
+            self._receive_all()
             if self._received:
                 return self._received.popleft()
             remaining = deadline - time.monotonic()
@@ -230,7 +230,7 @@ class KeyframeClient(Endpoint):
     def refuse(self, key: Key, reason: str) -> None:
         """To be called where the frame cannot be taken, now or later: capture sets it aside."""
         self._held.pop(key, None)
-        _remember(self._refused, key, printable(reason, LONGEST_TEXT), REMEMBERED_REFUSED)
+        _remember(self._refused, key, sanitize_text(reason, LONGEST_TEXT), REMEMBERED_REFUSED)
         self._refuse("a keyframe", reason)
         self._say(Refuse(*key, self._refused[key]))
 
@@ -242,21 +242,21 @@ class KeyframeClient(Endpoint):
         held = [(key.session, key.sequence) for key in self._held]
         self._say(Ready(self._recon, self._process, self.capacity, held, self.network.limits.total_bytes))
 
-    def _take_in(self) -> None:
+    def _receive_all(self) -> None:
         for _ in range(self.capacity + 2):
             try:
                 parts = self._dealer.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
             try:
-                first = decode(parts[:DELIVERY_PARTS], Delivery | Served, REQUEST_LIMITS).header
+                first = decode(parts[:DELIVERY_PARTS], Delivery | ConsumerStatus, REQUEST_LIMITS).header
             except WireError as error:  # it does not say which frame it is, if it is one
                 self._refuse("a keyframe without a number", error)
                 continue
             if isinstance(first, Delivery):
                 self._take(Key(first.session, first.sequence), parts[DELIVERY_PARTS:])
             else:
-                self._follow(first)
+                self._update_status(first)
 
     def _take(self, key: Key, parts: list[zmq.Frame]) -> None:
         if key in self._seen:
@@ -266,7 +266,7 @@ class KeyframeClient(Endpoint):
             self._say(Refuse(*key, self._refused[key]))
         elif key not in self._held:
             try:
-                frame = received(key, parts, self.network.limits)
+                frame = decode_frame(key, parts, self.network.limits)
             except WireError as error:
                 if may_be_shortage(error):  # the connection is made anew, and the frame comes again
                     raise
@@ -275,8 +275,8 @@ class KeyframeClient(Endpoint):
                 self._held[key] = None
                 self._received.append(frame)
 
-    def _follow(self, answer: Served) -> None:
-        """Where another recon is served, what waits here is its."""
+    def _update_status(self, answer: ConsumerStatus) -> None:
+        """Updates the consumer status: where another recon is active, the keyframes that wait here are its."""
         self.served = answer.served
         if not answer.served:
             self._received.clear()

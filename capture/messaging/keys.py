@@ -15,10 +15,10 @@ from pathlib import Path
 
 import zmq
 
-from splatnode.capture.process.durable import remove_leftovers, write_whole
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.durable import remove_leftovers, write_atomically
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.private import NotPrivate, StrayFile, check_only_ours, read_own
+from splatnode.capture.process.private import NotOwnerOnly, StrayFile, check_owner_only, read_own
 
 log = logging.getLogger(__name__)
 
@@ -62,31 +62,31 @@ def allow(folder: Path, name: str, public: bytes) -> None:
     if not re.fullmatch(r"[\w.-]{1,64}", name) or name.startswith("."):
         raise ValueError(f"a machine's name has letters, digits, - and _, got {name!r}")
     _make(folder)
-    _write_key(folder / ALLOWED / f"{name}.key", checked_key(public, name))
+    _write_key(folder / ALLOWED / f"{name}.key", check_key(public, name))
 
 
 def expect_server(folder: Path, public: bytes) -> None:
     """Connects to services of the machine with this key, and to no other."""
-    check_only_ours(folder)
-    _write_key(folder / SERVER, checked_key(public, SERVER))
+    check_owner_only(folder)
+    _write_key(folder / SERVER, check_key(public, SERVER))
 
 
 def read_keys(folder: Path) -> Keys:
     """Raises KeyFileError where a key is missing, damaged, or others could read the secret or change any of them."""
     try:
         secret = _read_key(folder / SECRET)
-        check_only_ours(folder)
+        check_owner_only(folder)
         if (folder / SECRET).lstat().st_mode & 0o077:
             raise KeyFileError(f"{folder / SECRET} can be read by other users. Run: chmod 600 {folder / SECRET}")
-        with foreign(KeyFileError, folder / SECRET):
+        with guard_untrusted(KeyFileError, folder / SECRET):
             public = zmq.curve_public(secret)
         server = _read_key(folder / SERVER) if os.path.lexists(folder / SERVER) else public
-    except NotPrivate as error:
+    except NotOwnerOnly as error:
         raise KeyFileError(str(error)) from error
     return Keys(public, secret, server)
 
 
-def checked_key(text: bytes, where: object) -> bytes:
+def check_key(text: bytes, where: object) -> bytes:
     """The key in `text`. Raises KeyFileError, which names `where` it came from."""
     key = text.strip()
     if not _Z85.fullmatch(key):
@@ -106,11 +106,11 @@ def _make(folder: Path) -> None:
     """The folder, and that of the allowed keys. Raises NotPrivate, OSError."""
     for each in (folder, folder / ALLOWED):
         each.mkdir(mode=0o700, parents=True, exist_ok=True)
-        check_only_ours(each)
+        check_owner_only(each)
 
 
 def _is_cut(path: Path) -> bool:
-    """Whether it is a file of less than a key, as a full disk or a power cut may have left it."""
+    """True if the file has less than a key, as a full disk or a power cut may have left it."""
     try:
         return len(read_own(path, _LARGEST).strip()) < _KEY_BYTES
     except (FileNotFoundError, StrayFile):
@@ -119,13 +119,13 @@ def _is_cut(path: Path) -> bool:
 
 def _write_key(path: Path, key: bytes) -> None:
     remove_leftovers(path.parent)
-    write_whole(path, [key + b"\n"])
+    write_atomically(path, [key + b"\n"])
 
 
 def _read_key(path: Path) -> bytes:
     """Raises KeyFileError, and NotPrivate where others could change it."""
     try:
-        return checked_key(read_own(path, _LARGEST, only_ours=True), path)
+        return check_key(read_own(path, _LARGEST, only_ours=True), path)
     except FileNotFoundError as error:
         raise KeyFileError(f"no key {path}. Run: splatnode keys {path.parent}") from error
     except StrayFile as error:
@@ -142,7 +142,7 @@ class AllowList:
 
     def callback(self, domain: str, key: bytes) -> bool:
         try:
-            allowed = key == self.own or key in outlast(self._listed, "whom to let in", _READ_S)
+            allowed = key == self.own or key in outlast(self._list_keys, "whom to let in", _READ_S)
         except OSError as error:
             self._say(logging.ERROR, f"cannot read whom to let in, so nobody is: {error}")
             return False
@@ -150,15 +150,15 @@ class AllowList:
             self._say(logging.WARNING, f"refused a connection: key {key.decode('ascii', 'replace')} is not allowed")
         return allowed
 
-    def _listed(self) -> set[bytes]:
+    def _list_keys(self) -> set[bytes]:
         """The keys that only this user can have put there; the others are said. Raises NotPrivate, OSError."""
         for each in (self.folder.parent, self.folder):
-            check_only_ours(each)
+            check_owner_only(each)
         found = set()
         for path in sorted(self.folder / name for name in os.listdir(self.folder) if name.endswith(".key")):
             try:
                 found.add(_read_key(path))
-            except (KeyFileError, NotPrivate) as error:
+            except (KeyFileError, NotOwnerOnly) as error:
                 self._say(logging.ERROR, f"a key is not accepted: {error}")
         return found
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from splatnode.capture.messaging.wire import MAGIC, VERSION, Part
-from splatnode.capture.process.durable import write_whole
+from splatnode.capture.process.durable import write_atomically
 from splatnode.capture.process.private import read_own
 
 LARGEST = 4 << 30  # bytes of a body, unless the reader knows better
@@ -31,7 +31,7 @@ def write_message(path: Path, parts: Sequence[Part]) -> None:
     checksum = 0
     for piece in body:
         checksum = zlib.crc32(piece, checksum)
-    write_whole(path, [_HEAD.pack(_MAGIC, len(parts), size_in_file(parts), checksum), *body])
+    write_atomically(path, [_HEAD.pack(_MAGIC, len(parts), size_in_file(parts), checksum), *body])
 
 
 class MessageFileError(ValueError):

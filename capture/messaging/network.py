@@ -29,10 +29,10 @@ from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
 from splatnode.capture.messaging.services import Service
 from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
-from splatnode.capture.process.lock import Held, exclusive
-from splatnode.capture.process.printable import printable
-from splatnode.capture.process.private import NotPrivate, private_folder
-from splatnode.capture.process.problems import is_said
+from splatnode.capture.process.lock import LockHeld, exclusive
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.private import NotOwnerOnly, make_owner_only_folder
+from splatnode.capture.process.problems import is_logged
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class NetworkError(PermissionError):
     """The network cannot be used as configured; the text says what to do."""
 
 
-class AlreadyRunning(Held):
+class AlreadyRunning(LockHeld):
     """Another process offers this service."""
 
     def __init__(self, service: Service, pid: int | None) -> None:
@@ -94,7 +94,7 @@ class Endpoint:
         self.refused = 0  # messages that could not be taken
         self.why_refused = ""  # the last of them
         self._resources = contextlib.ExitStack()
-        with self._closed_on_error():
+        with self._close_on_error():
             self._keys = _curve_keys(network)
             self._links: list[_Link] = []
             if offers is not None:
@@ -118,19 +118,19 @@ class Endpoint:
     def _refuse(self, what: str, why: object) -> None:
         """Counts a message that cannot be taken. The 1st, 2nd, 4th, 8th, ... is logged: nobody can fill the journal."""
         self.refused += 1
-        self.why_refused = printable(why)
-        if is_said(self.refused):
+        self.why_refused = sanitize_text(why)
+        if is_logged(self.refused):
             log.warning("refused %s (%d so far): %s", what, self.refused, self.why_refused)
 
     def _lock(self, service: Service) -> None:
         try:
             self._resources.enter_context(exclusive(runtime_directory(self.network) / f"{service.name}.lock"))
-        except Held as error:
+        except LockHeld as error:
             raise AlreadyRunning(service, error.pid) from error
 
     def _bind(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
         """Raises AlreadyRunning, NetworkError, OSError."""
-        with self._closed_on_error():
+        with self._close_on_error():
             socket = self._socket(kind, queue, largest=REQUEST_BYTES)
             if self._keys is not None:
                 socket.curve_server, socket.curve_secretkey = True, self._keys.secret
@@ -152,7 +152,7 @@ class Endpoint:
 
     def _connect(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
         """Succeeds whether or not the service is there: it may start later, end, and start again."""
-        with self._closed_on_error():
+        with self._close_on_error():
             socket = self._socket(kind, queue, largest=self.network.max_message_mb << 20)
             if self._keys is not None:
                 socket.curve_publickey, socket.curve_secretkey = self._keys.public, self._keys.secret
@@ -172,7 +172,7 @@ class Endpoint:
             link.check()
 
     @contextlib.contextmanager
-    def _closed_on_error(self) -> Iterator[None]:
+    def _close_on_error(self) -> Iterator[None]:
         try:
             yield
         except BaseException:
@@ -228,8 +228,8 @@ def runtime_directory(network: Network) -> Path:
     """The private folder of sockets and locks, made where it is absent. Raises NetworkError where it is not private."""
     directory = network.directory or _default_directory()
     try:
-        private_folder(directory, "network.directory (or $XDG_RUNTIME_DIR), for each process,", ours=False)
-    except NotPrivate as error:
+        make_owner_only_folder(directory, "network.directory (or $XDG_RUNTIME_DIR), for each process,", ours=False)
+    except NotOwnerOnly as error:
         raise NetworkError(str(error)) from error
     return directory
 

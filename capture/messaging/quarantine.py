@@ -15,11 +15,11 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.messaging.values import Name, Text, check
-from splatnode.capture.process.durable import remove_leftovers, write_whole
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.durable import remove_leftovers, write_atomically
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
-from splatnode.capture.process.private import StrayFile, own_files, private_folder, read_own
+from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, sanitize_text
+from splatnode.capture.process.private import StrayFile, list_own_files, make_owner_only_folder, read_own
 from splatnode.capture.process.records import record_in
 
 log = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 512  # their size, in 2^20 bytes; beyond, the oldest goes
 
 
-class SetAside(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class QuarantinedKeyframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A keyframe that was set aside."""
 
     name: Name  # of the frame; a question mark where it does not tell
@@ -49,11 +49,11 @@ class Quarantine:
         """Goes on with what lies in the directory. Raises OSError where it cannot be made, NotPrivate."""
         self.config = config
         self.directory = directory
-        private_folder(directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
-        self._records: dict[int, SetAside] = {}  # oldest first
+        make_owner_only_folder(directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
+        self._records: dict[int, QuarantinedKeyframe] = {}  # oldest first
         self._bytes: dict[int, int] = {}
         remove_leftovers(directory)
-        for path in own_files(directory, _FILE, ".frame"):
+        for path in list_own_files(directory, _FILE, ".frame"):
             self._records[int(path.stem)] = _record(path)
             self._bytes[int(path.stem)] = path.stat().st_size
         self._last_seen = _number_in(directory / _SEEN)
@@ -68,26 +68,28 @@ class Quarantine:
         """How many of those that are here came after `seen` was last called."""
         return sum(number > self._last_seen for number in self._records)
 
-    def newest(self, count: int) -> tuple[SetAside, ...]:
+    def newest(self, count: int) -> tuple[QuarantinedKeyframe, ...]:
         """The last ones that came, newest first."""
         return tuple(itertools.islice(reversed(self._records.values()), count))
 
-    def seen(self) -> None:
+    def mark_seen(self) -> None:
         """Somebody has seen all that are here."""
         self._last_seen = self._number - 1
         try:
-            write_whole(self.directory / _SEEN, [b"%d\n" % self._last_seen])
+            write_atomically(self.directory / _SEEN, [b"%d\n" % self._last_seen])
         except OSError as error:
             log.warning("what was seen of %s is forgotten with this process: %s", self.directory, error)
 
     def take(self, path: Path, name: str, reason: str) -> None:
         """Moves the message's file here. Where the disk does not let it, it stays and comes again after a restart."""
-        record = SetAside(
-            printable(name, LONGEST_NAME) or "?", printable(reason, LONGEST_TEXT), printable(path.name, LONGEST_NAME)
+        record = QuarantinedKeyframe(
+            sanitize_text(name, LONGEST_NAME) or "?",
+            sanitize_text(reason, LONGEST_TEXT),
+            sanitize_text(path.name, LONGEST_NAME),
         )
         number = self._number
         try:
-            write_whole(self._file(number).with_suffix(".json"), [msgspec.json.encode(record)])
+            write_atomically(self._file(number).with_suffix(".json"), [msgspec.json.encode(record)])
         except OSError as error:
             log.error("%s: the reason why it is set aside cannot be kept: %s", record.name, error)
         try:
@@ -113,17 +115,17 @@ class Quarantine:
         return self.directory / f"{number:012d}.frame"
 
 
-def _record(path: Path) -> SetAside:
+def _record(path: Path) -> QuarantinedKeyframe:
     """Why the message is here, as far as that is known."""
     beside = path.with_suffix(".json")
     try:
-        with foreign(ValueError, beside):
-            record = record_in(read_own(beside, _LARGEST_RECORD), SetAside)
+        with guard_untrusted(ValueError, beside):
+            record = record_in(read_own(beside, _LARGEST_RECORD), QuarantinedKeyframe)
             check(record)
             return record
     except (OSError, ValueError) as error:
         raise_shortage(error)
-        return SetAside("?", "its reason was lost", printable(path.name, LONGEST_NAME))
+        return QuarantinedKeyframe("?", "its reason was lost", sanitize_text(path.name, LONGEST_NAME))
 
 
 def _number_in(path: Path) -> int:

@@ -21,7 +21,7 @@ class Service:
 
     @property
     def requests(self) -> Service:
-        """Where late subscribers ask for the state; it has a socket of its own."""
+        """Returns the service on which late subscribers ask for the state; it has a socket of its own."""
         return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
 
 

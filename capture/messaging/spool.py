@@ -23,7 +23,7 @@ from splatnode.capture.process.disk_space import shortage
 from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import exclusive
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.private import StrayFile, own_files, private_folder
+from splatnode.capture.process.private import StrayFile, list_own_files, make_owner_only_folder
 from splatnode.capture.process.state_directory import state_directory
 
 log = logging.getLogger(__name__)
@@ -60,7 +60,7 @@ class Spool:
         """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate."""
         self.config = config
         self.directory = spool_directory(config)
-        private_folder(self.directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
+        make_owner_only_folder(self.directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
         self._resources = contextlib.ExitStack()
         self._resources.enter_context(exclusive(self.directory / "lock"))
         self._files: dict[Key, Path] = {}  # oldest first
@@ -68,7 +68,7 @@ class Spool:
         self._acknowledged: list[Path] = []  # that are still to be removed
         self.quarantine = quarantine.Quarantine(self.directory.with_name("quarantine"), config.quarantine)
         remove_leftovers(self.directory)
-        found = own_files(self.directory, _FILE, ".frame")
+        found = list_own_files(self.directory, _FILE, ".frame")
         for path in found:
             self._take_over(path)
         self._number = max((_number(path) for path in found), default=-1) + 1
@@ -96,7 +96,7 @@ class Spool:
         further_bytes = (self.config.max_mb << 20) - self.size_bytes
         return shortage(self.directory, further_bytes, "further keyframes (spool.max_mb)")
 
-    def put(self, key: Key, parts: Sequence[Part]) -> None:
+    def store(self, key: Key, parts: Sequence[Part]) -> None:
         """Returns when the message is on the disk.
 
         Raises SpoolFull; what is_shortage tells, where another time may do.
@@ -125,13 +125,13 @@ class Spool:
             self._acknowledged.append(path)
             self._remove_acknowledged()
 
-    def set_aside(self, key: Key, name: str, reason: str) -> None:
+    def move_to_quarantine(self, key: Key, name: str, reason: str) -> None:
         """Moves the message that carries the frame `name` to the quarantine: it is not delivered any more."""
         self._bytes.pop(key)
         self.quarantine.take(self._files.pop(key), name, reason)
 
     def _remove_acknowledged(self) -> None:
-        """What the disk does not let go of now is removed later; after a restart it is sent and acknowledged again."""
+        """Removes acknowledged keyframes. One that the disk keeps is removed later; after a restart it comes again."""
         while self._acknowledged:
             try:
                 self._acknowledged[-1].unlink(missing_ok=True)

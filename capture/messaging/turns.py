@@ -32,7 +32,7 @@ class Connection:
     outstanding: set[Key] = field(default_factory=set)  # sent or held, neither acknowledged nor refused
 
 
-class Turns:
+class ConsumerArbiter:
     """The connections, and which of them is served."""
 
     def __init__(self) -> None:
@@ -41,22 +41,22 @@ class Turns:
         self._ended: deque[str] = deque(maxlen=_ENDED)
 
     @property
-    def served(self) -> Connection | None:
+    def active(self) -> Connection | None:
         return self._served
 
     @property
-    def waiting(self) -> int:
+    def num_rejected(self) -> int:
         """Recons that ask and are not served."""
-        return len({each.process for each in self._connections.values() if not self._is_served(each)})
+        return len({each.process for each in self._connections.values() if not self._is_active(each)})
 
-    def is_served(self, identity: bytes) -> bool:
+    def is_active(self, identity: bytes) -> bool:
         return self._served is not None and self._served.identity == identity
 
-    def ready(self, identity: bytes, request: Ready, spooled: Collection[Key], now_s: float) -> bool:
+    def handle_ready(self, identity: bytes, request: Ready, spooled: Collection[Key], now_s: float) -> bool:
         """A recon asks for keyframes: whether it gets them."""
         known = self._connections.get(identity)
         if known is None and len(self._connections) >= MOST_CONNECTIONS:
-            self.gone(min(self._connections.values(), key=self._worth).identity)
+            self.remove_connection(min(self._connections.values(), key=self._eviction_rank).identity)
         asking = known or Connection(identity, request.recon, request.process, now_s)
         self._connections[identity] = asking
         asking.recon, asking.process, asking.heard_s = request.recon, request.process, now_s
@@ -65,41 +65,41 @@ class Turns:
         if self._takes_over(asking, now_s):
             before, self._served = self._served, asking
             if before is not None and before.process != asking.process:
-                self._succeeded(before, asking)
+                self._handle_takeover(before, asking)
         return self._served is asking
 
-    def heard(self, identity: bytes, now_s: float) -> None:
+    def record_keep_alive(self, identity: bytes, now_s: float) -> None:
         """The connection has said something."""
         if identity in self._connections:
             self._connections[identity].heard_s = now_s
 
-    def answered(self, key: Key) -> None:
+    def mark_answered(self, key: Key) -> None:
         """The frame is no longer on its way."""
         for each in self._connections.values():
             each.outstanding.discard(key)
 
     def forget_silent(self, now_s: float) -> None:
         for identity in [name for name, each in self._connections.items() if now_s - each.heard_s > FORGET_S]:
-            self.gone(identity)
+            self.remove_connection(identity)
 
-    def gone(self, identity: bytes) -> None:
+    def remove_connection(self, identity: bytes) -> None:
         """The connection has ended."""
         self._connections.pop(identity, None)
-        if self.is_served(identity):
+        if self.is_active(identity):
             self._served = None
 
-    def _succeeded(self, before: Connection, after: Connection) -> None:
+    def _handle_takeover(self, before: Connection, after: Connection) -> None:
         """Another process is served now. One with the same checkpoint has ended: if it is a copy, it asks again."""
         self._ended.append(before.process)
         if before.recon == after.recon:
             for identity in [name for name, each in self._connections.items() if each.process == before.process]:
-                self.gone(identity)
+                self.remove_connection(identity)
 
-    def _worth(self, connection: Connection) -> tuple[bool, float]:
+    def _eviction_rank(self, connection: Connection) -> tuple[bool, float]:
         """The least goes where there are too many, so that nobody can keep others out by asking often."""
-        return self.is_served(connection.identity), connection.heard_s
+        return self.is_active(connection.identity), connection.heard_s
 
-    def _is_served(self, connection: Connection) -> bool:
+    def _is_active(self, connection: Connection) -> bool:
         return self._served is not None and self._served.process == connection.process
 
     def _takes_over(self, asking: Connection, now_s: float) -> bool:

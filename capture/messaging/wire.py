@@ -23,8 +23,8 @@ import numpy.typing as npt
 import zmq
 
 from splatnode.capture.messaging.values import Sequential, SessionId, check
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import Decoder, decoder_of
 
 # Of the messages: 1 knew no answer to a keyframe that cannot be taken, 2 no time of capture, 3 no masks, 4 no fisheyes.
@@ -41,7 +41,7 @@ class WireError(ValueError):
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every header has. A room's headers extend it; where several share a service they are tagged."""
+    """The fields of every header. A room's headers extend it; where several share a service they are tagged."""
 
     session: SessionId  # of the process that sends: a new one begins to count anew
     sequence: Sequential  # gaps are losses
@@ -92,25 +92,25 @@ def encode(header: msgspec.Struct, arrays: Sequence[npt.NDArray] = ()) -> list[P
 
 def decode(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits | None = None) -> Message[Any]:
     """The message in `parts` if its header is a `schema` (a Struct, or a union of tagged ones). Raises WireError."""
-    with foreign(WireError, "a message"):
-        return _decoded(parts, schema, limits or Limits())
+    with guard_untrusted(WireError, "a message"):
+        return _decode_parts(parts, schema, limits or Limits())
 
 
 def size_bytes(parts: Sequence[Part]) -> int:
-    """Of a message on its way."""
+    """Returns the size of a message on its way."""
     return sum(memoryview(part).nbytes for part in parts)
 
 
 def plain_header(parts: Sequence[Part]) -> dict[str, Any]:
-    """What stands in the place of the header, of parts that need not be a message; empty where nothing does."""
+    """Returns what stands in the place of the header, of parts that need not be a message; empty where nothing does."""
     try:
-        with foreign(WireError):
+        with guard_untrusted(WireError):
             return _envelope(memoryview(parts[1]), dict[str, Any]).header
     except WireError:
         return {}
 
 
-def _decoded(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits) -> Message[Any]:
+def _decode_parts(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits) -> Message[Any]:
     if len(parts) > limits.arrays + 2:
         raise WireError(f"too many parts: {len(parts)}, and {limits.arrays} arrays are allowed")
     buffers = [memoryview(part.buffer if isinstance(part, zmq.Frame) else part) for part in parts]
@@ -143,7 +143,7 @@ def _envelope(head: memoryview, schema: Any) -> _Envelope[Any]:
     try:
         return decoder.decode(head)
     except (ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
-        raise WireError(f"header refused: {printable(error)}") from error
+        raise WireError(f"header refused: {sanitize_text(error)}") from error
 
 
 @functools.lru_cache(maxsize=64)

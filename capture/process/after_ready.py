@@ -11,14 +11,14 @@ from splatnode.capture.process.service_manager import ServiceManager
 _HELPED_BY_A_START = (69, 75)  # exit codes: the camera is not there, another process is still ending
 
 
-class Failed(RuntimeError):
+class FailedAfterReady(RuntimeError):
     """A process failed after it was ready: no fault of its configuration, and another start may help."""
 
     exit_code = 70
 
 
 @contextlib.contextmanager
-def after_ready(manager: ServiceManager) -> Iterator[None]:
+def wrap_late_errors(manager: ServiceManager) -> Iterator[None]:
     """Once the process is ready, an error in here is no longer one of its configuration, whatever it was raised for.
 
     The exit codes that the units take as the call for a human, 2 and 77, are those of a start that failed.
@@ -29,4 +29,4 @@ def after_ready(manager: ServiceManager) -> Iterator[None]:
         helped = is_shortage(error) or getattr(error, "exit_code", None) in _HELPED_BY_A_START
         if not manager.is_ready or helped:
             raise
-        raise Failed(f"{type(error).__name__}: {error}") from error
+        raise FailedAfterReady(f"{type(error).__name__}: {error}") from error

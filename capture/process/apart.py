@@ -11,8 +11,8 @@ from splatnode.capture.process import python
 
 
 def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
-    """What the process of a module writes, `most` bytes of it, once it has read `data`; and how it ended."""
-    child = started(python.command(module, *arguments), subprocess.PIPE)
+    """Returns what the process of a module writes, at most `most` bytes, after it has read `data`, and how it ended."""
+    child = start_process(python.command(module, *arguments), subprocess.PIPE)
     with child:
         assert child.stdin is not None and child.stdout is not None
         try:
@@ -26,7 +26,7 @@ def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes,
             child.kill()
 
 
-def started(command: list[str], stdin: int) -> subprocess.Popen[bytes]:
+def start_process(command: list[str], stdin: int) -> subprocess.Popen[bytes]:
     """The process, whose output can be read. Raises OSError; what is_shortage tells where no further one may be."""
     try:
         return subprocess.Popen(
@@ -48,6 +48,6 @@ def limit_memory(further_bytes: int) -> None:
 
 
 def _data_bytes() -> int:
-    """What RLIMIT_DATA counts, of this process just now."""
+    """Returns the bytes of this process that RLIMIT_DATA counts now."""
     with open("/proc/self/status") as file:
         return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData"))

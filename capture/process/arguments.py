@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 
 from splatnode.capture.process.config_text import MAX_NUMBER
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 _MAX_DIGITS = 20
 _LAST_PORT = 65535
@@ -18,7 +18,9 @@ def _whole_number(least: int) -> Callable[[str], int]:
     def convert(text: str) -> int:
         number = int(text) if text.strip().isdecimal() and len(text) <= _MAX_DIGITS else -1
         if not least <= number <= MAX_NUMBER:
-            raise argparse.ArgumentTypeError(f"must be a whole number from {least} to {MAX_NUMBER}; got {_shown(text)}")
+            raise argparse.ArgumentTypeError(
+                f"must be a whole number from {least} to {MAX_NUMBER}; got {_quote_text(text)}"
+            )
         return number
 
     return convert
@@ -31,7 +33,9 @@ def port(text: str) -> int:
     """The number of a port, from 0 to 65535."""
     number = natural(text)
     if number > _LAST_PORT:
-        raise argparse.ArgumentTypeError(f"must be the number of a port, from 0 to {_LAST_PORT}; got {_shown(text)}")
+        raise argparse.ArgumentTypeError(
+            f"must be the number of a port, from 0 to {_LAST_PORT}; got {_quote_text(text)}"
+        )
     return number
 
 
@@ -40,7 +44,9 @@ def address(text: str) -> str:
     try:
         return str(ipaddress.ip_address(text))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a numeric address, as 192.168.1.5; got {_shown(text)}") from None
+        raise argparse.ArgumentTypeError(
+            f"must be a numeric address, as 192.168.1.5; got {_quote_text(text)}"
+        ) from None
 
 
 def seconds(text: str) -> float:
@@ -72,7 +78,7 @@ def angle(text: str) -> float:
     """Degrees of an angle of view."""
     degrees = _above_zero(text, "degrees")
     if degrees >= 180.0:
-        raise argparse.ArgumentTypeError(f"must be below 180 degrees, got {_shown(text)}")
+        raise argparse.ArgumentTypeError(f"must be below 180 degrees, got {_quote_text(text)}")
     return degrees
 
 
@@ -82,7 +88,9 @@ def _above_zero(text: str, unit: str) -> float:
     except ValueError:
         number = math.nan
     if not 0 < number <= MAX_NUMBER:
-        raise argparse.ArgumentTypeError(f"must be a number of {unit} above 0, up to {MAX_NUMBER}; got {_shown(text)}")
+        raise argparse.ArgumentTypeError(
+            f"must be a number of {unit} above 0, up to {MAX_NUMBER}; got {_quote_text(text)}"
+        )
     return number
 
 
@@ -90,7 +98,7 @@ def names(text: str) -> tuple[str, ...]:
     """Values with commas between them: a,b,c."""
     names = tuple(name.strip() for name in text.split(","))
     if not all(names):
-        raise argparse.ArgumentTypeError(f"must be values with commas between them; got {_shown(text)}")
+        raise argparse.ArgumentTypeError(f"must be values with commas between them; got {_quote_text(text)}")
     return names
 
 
@@ -98,7 +106,7 @@ def size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels."""
     sides = [int(side) for side in text.split("x") if side.isdecimal() and len(side) <= _MAX_DIGITS]
     if len(sides) != 2 or not 16 <= min(sides) <= max(sides) <= 4096:
-        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, from 16 to 4096 pixels; got {_shown(text)}")
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, from 16 to 4096 pixels; got {_quote_text(text)}")
     return sides[0], sides[1]
 
 
@@ -109,10 +117,10 @@ def box(text: str) -> tuple[float, float, float, float, float, float]:
     except ValueError:
         x0, y0, z0, x1, y1, z1 = [math.nan] * 6
     if not all(math.isfinite(number) and abs(number) <= MAX_NUMBER for number in (x0, y0, z0, x1, y1, z1)):
-        raise argparse.ArgumentTypeError(f"must be six numbers with commas between them; got {_shown(text)}")
+        raise argparse.ArgumentTypeError(f"must be six numbers with commas between them; got {_quote_text(text)}")
     for axis, least, most in (("x", x0, x1), ("y", y0, y1), ("z", z0, z1)):
         if least >= most:
-            raise argparse.ArgumentTypeError(f"must have {axis}0 below {axis}1; got {_shown(text)}")
+            raise argparse.ArgumentTypeError(f"must have {axis}0 below {axis}1; got {_quote_text(text)}")
     return x0, y0, z0, x1, y1, z1
 
 
@@ -125,5 +133,5 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object for programs")
 
 
-def _shown(text: str) -> str:
-    return repr(printable(text, 100))
+def _quote_text(text: str) -> str:
+    return repr(sanitize_text(text, 100))

@@ -21,8 +21,8 @@ import msgspec
 
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import record_of
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ class Plugin:
 
 def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
     """The YAML file at `path` with `changes`, such as ["camera.folder=photos"], as a `schema`. Raises ConfigError."""
-    return typed(merged(read_yaml(path), parse_changes(changes)), schema)
+    return parse_config(merge_config(read_yaml(path), parse_changes(changes)), schema)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -94,28 +94,28 @@ def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
         key, equals, value = change.partition("=")
         names = key.replace("-", "_").split(".")
         if not (key and equals and len(names) <= MAX_DEPTH):
-            raise ConfigError(f"expected KEY=VALUE such as camera.loops=2, got {printable(change)!r}")
-        leaf = parse_yaml(value, printable(key))
+            raise ConfigError(f"expected KEY=VALUE such as camera.loops=2, got {sanitize_text(change)!r}")
+        leaf = parse_yaml(value, sanitize_text(key))
         for name in reversed(names):
             leaf = {name: leaf}
-        tree = merged(tree, leaf)
+        tree = merge_config(tree, leaf)
     return tree
 
 
-def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def merge_config(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """`base` with `changes` laid over it, key by key."""
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)
-        result[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+        result[key] = merge_config(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return result
 
 
-def typed(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
+def parse_config(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
     """`raw` as a `schema` (Struct or dataclass); `where` is the key under which it stands. Raises ConfigError."""
-    with foreign(ConfigError, where):
+    with guard_untrusted(ConfigError, where):
         try:
-            return record_of(_checked(raw, schema, where), schema, dec_hook=_decode)
+            return record_of(_check_keys(raw, schema, where), schema, dec_hook=_decode)
         except msgspec.ValidationError as error:
             message, _, path = str(error).partition(" - at `$")
             key = _join(where, path.rstrip("`").lstrip("."))
@@ -124,13 +124,13 @@ def typed(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
             ) from error
 
 
-def _checked(raw: Any, schema: Any, where: str) -> Any:
+def _check_keys(raw: Any, schema: Any, where: str) -> Any:
     """`raw` after all its keys were found in `schema`, its plug-ins made; types are msgspec's to check."""
     if not isinstance(raw, Mapping):
         return raw
     if typing.get_origin(schema) is Mapping:
         plugin = typing.get_args(schema)[1]
-        return {name: _checked(_of_kind(name, each), plugin, _join(where, str(name))) for name, each in raw.items()}
+        return {name: _check_keys(_add_kind(name, each), plugin, _join(where, str(name))) for name, each in raw.items()}
     if isinstance(schema, type) and issubclass(schema, Plugin):
         return _plugin(raw, schema, where)
     if not _has_fields(schema):
@@ -138,18 +138,18 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
     types = typing.get_type_hints(schema)
     unknown = sorted((str(key) for key in raw if key not in types), key=lambda key: key not in OF_VERBS)
     if unknown:
-        elsewhere = _elsewhere(unknown[0], types, where)
+        elsewhere = _locate_key(unknown[0], types, where)
         raise ConfigError(
-            f"{_join(where, printable(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(types)}"
+            f"{_join(where, sanitize_text(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(types)}"
         )
-    missing = [name for name in _required(schema) if name not in raw]
+    missing = [name for name in _list_required_fields(schema) if name not in raw]
     if missing:
         raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
-    return {key: _checked(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
+    return {key: _check_keys(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
 
 
-def _elsewhere(key: str, types: Mapping[str, Any], where: str) -> str:
-    """Where a key that is none of these belongs, if one of them has it, or another verb."""
+def _locate_key(key: str, types: Mapping[str, Any], where: str) -> str:
+    """Says where a key that is none of these belongs, if one of them has it, or another verb."""
     for name, annotation in types.items():
         struct = _struct_in(annotation)
         if _has_fields(struct) and key in typing.get_type_hints(struct):
@@ -157,7 +157,7 @@ def _elsewhere(key: str, types: Mapping[str, Any], where: str) -> str:
     return f", which is of the configuration of {OF_VERBS[key]}" if key in OF_VERBS and not where else ""
 
 
-def _of_kind(kind: object, raw: Any) -> Any:
+def _add_kind(kind: object, raw: Any) -> Any:
     return {"kind": kind, **raw} if isinstance(raw, Mapping) else raw
 
 
@@ -165,18 +165,18 @@ def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
     if not schema.is_kind(kind):
         raise ConfigError(
-            f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {printable(repr(kind), 100)}"
+            f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {sanitize_text(repr(kind), 100)}"
         )
     module = import_module(f"{schema.package}.{kind}")
     rest = {key: value for key, value in raw.items() if key != "kind"}
-    return schema(kind, typed(rest, module.Config, where))
+    return schema(kind, parse_config(rest, module.Config, where))
 
 
 def _has_fields(schema: Any) -> bool:
     return isinstance(schema, type) and (issubclass(schema, msgspec.Struct) or dataclasses.is_dataclass(schema))
 
 
-def _required(schema: Any) -> list[str]:
+def _list_required_fields(schema: Any) -> list[str]:
     if issubclass(schema, msgspec.Struct):
         return [field.name for field in msgspec.structs.fields(schema) if field.required]
     none = dataclasses.MISSING

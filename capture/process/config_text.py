@@ -13,8 +13,8 @@ from typing import Any
 
 import yaml
 
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 
 MAX_BYTES = 262_144  # of a file
 MAX_VALUES = 10_000  # keys count, too
@@ -33,23 +33,23 @@ def parse_yaml(text: str, source: str) -> Any:
 
     It consists of mappings with different keys that are text, lists, finite numbers, text, truth values and None.
     """
-    with foreign(ConfigError, source):
+    with guard_untrusted(ConfigError, source):
         if len(text) > MAX_BYTES:
             raise ConfigError(f"{source}: {len(text)} characters; at most {MAX_BYTES} are read")
         try:
             return yaml.load(text, Loader=_Loader)  # a SafeLoader
         except yaml.YAMLError as error:
             raise ConfigError(f"{source} is not YAML: {error}") from error
-        except _Beyond as error:
+        except _BoundsError as error:
             raise ConfigError(f"{source}: {error}") from error
 
 
-class _Beyond(Exception):
+class _BoundsError(Exception):
     """A value that no configuration has."""
 
     def __init__(self, expected: str, node: yaml.Node) -> None:
         text = node.value if isinstance(node, yaml.ScalarNode) else type(node).__name__
-        super().__init__(f"line {node.start_mark.line + 1}: {expected}, got {printable(text, 100)}")
+        super().__init__(f"line {node.start_mark.line + 1}: {expected}, got {sanitize_text(text, 100)}")
 
 
 class _Loader(yaml.SafeLoader):
@@ -71,24 +71,24 @@ class _Loader(yaml.SafeLoader):
         self._depth -= 1
         return node
 
-    def bounded_text(self, node: yaml.ScalarNode) -> str:
+    def construct_text(self, node: yaml.ScalarNode) -> str:
         # Control characters and halves of letters are in no path, and would end what opens it.
         categories = {unicodedata.category(letter) for letter in node.value}
         if len(node.value) > MAX_CHARACTERS or categories & {"Cc", "Cs"}:
-            raise _Beyond(f"expected a text of one line, of at most {MAX_CHARACTERS} characters", node)
+            raise _BoundsError(f"expected a text of one line, of at most {MAX_CHARACTERS} characters", node)
         return node.value
 
-    def bounded_number(self, node: yaml.ScalarNode) -> float:
+    def construct_number(self, node: yaml.ScalarNode) -> float:
         construct = self.construct_yaml_int if node.tag.endswith(":int") else self.construct_yaml_float
         number = construct(node) if len(node.value) <= _MAX_DIGITS else math.nan
         if not abs(number) <= MAX_NUMBER:
-            raise _Beyond(f"expected a number within ±{MAX_NUMBER}", node)
+            raise _BoundsError(f"expected a number within ±{MAX_NUMBER}", node)
         return number
 
     def distinct_keys(self, node: yaml.MappingNode) -> dict[str, Any]:
         keys = [key.value if key.tag == "tag:yaml.org,2002:str" else None for key, _ in node.value]
         if None in keys or len({*keys}) < len(keys):
-            raise _Beyond("expected keys that are text and differ", node)
+            raise _BoundsError("expected keys that are text and differ", node)
         return {self.construct_object(key): self.construct_object(value, deep=True) for key, value in node.value}
 
 
@@ -99,10 +99,10 @@ _Loader.add_implicit_resolver(
 _Loader.yaml_constructors = {
     f"{_TAG}null": _Loader.construct_yaml_null,
     f"{_TAG}bool": _Loader.construct_yaml_bool,
-    f"{_TAG}int": _Loader.bounded_number,
-    f"{_TAG}float": _Loader.bounded_number,
-    f"{_TAG}str": _Loader.bounded_text,
-    f"{_TAG}timestamp": _Loader.bounded_text,  # a folder may be called 2020-01-01
+    f"{_TAG}int": _Loader.construct_number,
+    f"{_TAG}float": _Loader.construct_number,
+    f"{_TAG}str": _Loader.construct_text,
+    f"{_TAG}timestamp": _Loader.construct_text,  # a folder may be called 2020-01-01
     f"{_TAG}seq": lambda loader, node: loader.construct_sequence(node, deep=True),
     f"{_TAG}map": _Loader.distinct_keys,
     None: _Loader.construct_undefined,

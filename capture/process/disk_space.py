@@ -9,7 +9,7 @@ from pathlib import Path
 _OF_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS}
 
 
-def is_of_disk(error: BaseException) -> bool:
+def is_disk_error(error: BaseException) -> bool:
     """Whether something failed because the disk did not take it, which says nothing of what it was."""
     return isinstance(error, OSError) and error.errno in _OF_DISK
 

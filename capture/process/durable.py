@@ -17,7 +17,7 @@ from splatnode.capture.process.private import create_own
 _BUFFER = 1 << 20  # bytes: the many small arrays of a message are one call each else
 
 
-def write_whole(path: Path, content: Iterable[bytes | memoryview]) -> None:
+def write_atomically(path: Path, content: Iterable[bytes | memoryview]) -> None:
     """Writes `path` under a temporary name, through to the disk, then renames it. Raises OSError, nothing left.
 
     Only this user can read it. A process that is killed may leave the temporary file, `.NAME.*.tmp`.

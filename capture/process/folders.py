@@ -14,7 +14,7 @@ LOCK = ".splatnode.lock"
 
 
 @contextlib.contextmanager
-def made(folder: Path) -> Iterator[None]:
+def make_folder(folder: Path) -> Iterator[None]:
     """Makes `folder` and the folders above it; at the end removes those that it made and that are empty.
 
     Raises OSError where one cannot be made.
@@ -25,9 +25,9 @@ def made(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def claim_folder(folder: Path) -> Iterator[None]:
     """Makes `folder` as `made` does and holds its lock, whose file is removed at the end. Raises Held, OSError."""
-    with made(folder), exclusive(folder / LOCK):
+    with make_folder(folder), exclusive(folder / LOCK):
         try:
             yield
         finally:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 
 @contextlib.contextmanager
-def foreign(refusal: type[Exception], source: object = "") -> Iterator[None]:
+def guard_untrusted(refusal: type[Exception], source: object = "") -> Iterator[None]:
     """Whatever fails in here is the fault of `source`, a file or a sender, and is raised as a `refusal` that names it.
 
     For the code that reads a stranger's bytes, and for nothing else: a parser meets what its author did not think of,
@@ -23,4 +23,4 @@ def foreign(refusal: type[Exception], source: object = "") -> Iterator[None]:
         raise
     except Exception as error:
         where = f"{source}: " if source else ""
-        raise refusal(f"{where}cannot be read ({type(error).__name__}: {printable(error)})") from error
+        raise refusal(f"{where}cannot be read ({type(error).__name__}: {sanitize_text(error)})") from error

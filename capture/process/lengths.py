@@ -19,16 +19,16 @@ def metres(text: str) -> float:
     return length
 
 
-def measured(text: str) -> tuple[float, float | None]:
+def parse_measurement(text: str) -> tuple[float, float | None]:
     """A length and its standard deviation in metres, as 100mm@0.2mm; None where there is none. Raises ValueError."""
     length, at, sigma = text.partition("@")
     return metres(length), metres(sigma) if at else None
 
 
-def measured_argument(text: str) -> str:
+def measurement_argument(text: str) -> str:
     """The text, for an argument of the command line that `measured` reads."""
     try:
-        measured(text)
+        parse_measurement(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
     return text.strip()
@@ -42,6 +42,6 @@ def metres_argument(text: str) -> float:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
-def in_words(length_m: float) -> str:
+def format_length(length_m: float) -> str:
     """The length in the unit that suits it: 100 mm, 1.5 m."""
     return f"{length_m:g} m" if length_m >= 1.0 else f"{1e3 * length_m:g} mm"

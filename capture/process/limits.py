@@ -7,7 +7,7 @@ import resource
 import threading
 
 
-class Limited(RuntimeError):
+class LimitTooLow(RuntimeError):
     """The process may not have what it needs; the text says of what and how to raise the limit."""
 
     exit_code = 75
@@ -31,7 +31,7 @@ def make_sure_of_room(files: int, threads: int) -> None:
     except OSError:  # there is not even one for the folder, or it is not Linux
         used = 0 if not os.path.isdir("/proc/self/fd") else now
     if now != resource.RLIM_INFINITY and now - used < files:
-        raise Limited(
+        raise LimitTooLow(
             f"this process may have {now} open files, has {used}, and needs {files} more. "
             "Raise the limit: ulimit -n, or LimitNOFILE= of the service"
         )
@@ -42,7 +42,7 @@ def make_sure_of_room(files: int, threads: int) -> None:
             started.append(threading.Thread(target=done.wait))
             started[-1].start()
     except RuntimeError as error:
-        raise Limited(
+        raise LimitTooLow(
             f"this process could start {len(started) - 1} further threads, and needs {threads}. "
             "Raise the limit: ulimit -u, or TasksMax= of the service"
         ) from error

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TextIO
 
 
-class Held(RuntimeError):
+class LockHeld(RuntimeError):
     """Another process holds the lock."""
 
     exit_code = 75
@@ -29,9 +29,9 @@ def exclusive(path: Path) -> Iterator[None]:
     The file stays, unless its holder removes it.
     """
     with contextlib.ExitStack() as resources:
-        file = resources.enter_context(_locked(path))
+        file = resources.enter_context(_hold_lock(path))
         while not _is_at(path, file):  # the holder before removed the file after it was opened here
-            file = resources.enter_context(_locked(path))
+            file = resources.enter_context(_hold_lock(path))
         file.truncate(0)
         file.write(f"{os.getpid()}\n")
         file.flush()
@@ -39,7 +39,7 @@ def exclusive(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _locked(path: Path) -> Iterator[TextIO]:
+def _hold_lock(path: Path) -> Iterator[TextIO]:
     flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     with open(os.open(path, flags, 0o600), "a+", errors="replace") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -50,7 +50,7 @@ def _locked(path: Path) -> Iterator[TextIO]:
             file.seek(0)
             text = file.read(32).strip()
             pid = int(text) if text.isdecimal() else None
-            raise Held(f"{path} is held by {f'process {pid}' if pid else 'another process'}", pid) from error
+            raise LockHeld(f"{path} is held by {f'process {pid}' if pid else 'another process'}", pid) from error
         yield file
 
 

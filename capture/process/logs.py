@@ -14,8 +14,8 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from splatnode.capture.process.printable import escaped, printable_lines
-from splatnode.capture.process.terminal import beneath, in_place
+from splatnode.capture.process.printable import escape_text, sanitize_lines
+from splatnode.capture.process.terminal import beneath, is_interactive
 
 _PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 _LONGEST_VALUE = 4000  # characters; a status tells of 1000, and lists of names are longer
@@ -24,7 +24,7 @@ _LONGEST_TRACEBACK = 20_000
 
 def use_structured_lines() -> None:
     """From now on every record of every room is one line: of key=value, or on a terminal with its time and in words."""
-    if in_place():
+    if is_interactive():
         handler = logging.StreamHandler(sys.stderr)
         handler.setFormatter(TimedLines())
     else:
@@ -55,7 +55,7 @@ class _Event:
         return " ".join(f"{key}={_value(value)}" for key, value in {"event": self.what, **self.fields}.items())
 
     @property
-    def in_words(self) -> str:
+    def plain_text(self) -> str:
         """`another place: before scene-0001, now scene-0002`; fields that say nothing are left out."""
         told = [f"{key} {_short(value)}" for key, value in self.fields.items() if value not in ("", None)]
         return ": ".join(filter(None, (self.what.replace("_", " "), ", ".join(told))))
@@ -70,7 +70,7 @@ class StructuredLines(logging.Formatter):
         what = record.msg if isinstance(record.msg, _Event) else _Event("log", {"message": record.getMessage()})
         text = str(what)
         if record.exc_info:
-            text += f" exception={_quoted(self.formatException(record.exc_info)[-_LONGEST_TRACEBACK:])}"
+            text += f" exception={_quote_text(self.formatException(record.exc_info)[-_LONGEST_TRACEBACK:])}"
         if self._journal:
             return f"<{_PRIORITIES.get(record.levelno, 6)}>logger={record.name} {text}"
         return f"time={_value(self.formatTime(record))} level={record.levelname.lower()} logger={record.name} {text}"
@@ -80,10 +80,10 @@ class PlainLines(logging.Formatter):
     """The message, an event in words; lines after its first one are set in, so that none passes for a message."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return record.msg.in_words if isinstance(record.msg, _Event) else super().formatMessage(record)
+        return record.msg.plain_text if isinstance(record.msg, _Event) else super().formatMessage(record)
 
     def format(self, record: logging.LogRecord) -> str:
-        return printable_lines(super().format(record))
+        return sanitize_lines(super().format(record))
 
 
 class TimedLines(PlainLines):
@@ -98,7 +98,7 @@ def _value(value: object) -> str:
     """One word, or a quoted text on one line."""
     text = _short(value)
     plain = text and not any(letter.isspace() or letter in "\"'=" or not letter.isprintable() for letter in text)
-    return text if plain else _quoted(text)
+    return text if plain else _quote_text(text)
 
 
 def _short(value: object) -> str:
@@ -106,6 +106,6 @@ def _short(value: object) -> str:
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
 
 
-def _quoted(text: str) -> str:
+def _quote_text(text: str) -> str:
     marked = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped(marked)}"'
+    return f'"{escape_text(marked)}"'

@@ -34,12 +34,12 @@ def is_shortage(error: BaseException) -> bool:
 
     That says nothing of what it was done with: neither a file nor its sender is to blame, and another time may do.
     """
-    return _lacks_memory(error) or any(_code(each) in _OF_PROCESS for each in _with_causes(error))
+    return _lacks_memory(error) or any(_code(each) in _OF_PROCESS for each in _list_causes(error))
 
 
 def may_be_shortage(error: BaseException) -> bool:
     """As `is_shortage`, and where memory lacked for what a stranger's bytes describe: perhaps he asks for too much."""
-    return is_shortage(error) or any(map(_lacks_memory, _with_causes(error)))
+    return is_shortage(error) or any(map(_lacks_memory, _list_causes(error)))
 
 
 def raise_shortage(error: BaseException) -> None:
@@ -49,7 +49,7 @@ def raise_shortage(error: BaseException) -> None:
 
 
 def outlast(work: Callable[[], T], what: str, files_s: float = _FILES_S) -> T:
-    """What `work` returns. It is repeated while this process is short of something, which is said once.
+    """Returns what `work` does, which is repeated while this process is short of something; that is said once.
 
     `what` is waiting, in the words of a person. Raises the shortage where that lasts for too long: for want of files
     `files_s`, for want of memory less.
@@ -75,15 +75,15 @@ def _lacks_memory(error: BaseException) -> bool:
 
 
 def _lacks_files(error: BaseException) -> bool:
-    return any(_code(each) in _OF_FILES for each in _with_causes(error))
+    return any(_code(each) in _OF_FILES for each in _list_causes(error))
 
 
 def _code(error: BaseException) -> int | None:
-    """Of the system; ZeroMQ's and FFmpeg's errors have one, too."""
+    """Returns the system's error number; ZeroMQ's and FFmpeg's errors have one, too."""
     return getattr(error, "errno", None)
 
 
-def _with_causes(error: BaseException) -> list[BaseException]:
+def _list_causes(error: BaseException) -> list[BaseException]:
     found, cause = [error], error.__cause__
     while cause is not None and len(found) < _MOST_CAUSES:
         found.append(cause)

@@ -33,7 +33,7 @@ EXTRAS = {
 
 
 def remedy(module: str) -> str:
-    """What to run where `module`, or a part of it, is missing."""
+    """Says what to run where `module`, or a part of it, is missing."""
     name = module.split(".")[0]
     if name in EXTRAS:
         return f"Run: pip install 'splatnode[{EXTRAS[name]}]'"

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 log = logging.getLogger(__name__)
 
@@ -25,31 +25,31 @@ _OTHERS, _OTHERS_WRITE = 0o077, 0o022
 _NAMED = 5  # stray files
 
 
-class NotPrivate(PermissionError):
+class NotOwnerOnly(PermissionError):
     """Another user could read or replace what is kept there; the text says what to do."""
 
 
 class StrayFile(ValueError):
-    """What lies there is no file of this user, or larger than any that is written there."""
+    """A file is not this user's, or is larger than any that is written there."""
 
 
-def private_folder(folder: Path, instead: str, *, ours: bool) -> None:
+def make_owner_only_folder(folder: Path, instead: str, *, ours: bool) -> None:
     """Makes `folder`, and what is missing above it, for this user alone.
 
     Where it is there and others may read it, it is closed to them if it is `ours` by its name, and refused if it is
     any folder that somebody named. Raises OSError, and NotPrivate, which names what to set `instead`.
     """
-    with _opened_folder(folder, instead) as descriptor:
+    with _open_folder(folder, instead) as descriptor:
         found = os.fstat(descriptor)
         if found.st_uid != os.geteuid():
-            raise NotPrivate(_of_another(folder, found, instead))
+            raise NotOwnerOnly(_describe_owner(folder, found, instead))
         if ours and found.st_mode & _OTHERS and not found.st_mode & stat.S_IWOTH:
             os.fchmod(descriptor, 0o700)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
         if mode & _OTHERS:
-            raise NotPrivate(
-                f"{_shown(folder)} must be private (mode 0700), got mode {mode:04o}. If nobody else has put anything "
-                f"there, run: chmod 700 {_shown(folder)}. Or set {instead} to a folder that is not there yet"
+            raise NotOwnerOnly(
+                f"{_sanitize_path(folder)} must be private (mode 0700), got mode {mode:04o}. If nobody else has put anything "
+                f"there, run: chmod 700 {_sanitize_path(folder)}. Or set {instead} to a folder that is not there yet"
             )
 
 
@@ -63,7 +63,7 @@ def check_way(folder: Path, instead: str = "") -> None:
     _check_steps(Path.cwd() / folder, instead, is_end=True)
 
 
-def check_only_ours(folder: Path) -> None:
+def check_owner_only(folder: Path) -> None:
     """Raises NotPrivate where another user could change what lies in `folder`, OSError where it is none."""
     check_way(folder)
     with _open(os.path.realpath(folder), _FOLDER) as descriptor:
@@ -89,13 +89,13 @@ def read_own(path: Path, most_bytes: int, *, only_ours: bool = False) -> bytes:
     if only_ours:
         check_way(path.parent)
     if not stat.S_ISREG(os.lstat(path).st_mode):  # before it is opened: a device may begin to work
-        raise StrayFile(f"{_shown(path)} is no regular file")
+        raise StrayFile(f"{_sanitize_path(path)} is no regular file")
     with open(os.open(path, os.O_RDONLY | _FILE), "rb", buffering=0) as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode) or found.st_uid not in (0, os.geteuid()):
-            raise StrayFile(f"{_shown(path)} is no file of this user")
+            raise StrayFile(f"{_sanitize_path(path)} is no file of this user")
         if found.st_size > most_bytes:
-            raise StrayFile(f"{_shown(path)} has {found.st_size} bytes; at most {most_bytes} are read")
+            raise StrayFile(f"{_sanitize_path(path)} has {found.st_size} bytes; at most {most_bytes} are read")
         if only_ours:
             _check_owner(found, path)
         return _read(file.fileno(), found.st_size)
@@ -112,7 +112,7 @@ def create_own(path: Path) -> int:
     return descriptor
 
 
-def own_files(folder: Path, name: re.Pattern[str], ending: str) -> list[Path]:
+def list_own_files(folder: Path, name: re.Pattern[str], ending: str) -> list[Path]:
     """The regular files of this user in `folder` called as `name` says, in the order of the numbers they begin with.
 
     What else ends with `ending` (a copy, a folder, a link, a pipe) is left alone, and said.
@@ -126,7 +126,7 @@ def own_files(folder: Path, name: re.Pattern[str], ending: str) -> list[Path]:
             is_ours = stat.S_ISREG(found.st_mode) and found.st_uid in (0, os.geteuid())
             (ours if is_ours and name.fullmatch(entry.name) else strays).append(entry.name)
     if strays:
-        named = ", ".join(printable(each, 100) for each in sorted(strays)[:_NAMED])
+        named = ", ".join(sanitize_text(each, 100) for each in sorted(strays)[:_NAMED])
         event(log, logging.WARNING, "left_alone", folder=folder, files=len(strays), such_as=named)
     return [folder / each for each in sorted(ours, key=_number_and_name)]
 
@@ -138,14 +138,14 @@ def _number_and_name(name: str) -> tuple[int, str]:
 
 def _check_owner(found: os.stat_result, path: Path) -> None:
     if found.st_uid not in (0, os.geteuid()) or found.st_mode & _OTHERS_WRITE:
-        raise NotPrivate(
-            f"{_shown(path)} can be changed by others (mode {stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}). "
-            f"Look what lies there, then run: chown {os.geteuid()} {_shown(path)}; chmod go-w {_shown(path)}"
+        raise NotOwnerOnly(
+            f"{_sanitize_path(path)} can be changed by others (mode {stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}). "
+            f"Look what lies there, then run: chown {os.geteuid()} {_sanitize_path(path)}; chmod go-w {_sanitize_path(path)}"
         )
 
 
 @contextlib.contextmanager
-def _opened_folder(folder: Path, instead: str) -> Iterator[int]:
+def _open_folder(folder: Path, instead: str) -> Iterator[int]:
     """A descriptor of the folder, which is made where it is missing."""
     check_way(folder, instead)
     missing = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
@@ -183,9 +183,9 @@ def _check_step(each: Path, instead: str, is_end: bool) -> bool:
     bad_mode = others_write and not is_link and not is_end
     is_anothers = found.st_uid not in (0, os.geteuid())
     if is_anothers or bad_mode:
-        shown, me, mode = _shown(each), os.geteuid(), stat.S_IMODE(found.st_mode)
+        shown, me, mode = _sanitize_path(each), os.geteuid(), stat.S_IMODE(found.st_mode)
         run = [f"chown {'-h ' * is_link}{me} {shown}"] * is_anothers + [f"chmod go-w {shown}"] * bad_mode
-        raise NotPrivate(
+        raise NotOwnerOnly(
             f"{shown} must be of root or of user {me}, and nobody else may write there unless it is sticky as /tmp is, "
             f"but it is of user {found.st_uid} with mode {mode:04o}: look what lies there, then run: {'; '.join(run)}"
             f"{f'. Or set {instead} to a folder of your own' if instead else ''}"
@@ -201,9 +201,9 @@ def _check_steps(folder: Path, instead: str, is_end: bool) -> None:
             return
 
 
-def _of_another(path: Path, found: os.stat_result, instead: str) -> str:
+def _describe_owner(path: Path, found: os.stat_result, instead: str) -> str:
     return (
-        f"{_shown(path)} belongs to user {found.st_uid}, who could read and replace what is kept there. "
+        f"{_sanitize_path(path)} belongs to user {found.st_uid}, who could read and replace what is kept there. "
         f"Set {instead} to a folder of your own"
     )
 
@@ -216,5 +216,5 @@ def _read(descriptor: int, size: int) -> bytes:
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
-def _shown(path: Path) -> str:
-    return printable(path)
+def _sanitize_path(path: Path) -> str:
+    return sanitize_text(path)

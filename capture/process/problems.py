@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from splatnode.capture.process.printable import LONGEST_TEXT, printable
+from splatnode.capture.process.printable import LONGEST_TEXT, sanitize_text
 
 
 class Problems:
@@ -20,15 +20,15 @@ class Problems:
         """One more of a `kind`, such as "frames that could not be examined"; returns how many there are now."""
         with self._lock:
             total = self._totals.get(kind, 0) + 1
-            self._totals[kind], self._newest[kind] = total, printable(why)
+            self._totals[kind], self._newest[kind] = total, sanitize_text(why)
             return total
 
     def count(self, kind: str, total: int, why: str) -> None:
         """So many of a `kind` are counted elsewhere."""
         with self._lock:
-            self._totals[kind], self._newest[kind] = total, printable(why)
+            self._totals[kind], self._newest[kind] = total, sanitize_text(why)
 
-    def seen(self) -> None:
+    def mark_seen(self) -> None:
         """Somebody has seen all that was told: it is not told again."""
         with self._lock:
             self._seen = dict(self._totals)
@@ -38,9 +38,9 @@ class Problems:
         with self._lock:
             unseen = {kind: total - self._seen.get(kind, 0) for kind, total in self._totals.items()}
             told = [f"{count} {kind}, the last: {self._newest[kind]}" for kind, count in unseen.items() if count > 0]
-        return printable("; ".join(told), LONGEST_TEXT)
+        return sanitize_text("; ".join(told), LONGEST_TEXT)
 
 
-def is_said(count: int) -> bool:
+def is_logged(count: int) -> bool:
     """Whether the so manieth of a kind is logged: the 1st, 2nd, 4th, 8th, ..., so that nobody can fill the journal."""
     return count.bit_count() == 1

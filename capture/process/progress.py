@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
-from splatnode.capture.process.terminal import again, in_place, progress, say, taken_away
+from splatnode.capture.process.terminal import clear_progress, is_interactive, progress, refresh_progress, say
 
 _SHOW_EVERY_S = 0.1  # at most so often in place
 _TICK_S = 1.0  # between looks at the seconds of a step that is not heard of
@@ -20,7 +20,7 @@ Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
-class Step:
+class ProgressStep:
     """A part of the work that is under way."""
 
     doing: str  # "matching"
@@ -31,85 +31,85 @@ class Step:
     def __str__(self) -> str:
         """`matching: 3 of 10 photograph pairs`."""
         if self.of:
-            return f"{self.doing}: {self.done} of {_counted(self.of, self.what)}"
-        return f"{self.doing}: {_counted(self.done, self.what)}" if self.done else self.doing
+            return f"{self.doing}: {self.done} of {_format_count(self.of, self.what)}"
+        return f"{self.doing}: {_format_count(self.done, self.what)}" if self.done else self.doing
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it has begun, and is not known to be done."""
+        """True if the step has begun, and is not known to be done."""
         return bool(self.doing) and not self.done == self.of > 0
 
     @property
-    def announced(self) -> str:
+    def announcement(self) -> str:
         """`matching: 10 photograph pairs`, as it begins."""
-        return f"{self.doing}: {_counted(self.of, self.what)}" if self.of else self.doing
+        return f"{self.doing}: {_format_count(self.of, self.what)}" if self.of else self.doing
 
 
-Tell = Callable[[Step | str], None]  # a step each time that it has gone on, or a line about what was found
+Tell = Callable[[ProgressStep | str], None]  # a step each time that it has gone on, or a line about what was found
 
 
-def told_to_nobody(_: Step | str) -> None:
-    """Where nobody waits."""
+def ignore_progress(_: ProgressStep | str) -> None:
+    """Ignores progress, where nobody waits."""
 
 
-class Told:
+class ProgressPrinter:
     """Shows steps on a terminal in place, with how long they took and will take; elsewhere each once, as it begins."""
 
     def __init__(self) -> None:
-        self._step, self._began_s, self._shown_s = Step(""), 0.0, 0.0
+        self._step, self._began_s, self._shown_s = ProgressStep(""), 0.0, 0.0
 
-    def __call__(self, told: Step | str) -> None:
+    def __call__(self, told: ProgressStep | str) -> None:
         if isinstance(told, str):
-            self._without_what_is_left()
+            self._end_step()
             say(told)
             return
         now_s, begins = time.monotonic(), told.doing != self._step.doing
         if begins:
-            self._without_what_is_left()
+            self._end_step()
             self._began_s = now_s
         self._step = told
-        if not in_place():
+        if not is_interactive():
             if begins:
-                say(told.announced, error=True)
+                say(told.announcement, error=True)
             return
         if begins:
             progress("")
         if begins or told.done == told.of or now_s >= self._shown_s + _SHOW_EVERY_S:
             self._shown_s = now_s
-            progress(f"{told} ({times(told, now_s - self._began_s)})")
+            progress(f"{told} ({format_times(told, now_s - self._began_s)})")
 
-    def _without_what_is_left(self) -> None:
-        """What comes next ends the step that was told last, whether or not all was done."""
+    def _end_step(self) -> None:
+        """Ends the step that was reported last, whether or not all of it was done."""
         if self._step.is_under_way:
-            again(f"{self._step} ({time.monotonic() - self._began_s:.0f} s)")
+            refresh_progress(f"{self._step} ({time.monotonic() - self._began_s:.0f} s)")
 
     def tick(self) -> None:
         """Shows the seconds that have passed since, where the step that was told last is still under way."""
         step = self._step
         if step.is_under_way:
-            again(f"{step} ({times(step, time.monotonic() - self._began_s)})")
+            refresh_progress(f"{step} ({format_times(step, time.monotonic() - self._began_s)})")
 
 
 @contextlib.contextmanager
-def telling(quiet: bool = False) -> Iterator[Tell]:
+def show_progress(quiet: bool = False) -> Iterator[Tell]:
     """Who tells whoever waits what is being done, each second at least; with `quiet` nobody."""
     if quiet:
-        yield told_to_nobody
+        yield ignore_progress
         return
-    told = Told()
+    told = ProgressPrinter()
     with _each_second(told.tick):
         yield told
 
 
 @contextlib.contextmanager
-def waiting(doing: str) -> Iterator[None]:
+def show_waiting(doing: str) -> Iterator[None]:
     """Shows on a terminal what is being done, if that takes more than a second, and for as long as it does."""
     began_s = time.monotonic()
     try:
         with _each_second(lambda: progress(f"{doing} ({time.monotonic() - began_s:.0f} s)")):
             yield
     finally:
-        taken_away()
+        clear_progress()
 
 
 @contextlib.contextmanager
@@ -117,12 +117,12 @@ def _each_second(show: Callable[[], None]) -> Iterator[None]:
     """Calls `show` from a second on, where standard error is a terminal."""
     ended = threading.Event()
 
-    def go_on() -> None:
+    def repeat_show() -> None:
         while not ended.wait(_TICK_S):
             show()
 
-    thread = threading.Thread(target=go_on, daemon=True)
-    if in_place():
+    thread = threading.Thread(target=repeat_show, daemon=True)
+    if is_interactive():
         thread.start()
     try:
         yield
@@ -132,14 +132,14 @@ def _each_second(show: Callable[[], None]) -> Iterator[None]:
             thread.join()
 
 
-def counted(items: Iterable[Item], tell: Tell, doing: str, of: int, what: str) -> Iterator[Item]:
+def report_items(items: Iterable[Item], tell: Tell, doing: str, of: int, what: str) -> Iterator[Item]:
     """The items, each of which is told when it is there; `of` is 0 where nobody knows how many there will be."""
     for done, item in enumerate(items, start=1):
-        tell(Step(doing, done, of, what))
+        tell(ProgressStep(doing, done, of, what))
         yield item
 
 
-def times(step: Step, taken_s: float) -> str:
+def format_times(step: ProgressStep, taken_s: float) -> str:
     """`4 s, about 32 s left`: what is left takes as long for each as what is done took."""
     taken = f"{taken_s:.0f} s"
     if taken_s < _TELLS_S or not 0 < step.done < step.of:
@@ -149,5 +149,5 @@ def times(step: Step, taken_s: float) -> str:
     return f"{taken}, about {left} left"
 
 
-def _counted(number: int, what: str) -> str:
+def _format_count(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number != 1)}"

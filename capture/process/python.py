@@ -18,10 +18,10 @@ from splatnode.capture.process import start
 
 def command(module: str, *arguments: str) -> list[str]:
     """The command that runs a module as `python -m` does, with these arguments, in a process that is isolated."""
-    return isolated(start.__file__, json.dumps(_user_folders()), module, *arguments)
+    return make_isolated_command(start.__file__, json.dumps(_user_folders()), module, *arguments)
 
 
-def isolated(*told: str) -> list[str]:
+def make_isolated_command(*told: str) -> list[str]:
     """The command of an isolated Python that is `told` what to run, such as a script, or -m and a module.
 
     It has none of the user's places, and does not know this splatnode unless that is installed.
@@ -40,7 +40,7 @@ def place_of(module: str) -> str | None:
 
 
 def _user_folders() -> list[str]:
-    """Where this process finds modules because its user said so, but for the current folder, by whatever name."""
+    """Lists where this process finds modules because its user said so, without the current folder."""
     named = [*os.environ.get("PYTHONPATH", "").split(os.pathsep), site.getusersitepackages()]
     known = set(sys.path)
     found = dict.fromkeys(os.path.abspath(each) for each in named if os.path.isabs(each))

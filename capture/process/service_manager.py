@@ -7,7 +7,7 @@ import re
 import socket
 import time
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 WATCHDOG_SHARE = 0.25  # of the watchdog's time between two signs of life; sd_watchdog_enabled(3) asks for half at most
 
@@ -38,7 +38,7 @@ class ServiceManager:
         if self._is_ready and not self._knows_ready:
             self._knows_ready = self._notify("READY=1")
         # A line break would begin another assignment.
-        if time.monotonic() >= self._next and self._notify(f"WATCHDOG=1\nSTATUS={printable(status)}"):
+        if time.monotonic() >= self._next and self._notify(f"WATCHDOG=1\nSTATUS={sanitize_text(status)}"):
             self._next = time.monotonic() + self._every_s
 
     def stopping(self) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 _REPEATED_S = 0.5  # a signal that comes again sooner is the same one: timeout(1) sends each twice
 
 
-def on_first(numbers: tuple[signal.Signals, ...], stop: Callable[[], object]) -> None:
+def handle_first_signal(numbers: tuple[signal.Signals, ...], stop: Callable[[], object]) -> None:
     """Calls `stop` at the first of these signals; the second does what it does to any process."""
     first_s = math.inf
 

@@ -17,19 +17,19 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
-from splatnode.capture.process.printable import escaped
+from splatnode.capture.process.printable import escape_text
 
 _PRIORITY = re.compile(r"^(?=<[0-9]*>)", re.MULTILINE)
 
 
 @contextlib.contextmanager
-def shown_as_text() -> Iterator[None]:
+def sanitize_output() -> Iterator[None]:
     """Standard output and error take only text in here; the streams that were there before are there again after."""
     before = sys.stdout, sys.stderr
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # a name that a terminal cannot show costs no result
     line = _LineInPlace()
-    sys.stdout, sys.stderr = (stream and _Shown(stream, line) for stream in before)  # None where it is closed
+    sys.stdout, sys.stderr = (stream and _SanitizedStream(stream, line) for stream in before)  # None where it is closed
     try:
         yield
     finally:
@@ -39,15 +39,15 @@ def shown_as_text() -> Iterator[None]:
 
 def beneath(stream: Any) -> Any:
     """The stream itself, for lines that are safe by the way in which they are made."""
-    return stream.beneath if isinstance(stream, _Shown) else stream
+    return stream.beneath if isinstance(stream, _SanitizedStream) else stream
 
 
 def say(line: object, *, error: bool = False) -> None:
     """Prints `line` on standard output or error; a line break in it, which a name may have, is shown as an escape."""
-    print(escaped(str(line)), file=sys.stderr if error else sys.stdout, flush=True)
+    print(escape_text(str(line)), file=sys.stderr if error else sys.stdout, flush=True)
 
 
-def nobody_reads() -> bool:
+def is_output_closed() -> bool:
     """Whether standard output or error is a pipe whose reader has gone. From then on what they get is dropped."""
     closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _is_closed_pipe(stream)]
     for stream in closed:
@@ -66,9 +66,9 @@ def _is_closed_pipe(stream: Any) -> bool:
     return bool(poller.poll(0))
 
 
-def in_place() -> bool:
+def is_interactive() -> bool:
     """Whether `progress` shows anything: standard error is a terminal."""
-    return isinstance(sys.stderr, _Shown) and sys.stderr.beneath.isatty()
+    return isinstance(sys.stderr, _SanitizedStream) and sys.stderr.beneath.isatty()
 
 
 def progress(text: str) -> None:
@@ -76,19 +76,19 @@ def progress(text: str) -> None:
 
     Whatever else is printed ends it, too.
     """
-    if isinstance(sys.stderr, _Shown) and in_place():
-        sys.stderr.line.show(sys.stderr.beneath, escaped(text))
+    if isinstance(sys.stderr, _SanitizedStream) and is_interactive():
+        sys.stderr.line.show(sys.stderr.beneath, escape_text(text))
 
 
-def again(text: str) -> None:
+def refresh_progress(text: str) -> None:
     """Shows `text` in place of the last one, if that is still the last thing on the terminal."""
-    if isinstance(sys.stderr, _Shown) and in_place():
-        sys.stderr.line.show(sys.stderr.beneath, escaped(text), anew=False)
+    if isinstance(sys.stderr, _SanitizedStream) and is_interactive():
+        sys.stderr.line.show(sys.stderr.beneath, escape_text(text), anew=False)
 
 
-def taken_away() -> None:
+def clear_progress() -> None:
     """Nothing is left of what `progress` showed last, if nothing was printed since."""
-    if isinstance(sys.stderr, _Shown):
+    if isinstance(sys.stderr, _SanitizedStream):
         sys.stderr.line.clear()
 
 
@@ -117,7 +117,7 @@ class _LineInPlace:
             self._stream, self._length = stream, len(text)
 
     def clear(self) -> None:
-        """What comes next is written in its place."""
+        """Clears the line: what comes next is written in its place."""
         with self._writing:
             if self._stream is not None:
                 self._stream.write(f"\r{' ' * self._length}\r")
@@ -125,7 +125,7 @@ class _LineInPlace:
             self._stream, self._length = None, 0
 
     def end(self) -> None:
-        """What comes next begins on a line of its own."""
+        """Ends the line: what comes next begins on a line of its own."""
         with self._writing:
             if self._stream is not None:
                 self._stream.write("\n")
@@ -133,7 +133,7 @@ class _LineInPlace:
             self._stream, self._length = None, 0
 
 
-class _Shown:
+class _SanitizedStream:
     """A text stream. It has no descriptor and is no terminal: nobody may write past it, nor colour what it shows."""
 
     def __init__(self, stream: Any, line: _LineInPlace) -> None:
@@ -146,7 +146,7 @@ class _Shown:
         if text:
             self.line.end()
         with self._writing:
-            lines = "\n".join(escaped(line) for line in text.split("\n"))
+            lines = "\n".join(escape_text(line) for line in text.split("\n"))
             marked = _PRIORITY.sub(" ", lines if self._line_begins else f"\x00{lines}").removeprefix("\x00")
             if text:
                 self._line_begins = text.endswith("\n")

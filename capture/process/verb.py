@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
-from splatnode.capture.process.progress import waiting
+from splatnode.capture.process.progress import show_waiting
 
 Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
@@ -22,23 +22,23 @@ class Verb:
     run: Command
 
 
-def lazily(module: str, function: str) -> Command:
+def import_lazily(module: str, function: str) -> Command:
     """`function` of `module`, which is imported when the verb runs and not before."""
 
     def run(args: argparse.Namespace) -> int:
-        return getattr(_loaded(module), function)(args)
+        return getattr(_load_module(module), function)(args)
 
     return run
 
 
-def _loaded(module: str) -> ModuleType:
+def _load_module(module: str) -> ModuleType:
     """The module, without the collector, which would walk through all that torch brings again and again meanwhile.
 
     What is there then stays as long as the process, so that no later collection walks through it either.
     """
     gc.disable()
     try:
-        with waiting("loading splatnode"):
+        with show_waiting("loading splatnode"):
             return import_module(module)
     finally:
         gc.freeze()

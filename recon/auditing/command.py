@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 
 from splatnode.capture.lens_file import read_lens
-from splatnode.capture.process.progress import telling
+from splatnode.capture.process.progress import show_progress
 from splatnode.capture.process.terminal import say
 from splatnode.recon.auditing.audit import audit as audited
-from splatnode.recon.auditing.picture import picture
-from splatnode.recon.auditing.stations import recordings
-from splatnode.recon.auditing.table import heading, lines, summary, values
-from splatnode.recon.auditing.taken import one_each
+from splatnode.recon.auditing.picture import draw_audit
+from splatnode.recon.auditing.stations import find_recordings
+from splatnode.recon.auditing.table import format_heading, format_lines, format_summary, make_values
+from splatnode.recon.auditing.taken import load_first_frames
 from splatnode.recon.locating.photographs import check_lens
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.landmarks_file import read_landmarks
@@ -20,20 +20,20 @@ EXIT_GOOD, EXIT_NOTHING = 0, 65
 
 
 def audit(args: argparse.Namespace) -> int:
-    """What moved, then what stood still; EXIT_NOTHING where no camera could be compared."""
+    """Prints what moved, then what stood still; EXIT_NOTHING where no camera could be compared."""
     landmarks = read_landmarks(args.result)
     given = None if args.calibration is None else read_lens(args.calibration)
-    visits = recordings(args.recordings)
+    visits = find_recordings(args.recordings)
     if given is not None:
-        check_lens(given, one_each(visits))
-    say(heading(visits))
-    with telling() as tell:
+        check_lens(given, load_first_frames(visits))
+    say(format_heading(visits))
+    with show_progress() as tell:
         found = audited(landmarks, visits, given, args.fov, tell)
-    for line in lines(found):
+    for line in format_lines(found):
         say(line)
-    say(summary(found))
-    for path, content in ((args.json, json_bytes(values(found))), (args.picture, picture(found))):
+    say(format_summary(found))
+    for path, content in ((args.json, json_bytes(make_values(found))), (args.picture, draw_audit(found))):
         if path is not None:
             write_file(path, content)
             say(f"results: {path}")
-    return EXIT_GOOD if found.compared else EXIT_NOTHING
+    return EXIT_GOOD if found.comparable_cameras else EXIT_NOTHING

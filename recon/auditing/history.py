@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.auditing.motion import UNLIKELY, Motion, adjoint, motion, twist
-from splatnode.recon.auditing.sighting import Sighting
+from splatnode.recon.auditing.motion import UNLIKELY, MeasuredMotion, adjoint, measure_motion, twist
+from splatnode.recon.auditing.sighting import CameraSighting
 
 Array = npt.NDArray[np.float64]
 
@@ -20,9 +20,9 @@ class Period:
     """Recordings in which a camera stood where it was in the first of them, as far as can be told."""
 
     recordings: tuple[int, ...]  # by number, rising: those in which the camera was placed
-    sighting: Sighting  # in the first of them
-    last_motion: Motion | None  # from the first to the last of them, which tells what would have been noticed
-    came_by: Motion | None  # from the period before; None: it is the first
+    sighting: CameraSighting  # in the first of them
+    last_motion: MeasuredMotion | None  # from the first to the last of them, which tells what would have been noticed
+    came_by: MeasuredMotion | None  # from the period before; None: it is the first
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Move:
     cameras: tuple[str, ...]
 
 
-def extended(history: Sequence[Period], number: int, sighting: Sighting) -> list[Period]:
+def extend_history(history: Sequence[Period], number: int, sighting: CameraSighting) -> list[Period]:
     """The periods of one camera, once it was seen in the recording `number`, too, which is later than theirs.
 
     It is compared with the first recording of the last period: drift adds up.
@@ -42,14 +42,14 @@ def extended(history: Sequence[Period], number: int, sighting: Sighting) -> list
     if not history:
         return [Period((number,), sighting, None, None)]
     *earlier, last = history
-    since = motion(last.sighting.placed, sighting.placed)
-    if since.significant:
+    since = measure_motion(last.sighting.placed, sighting.placed)
+    if since.is_significant:
         return [*earlier, last, Period((number,), sighting, None, since)]
     return [*earlier, Period((*last.recordings, number), last.sighting, since, last.came_by)]
 
 
 @dataclass(frozen=True, eq=False)
-class _Step:
+class _PeriodChange:
     """From one period of a camera to the next."""
 
     camera: str
@@ -65,12 +65,18 @@ class _Step:
         return self.later.recordings[0]
 
 
-def moves(histories: Mapping[str, Sequence[Period]]) -> list[Move]:
+def find_moves(histories: Mapping[str, Sequence[Period]]) -> list[Move]:
     """All moves, in their order; cameras that moved alike in the world between the same recordings are one."""
-    steps = [_Step(name, earlier, later) for name, history in histories.items() for earlier, later in pairwise(history)]
-    groups: list[list[_Step]] = []
+    steps = [
+        _PeriodChange(name, earlier, later)
+        for name, history in histories.items()
+        for earlier, later in pairwise(history)
+    ]
+    groups: list[list[_PeriodChange]] = []
     for step in sorted(steps, key=lambda step: (step.before, step.after, step.camera)):
-        fitting = (group for group in groups if all(_overlap(step, each) and _alike(step, each) for each in group))
+        fitting = (
+            group for group in groups if all(_overlap(step, each) and _is_same_motion(step, each) for each in group)
+        )
         group = next(fitting, None)
         if group is None:
             groups.append([step])
@@ -84,14 +90,14 @@ def moves(histories: Mapping[str, Sequence[Period]]) -> list[Move]:
     ]
 
 
-def _overlap(one: _Step, other: _Step) -> bool:
+def _overlap(one: _PeriodChange, other: _PeriodChange) -> bool:
     """Whether both may have happened at one moment."""
     return max(one.after, other.after) < min(one.before, other.before)
 
 
-def _alike(one: _Step, other: _Step) -> bool:
+def _is_same_motion(one: _PeriodChange, other: _PeriodChange) -> bool:
     """Whether both cameras may be on one body that moved: the world's points moved alike for both."""
-    first, second = _came_by(one), _came_by(other)
+    first, second = _require_motion(one), _require_motion(other)
     T_other_one = np.linalg.inv(_pose(other)) @ _pose(one)
     expected = T_other_one @ first.T_before_after @ np.linalg.inv(T_other_one)
     covariance = adjoint(T_other_one) @ first.covariance @ adjoint(T_other_one).T + second.covariance
@@ -99,11 +105,11 @@ def _alike(one: _Step, other: _Step) -> bool:
     return bool(difference @ np.linalg.solve(covariance, difference) < UNLIKELY)
 
 
-def _came_by(step: _Step) -> Motion:
+def _require_motion(step: _PeriodChange) -> MeasuredMotion:
     assert step.later.came_by is not None  # it is not the first period
     return step.later.came_by
 
 
-def _pose(step: _Step) -> Array:
+def _pose(step: _PeriodChange) -> Array:
     """(4, 4) where the camera stood, to the world."""
     return step.earlier.sighting.placed.camera.T_world_camera

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.recon.geometry import angles_deg
 from splatnode.recon.locating.camera_model import POSE
-from splatnode.recon.locating.locate import Placed
-from splatnode.recon.locating.refinement import pose_covariance, refined
+from splatnode.recon.locating.locate import Localization
+from splatnode.recon.locating.refinement import optimize_camera, pose_covariance
 from splatnode.recon.registration.cross_product import cross_matrix
 
 Array = npt.NDArray[np.float64]
@@ -29,8 +29,8 @@ _LEAST_NOISE = 2.5e-4  # of the longer side: no shift of a feature is known bett
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """Of a camera, from one photograph to another, in the frame of the first: x right, y down, z forward."""
+class MeasuredMotion:
+    """The motion of a camera between two images, in the frame of the first: x right, y down, z forward."""
 
     T_before_after: Array  # (4, 4): p_before = T_before_after @ p_after
     covariance: Array  # (6, 6) of a small motion in that frame: shift (result's unit), then turn (radians)
@@ -38,12 +38,12 @@ class Motion:
 
     @property
     def degrees(self) -> float:
-        """By how much it turned."""
+        """The angle of the rotation."""
         return float(angles_deg(self.T_before_after[None, :3, :3], np.eye(3)[None])[0])
 
     @property
     def distance(self) -> float:
-        """By how much it was shifted, in the result's unit."""
+        """The length of the shift, in the result's unit."""
         return float(np.linalg.norm(self.T_before_after[:3, 3]))
 
     @property
@@ -56,7 +56,7 @@ class Motion:
         """The standard deviation of the shift in the direction in which it is known worst."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
-    def in_words(self, unit: float, metric: bool) -> str:
+    def format_motion(self, unit: float, metric: bool) -> str:
         """How far, with two standard deviations: in centimetres if the result is `metric`, else over its `unit`."""
         turn = f"{self.degrees:.2g} degrees (± {2 * self.degrees_sigma:.1g})"
         distance, sigma = self.distance, 2 * self.distance_sigma
@@ -65,8 +65,8 @@ class Motion:
         return f"{turn} and {100 * distance / unit:.2g} % of the distance (± {100 * sigma / unit:.1g})"
 
     @property
-    def significant(self) -> bool:
-        """Whether it is more than chance."""
+    def is_significant(self) -> bool:
+        """Whether the motion exceeds chance."""
         step = twist(self.T_before_after)
         return float(step @ np.linalg.solve(self.covariance, step)) > UNLIKELY
 
@@ -83,31 +83,31 @@ class Motion:
         return float(np.sqrt(UNLIKELY / np.linalg.eigvalsh(information)[0]))
 
 
-def motion(before: Placed, after: Placed) -> Motion:
+def measure_motion(before: Localization, after: Localization) -> MeasuredMotion:
     """How the camera of the photograph `before` moved until `after`; both are of one camera.
 
     Where it has another lens since, as once it zoomed, what each photograph says by itself is compared.
     """
-    own, other = _common(before, after)
+    own, other = _find_common(before, after)
     T = np.linalg.inv(before.camera.T_world_camera) @ after.camera.T_world_camera
-    apart = before.located.covariance + _carried(after.located.covariance, T)
-    if len(own) >= MIN_COMMON and before.size == after.size and _same_lens(before, after):
-        measured = _measured(before, own, after.seen.pixels[other] - before.seen.pixels[own])
+    apart = before.located.covariance + _rotate_covariance(after.located.covariance, T)
+    if len(own) >= MIN_COMMON and before.size == after.size and _has_same_lens(before, after):
+        measured = _fit_motion(before, own, after.seen.pixels[other] - before.seen.pixels[own])
         if measured is not None:
             depth = float(np.median(before.camera.project(before.seen.points[own])[1]))
-            otherwise = _seen_otherwise(measured, min(depth, before.spread))
+            otherwise = _compute_unshared_error(measured, min(depth, before.spread))
             return replace(measured, covariance=measured.covariance + otherwise**2 * apart)
-    return Motion(T, apart, 0)
+    return MeasuredMotion(T, apart, 0)
 
 
-def _same_lens(before: Placed, after: Placed) -> bool:
+def _has_same_lens(before: Localization, after: Localization) -> bool:
     """Whether the focal lengths differ by no more than their bounds allow."""
     first, second = (np.diag(each.located.K)[:2] for each in (before, after))
     bounds = [math.log1p(each.located.claim.focal_percent / 100.0) for each in (before, after)]
     return bool(np.abs(np.log(second / first)).max() <= math.hypot(*bounds))
 
 
-def _seen_otherwise(motion: Motion, reach: float) -> float:
+def _compute_unshared_error(motion: MeasuredMotion, reach: float) -> float:
     """The share of what is wrong with the scene that is not the same for both cameras, in [0, 1].
 
     A scene that is bent turns its cameras against each other, those that are farther apart by more: it is all for two
@@ -119,26 +119,26 @@ def _seen_otherwise(motion: Motion, reach: float) -> float:
     return min(1.0, motion.distance / reach + np.radians(motion.degrees))
 
 
-def _common(before: Placed, after: Placed) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _find_common(before: Localization, after: Localization) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """The places of the landmarks that both show, among those that each shows."""
     _, own, other = np.intersect1d(before.seen.landmark_of, after.seen.landmark_of, return_indices=True)
     return own, other
 
 
-def _measured(before: Placed, own: npt.NDArray[np.int64], shifts: Array) -> Motion | None:
+def _fit_motion(before: Localization, own: npt.NDArray[np.int64], shifts: Array) -> MeasuredMotion | None:
     """The motion that explains the `shifts` (M, 2) of the landmarks in the picture; None where they do not tell it.
 
     The landmarks, and the lens, count as exact: what is wrong with them is so in both photographs.
     """
-    start, seen = before.camera, before.seen.of(own)
+    start, seen = before.camera, before.seen.select(own)
     pixels = start.project(seen.points)[0] + shifts
     exact = replace(seen, pixels=pixels, covariances=np.zeros_like(seen.covariances))
     lens = replace(start.lens, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0, log_aspect_sigma=0.0)
-    fit = refined(start, lens, exact, _LEAST_NOISE * max(before.size))
+    fit = optimize_camera(start, lens, exact, _LEAST_NOISE * max(before.size))
     if not np.isfinite(fit.covariance).all():
         return None
     T = np.linalg.inv(start.T_world_camera) @ fit.camera.T_world_camera
-    return Motion(T, _carried(pose_covariance(fit.camera, fit.covariance), T), len(own))
+    return MeasuredMotion(T, _rotate_covariance(pose_covariance(fit.camera, fit.covariance), T), len(own))
 
 
 def adjoint(T: Array) -> Array:
@@ -154,7 +154,7 @@ def twist(T: Array) -> Array:
     return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_rotvec()])
 
 
-def _carried(covariance: Array, T_before_after: Array) -> Array:
+def _rotate_covariance(covariance: Array, T_before_after: Array) -> Array:
     """The covariance (6, 6) of a small motion in the frame of the second photograph, along the axes of the first."""
     turn = np.kron(np.eye(2), T_before_after[:3, :3])
     return turn @ covariance @ turn.T

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 
 from splatnode.recon.auditing.audit import Audit
-from splatnode.recon.auditing.table import amount
+from splatnode.recon.auditing.table import format_amount
 
 _CELL, _GAP, _LEFT, _TOP, _LINE = 26, 2, 170, 120, 30  # pixels
 _WORDS = 400  # pixels beside the cells, for what a camera did
@@ -15,7 +15,7 @@ _NOT_SEEN = "#dddddd"
 _LONGEST = 22  # characters of a name that are written
 
 
-def picture(audit: Audit) -> bytes:
+def draw_audit(audit: Audit) -> bytes:
     """The picture; what a cell stands for is told where the mouse rests on it."""
     cameras = sorted({*audit.periods, *audit.not_seen})
     right = _LEFT + len(audit.recordings) * _CELL + 10
@@ -29,24 +29,26 @@ def picture(audit: Audit) -> bytes:
     every = max(1, -(-len(audit.recordings) // _MOST_NAMES))
     for number in range(0, len(audit.recordings), every):
         x = _LEFT + number * _CELL + _CELL / 2
-        name = _text(audit.recordings[number])
+        name = _escape_name(audit.recordings[number])
         parts.append(f'<text transform="translate({x + 4},{_TOP - 8}) rotate(-60)">{name}</text>')
     for row, camera in enumerate(cameras):
         y = _TOP + row * _LINE
-        parts.append(f'<text x="{_LEFT - 8}" y="{y + 18}" text-anchor="end">{_text(camera)}</text>')
+        parts.append(f'<text x="{_LEFT - 8}" y="{y + 18}" text-anchor="end">{_escape_name(camera)}</text>')
         not_seen = {number: f"{each.code}: {each.message}" for number, each in audit.not_seen.get(camera, {}).items()}
         for number, told in {**audit.unreadable, **not_seen}.items():
-            parts.append(_cell(number, y, _NOT_SEEN, told))
+            parts.append(_draw_cell(number, y, _NOT_SEEN, told))
         for index, period in enumerate(audit.periods.get(camera, ())):
-            told = "where it stood first" if period.came_by is None else f"moved by {amount(audit, period.came_by)}"
+            told = (
+                "where it stood first" if period.came_by is None else f"moved by {format_amount(audit, period.came_by)}"
+            )
             for number in period.recordings:
-                parts.append(_cell(number, y, _COLOURS[index % len(_COLOURS)], told))
+                parts.append(_draw_cell(number, y, _COLOURS[index % len(_COLOURS)], told))
             if period.came_by is not None:
                 x = _LEFT + period.recordings[0] * _CELL - _GAP / 2
                 parts.append(
                     f'<line x1="{x}" x2="{x}" y1="{y - 2}" y2="{y + _CELL + 2}" stroke="black" stroke-width="3"/>'
                 )
-        did = [amount(audit, each.came_by) for each in audit.periods.get(camera, ()) if each.came_by is not None]
+        did = [format_amount(audit, each.came_by) for each in audit.periods.get(camera, ()) if each.came_by is not None]
         words = did[0] if len(did) == 1 else f"{len(did)} moves" if did else ""
         parts.append(f'<text x="{right}" y="{y + 18}">{html.escape(words)}</text>')
     y = _TOP + len(cameras) * _LINE + 28
@@ -55,11 +57,11 @@ def picture(audit: Audit) -> bytes:
     return "\n".join([*parts, "</svg>\n"]).encode()
 
 
-def _cell(number: int, y: float, colour: str, told: str) -> str:
+def _draw_cell(number: int, y: float, colour: str, told: str) -> str:
     x = _LEFT + number * _CELL
     rectangle = f'<rect x="{x}" y="{y}" width="{_CELL - _GAP}" height="{_CELL}" fill="{colour}">'
     return f"{rectangle}<title>{html.escape(told)}</title></rect>"
 
 
-def _text(name: str) -> str:
+def _escape_name(name: str) -> str:
     return html.escape(name if len(name) <= _LONGEST else f"...{name[3 - _LONGEST :]}")

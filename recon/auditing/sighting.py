@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.auditing.motion import motion
-from splatnode.recon.locating.locate import Placed, described, placed
-from splatnode.recon.locating.photographs import assumed_lens
+from splatnode.recon.auditing.motion import measure_motion
+from splatnode.recon.locating.locate import Localization, localize_with_inliers, prepare_query_image
+from splatnode.recon.locating.photographs import choose_intrinsics
 from splatnode.recon.result.landmarks import Landmarks
 
 MOVING = "MOVING"  # the code of a camera that did not stand still
@@ -16,15 +16,15 @@ UNREADABLE = "UNREADABLE"
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class CameraSighting:
     """A camera that stood still."""
 
     photograph: str
-    placed: Placed
+    placed: Localization
 
 
 @dataclass(frozen=True)
-class NotSeen:
+class SightingFailure:
     """Why it is not known where a camera stood."""
 
     photograph: str
@@ -32,10 +32,10 @@ class NotSeen:
     message: str
 
 
-def sight(
+def localize_camera(
     landmarks: Landmarks, frames: Iterable[Frame | DroppedFrame], fov_deg: float | None = None
-) -> Sighting | NotSeen:
-    """Where the camera that took these photographs of one recording stood; there is at least one.
+) -> CameraSighting | SightingFailure:
+    """Localizes the camera that took these images of one recording; there is at least one.
 
     `fov_deg` is its angle of view across the longer side, in degrees. Of several photographs all that can be placed
     must be of one place.
@@ -43,21 +43,21 @@ def sight(
     first, problem = None, None
     for frame in frames:
         if isinstance(frame, DroppedFrame):
-            problem = problem or NotSeen(frame.name, UNREADABLE, frame.reason)
+            problem = problem or SightingFailure(frame.name, UNREADABLE, frame.reason)
             continue
         try:
-            photograph = described(frame.image, assumed_lens(frame, fov_deg), name=frame.name)
+            photograph = prepare_query_image(frame.image, choose_intrinsics(frame, fov_deg), name=frame.name)
         except ValueError as error:  # of its lens, which nothing can undo
-            problem = problem or NotSeen(frame.name, UNREADABLE, str(error))
+            problem = problem or SightingFailure(frame.name, UNREADABLE, str(error))
             continue
-        found = placed(landmarks, photograph)
-        if not isinstance(found, Placed):
-            problem = problem or NotSeen(frame.name, found.code.value, found.message)
+        found = localize_with_inliers(landmarks, photograph)
+        if not isinstance(found, Localization):
+            problem = problem or SightingFailure(frame.name, found.code.value, found.message)
         elif first is None:
-            first = Sighting(frame.name, found)
-        elif (since := motion(first.placed, found)).significant:
-            told = f"since {first.photograph} it moved by {since.in_words(landmarks.unit, landmarks.metric)}"
-            return NotSeen(
+            first = CameraSighting(frame.name, found)
+        elif (since := measure_motion(first.placed, found)).is_significant:
+            told = f"since {first.photograph} it moved by {since.format_motion(landmarks.unit, landmarks.metric)}"
+            return SightingFailure(
                 frame.name, MOVING, f"{told}: only a camera that stands still in a recording can be compared"
             )
     if first is not None:

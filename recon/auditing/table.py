@@ -7,15 +7,15 @@ from collections.abc import Iterator, Sequence
 
 from splatnode.recon.auditing.audit import Audit
 from splatnode.recon.auditing.history import Period
-from splatnode.recon.auditing.motion import Motion
-from splatnode.recon.auditing.sighting import NotSeen
-from splatnode.recon.auditing.stations import Recording
+from splatnode.recon.auditing.motion import MeasuredMotion
+from splatnode.recon.auditing.sighting import SightingFailure
+from splatnode.recon.auditing.stations import StationRecording
 
 _MOST_LINES = 3  # of one camera for one reason; of more recordings the first is told, and how many there are
 _MOST_NAMES = 8  # of cameras, in one line
 
 
-def heading(recordings: Sequence[Recording]) -> str:
+def format_heading(recordings: Sequence[StationRecording]) -> str:
     """How what was named is read: which recordings, and which cameras."""
     cameras = sorted({camera for recording in recordings for camera in recording.cameras})
     first, last, count = recordings[0].name, recordings[-1].name, len(recordings)
@@ -24,8 +24,8 @@ def heading(recordings: Sequence[Recording]) -> str:
     return f"{visits}, of {len(cameras)} camera{'s' if len(cameras) != 1 else ''}{named and ': '}{named}"
 
 
-def lines(audit: Audit) -> Iterator[str]:
-    """What moved first, then what stood still, then what is not known."""
+def format_lines(audit: Audit) -> Iterator[str]:
+    """Formats lines: first what moved, then what stood still, then what is not known."""
     for move in audit.moves:
         when = f"moved between {audit.recordings[move.after]} and {audit.recordings[move.before]}"
         if len(move.cameras) > 1:
@@ -36,18 +36,18 @@ def lines(audit: Audit) -> Iterator[str]:
         for camera in move.cameras:
             later = next(each for each in audit.periods[camera][1:] if each.recordings[0] >= move.before)
             assert later.came_by is not None  # it is not the first period
-            yield f"{camera} {when} by {amount(audit, later.came_by)}"
+            yield f"{camera} {when} by {format_amount(audit, later.came_by)}"
     for camera, history in audit.periods.items():
         if len(history) == 1:
-            yield f"{camera} {_stood(audit, history[0])}"
+            yield f"{camera} {_format_still_period(audit, history[0])}"
     for camera in sorted(audit.not_seen):
-        yield from _not_compared(audit, camera)
+        yield from _format_not_compared(audit, camera)
     for number, reason in audit.unreadable.items():
         yield f"{audit.recordings[number]} was not compared: {reason}"
 
 
-def _not_compared(audit: Audit, camera: str) -> Iterator[str]:
-    by_code: defaultdict[str, list[tuple[int, NotSeen]]] = defaultdict(list)
+def _format_not_compared(audit: Audit, camera: str) -> Iterator[str]:
+    by_code: defaultdict[str, list[tuple[int, SightingFailure]]] = defaultdict(list)
     for number, problem in sorted(audit.not_seen[camera].items()):
         by_code[problem.code].append((number, problem))
     for code, problems in by_code.items():
@@ -58,12 +58,12 @@ def _not_compared(audit: Audit, camera: str) -> Iterator[str]:
             yield f"{camera} was not compared in {name}: {code}: {problem.message}"
 
 
-def amount(audit: Audit, motion: Motion) -> str:
+def format_amount(audit: Audit, motion: MeasuredMotion) -> str:
     """How far, with two standard deviations."""
-    return motion.in_words(audit.unit, audit.metric)
+    return motion.format_motion(audit.unit, audit.metric)
 
 
-def _stood(audit: Audit, period: Period) -> str:
+def _format_still_period(audit: Audit, period: Period) -> str:
     if period.last_motion is None:
         return f"was placed in {audit.recordings[period.recordings[0]]} alone: there is nothing to compare it with"
     noticed = period.last_motion
@@ -75,7 +75,7 @@ def _stood(audit: Audit, period: Period) -> str:
     )
 
 
-def values(audit: Audit) -> dict[str, object]:
+def make_values(audit: Audit) -> dict[str, object]:
     """For a file: poses are T_world_camera (4, 4) in the world of the result, turns in degrees, lengths in its unit."""
     return {
         "scale": "metric" if audit.metric else "relative",
@@ -122,7 +122,7 @@ def _period(audit: Audit, period: Period) -> dict[str, object]:
     }
 
 
-def _motion(motion: Motion) -> dict[str, object]:
+def _motion(motion: MeasuredMotion) -> dict[str, object]:
     return {
         "T_before_after": motion.T_before_after.tolist(),
         "covariance": motion.covariance.tolist(),
@@ -132,10 +132,10 @@ def _motion(motion: Motion) -> dict[str, object]:
     }
 
 
-def summary(audit: Audit) -> str:
+def format_summary(audit: Audit) -> str:
     """How many moved, in one line."""
     cameras, moved = {*audit.periods, *audit.not_seen}, {name for move in audit.moves for name in move.cameras}
     return (
         f"{len(moved)} of {len(cameras)} cameras moved in {len(audit.recordings)} recordings; "
-        f"{len(audit.compared)} could be compared"
+        f"{len(audit.comparable_cameras)} could be compared"
     )

@@ -9,42 +9,42 @@ from pathlib import Path
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_lens import seen_through
+from splatnode.capture.given_lens import assign_lens
 from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.packages import remedy
-from splatnode.capture.process.printable import printable, printable_name
-from splatnode.recon.auditing.stations import Film, Photographs, Recording
-from splatnode.recon.locating.photographs import photographs
+from splatnode.capture.process.printable import sanitize_name, sanitize_text
+from splatnode.recon.auditing.stations import Film, ImageFiles, StationRecording
+from splatnode.recon.locating.photographs import stream_query_frames
 
 _MOST_HELD = 9  # photographs in memory, evenly spread over what was read of a film so far
 
 
-def taken(pictures: Photographs | Film, given: Intrinsics | None) -> list[Frame | DroppedFrame]:
+def load_sample_frames(pictures: ImageFiles | Film, given: Intrinsics | None) -> list[Frame | DroppedFrame]:
     """The photographs; of a film the first, one from about the middle and the last. `given` is their lens.
 
     At least one: where nothing can be read, it is a dropped frame that says why.
     """
-    if isinstance(pictures, Photographs):
-        return _readable(photographs(pictures.paths, given), pictures.paths[0])
-    frames = _readable(_few(_stream(pictures.path)), pictures.path)
-    return frames if given is None else [seen_through(frame, given) for frame in frames]
+    if isinstance(pictures, ImageFiles):
+        return _read_all(stream_query_frames(pictures.paths, given), pictures.paths[0])
+    frames = _read_all(_sample_frames(_stream(pictures.path)), pictures.path)
+    return frames if given is None else [assign_lens(frame, given) for frame in frames]
 
 
-def one_each(recordings: Iterable[Recording]) -> Iterator[Frame | DroppedFrame]:
+def load_first_frames(recordings: Iterable[StationRecording]) -> Iterator[Frame | DroppedFrame]:
     """The first photograph that can be read of each camera in each recording; where there is none, why."""
     for pictures in (each for recording in recordings for each in recording.cameras.values()):
-        if isinstance(pictures, Photographs):
-            frames, path = photographs(pictures.paths, None), pictures.paths[0]
+        if isinstance(pictures, ImageFiles):
+            frames, path = stream_query_frames(pictures.paths, None), pictures.paths[0]
         else:
             frames, path = _stream(pictures.path), pictures.path
-        yield from _readable(islice((frame for frame in frames if isinstance(frame, Frame)), 1), path)
+        yield from _read_all(islice((frame for frame in frames if isinstance(frame, Frame)), 1), path)
 
 
 def _stream(path: Path) -> Iterator[Frame | DroppedFrame]:
     yield from film.stream(path) if film.is_film(path) else folder.stream(folder.Config(folder=path))
 
 
-def _readable(frames: Iterator[Frame | DroppedFrame], path: Path) -> list[Frame | DroppedFrame]:
+def _read_all(frames: Iterator[Frame | DroppedFrame], path: Path) -> list[Frame | DroppedFrame]:
     """All of them; in place of what cannot be read from `path`, why."""
     found: list[Frame | DroppedFrame] = []
     try:
@@ -56,10 +56,10 @@ def _readable(frames: Iterator[Frame | DroppedFrame], path: Path) -> list[Frame 
         reason = str(error)
     else:
         reason = "it holds no photographs"
-    return found or [DroppedFrame(printable_name(path.name), printable(reason))]
+    return found or [DroppedFrame(sanitize_name(path.name), sanitize_text(reason))]
 
 
-def _few(frames: Iterator[Frame | DroppedFrame]) -> Iterator[Frame | DroppedFrame]:
+def _sample_frames(frames: Iterator[Frame | DroppedFrame]) -> Iterator[Frame | DroppedFrame]:
     """The first, one within an eighth of the middle, and the last; what cannot be used only where there is no other.
 
     However many there are, few are in memory: when these are too many, every second one is given up, and from then on

@@ -8,9 +8,9 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, outlast
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import record_in
-from splatnode.recon.batch.sources import REPORT, Recording
+from splatnode.recon.batch.sources import REPORT, BatchRecording
 from splatnode.recon.jobs.child import End
 from splatnode.recon.result.export.limits import read_json_file
 
@@ -40,7 +40,7 @@ class Outcome(msgspec.Struct, frozen=True):
     ended_at: float  # seconds since 1970
 
     @property
-    def failed(self) -> bool:
+    def has_failed(self) -> bool:
         return self.verdict == FAILED
 
 
@@ -57,7 +57,7 @@ class _Claim(msgspec.Struct, frozen=True):
 
 
 class _Report(msgspec.Struct, frozen=True):
-    """What of report.json goes into the table."""
+    """The part of report.json that goes into the table."""
 
     verdict: _Verdict
     bounds: _Claim | None = None
@@ -68,20 +68,22 @@ class _Report(msgspec.Struct, frozen=True):
     peak_rss_mb: float | None = None
 
 
-def outcome(recording: Recording, folder: Path, end: End) -> Outcome:
+def read_outcome(recording: BatchRecording, folder: Path, end: End) -> Outcome:
     """The row of a recording whose process has ended and has left its result in `folder`, or none."""
     if end.exit_code not in _WITH_ANSWER:
-        return without_answer(recording, end, end.reason or f"ended with exit code {end.exit_code} and said nothing")
+        return make_failed_outcome(
+            recording, end, end.reason or f"ended with exit code {end.exit_code} and said nothing"
+        )
     try:
         report = outlast(lambda: record_in(read_json_file(folder / REPORT), _Report), f"{recording.name}'s report")
     except (OSError, ValueError) as error:  # a decoder's errors are ValueErrors
-        return without_answer(recording, end, f"ended with exit code {end.exit_code}, but {REPORT}: {error}")
+        return make_failed_outcome(recording, end, f"ended with exit code {end.exit_code}, but {REPORT}: {error}")
     claim = report.bounds
     return Outcome(
-        **msgspec.structs.asdict(without_answer(recording, end, ""))
+        **msgspec.structs.asdict(make_failed_outcome(recording, end, ""))
         | {
-            "verdict": printable(report.verdict.code, 100),
-            "message": printable(report.verdict.message),
+            "verdict": sanitize_text(report.verdict.code, 100),
+            "message": sanitize_text(report.verdict.message),
             "published": report.verdict.publishable,
             "photographs": None if report.frames_used is None else len(report.frames_used),
             "left_out": None if report.frames_dropped is None else len(report.frames_dropped),
@@ -95,13 +97,13 @@ def outcome(recording: Recording, folder: Path, end: End) -> Outcome:
     )
 
 
-def without_answer(recording: Recording, end: End, reason: str) -> Outcome:
+def make_failed_outcome(recording: BatchRecording, end: End, reason: str) -> Outcome:
     """The row of a recording that failed, or the beginning of another."""
     return Outcome(
         name=recording.name,
         source=recording.source,
         verdict=FAILED,
-        message=printable(_with_option(reason)),
+        message=sanitize_text(_add_memory_advice(reason)),
         published=False,
         photographs=None,
         left_out=None,
@@ -117,7 +119,7 @@ def without_answer(recording: Recording, end: End, reason: str) -> Outcome:
     )
 
 
-def _with_option(reason: str) -> str:
+def _add_memory_advice(reason: str) -> str:
     """The reason, with what a batch can do about it."""
     if any(said in reason for said in _SHORT_OF_MEMORY):
         return f"{reason}; in a batch fewer --cores, or --max-memory, leave more of it"

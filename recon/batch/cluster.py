@@ -12,13 +12,13 @@ from typing import Any
 
 import msgspec
 
-from splatnode.recon.batch.answer import Outcome, without_answer
+from splatnode.recon.batch.answer import Outcome, make_failed_outcome
 from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import NOT_RUN
 
 
-def run_all(todo: Iterable[Recording], job: Job, most: int | None) -> Generator[Outcome, None, None]:
+def run_all(todo: Iterable[BatchRecording], job: Job, most: int | None) -> Generator[Outcome, None, None]:
     """The outcomes as they come, of at most `most` recordings at a time; None: of as many as the cluster has cores.
 
     A recording whose worker is lost is repeated elsewhere; after a few times it has failed. Raises ModuleNotFoundError
@@ -27,12 +27,12 @@ def run_all(todo: Iterable[Recording], job: Job, most: int | None) -> Generator[
     from splatnode.recon.jobs import ray  # takes a second, and is an extra
 
     run = partial(run_recording, job=job)
-    for recording, found in ray.mapped(partial(next, iter(todo), None), run, most, job.limits.memory_mb):
-        yield without_answer(recording, NOT_RUN, found.reason) if isinstance(found, ray.Lost) else found
+    for recording, found in ray.map_on_cluster(partial(next, iter(todo), None), run, most, job.limits.memory_mb):
+        yield make_failed_outcome(recording, NOT_RUN, found.reason) if isinstance(found, ray.LostCall) else found
 
 
 def shortage(max_memory_mb: float | None) -> str | None:
-    """What to say where no machine of the cluster has so much memory for a recording; None: one has.
+    """Returns a message if no machine of the cluster has so much memory for a recording; None if one has.
 
     Ray, which must have been joined, would wait for such a machine without a word.
     """
@@ -50,4 +50,4 @@ def shortage(max_memory_mb: float | None) -> str | None:
 
 def run_row(row: dict[str, Any], job: Job) -> dict[str, Any]:
     """A row of a dataset, which has name and source, with what came of it, column by column."""
-    return {**row, **msgspec.structs.asdict(run_recording(Recording(row["name"], row["source"]), job))}
+    return {**row, **msgspec.structs.asdict(run_recording(BatchRecording(row["name"], row["source"]), job))}

@@ -14,9 +14,9 @@ from pathlib import Path
 from splatnode.capture.process import python
 from splatnode.capture.process.folders import LOCK
 from splatnode.capture.process.packages import remedy
-from splatnode.capture.process.printable import printable
-from splatnode.capture.process.progress import Step, Tell, telling, times, waiting
-from splatnode.capture.process.terminal import in_place, say, taken_away
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.progress import ProgressStep, Tell, format_times, show_progress, show_waiting
+from splatnode.capture.process.terminal import clear_progress, is_interactive, say
 from splatnode.recon.batch import cluster
 from splatnode.recon.batch.answer import FAILED, Outcome
 from splatnode.recon.batch.engine import Plan, Work, run_all
@@ -24,16 +24,16 @@ from splatnode.recon.batch.keeping import remove_leftovers
 from splatnode.recon.batch.ledger import LEDGER, Ledger
 from splatnode.recon.batch.page import PAGE, write_page
 from splatnode.recon.batch.remote import Job
-from splatnode.recon.batch.sources import Recording, recordings
+from splatnode.recon.batch.sources import BatchRecording, recordings
 from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.batch.write_back import write_back
 from splatnode.recon.jobs.child import Limits
 from splatnode.recon.jobs.cores import chosen_cores
 from splatnode.recon.jobs.version import own_version
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.folder import hold_result_folder
 
-Run = Callable[[Sequence[Recording]], Iterator[Outcome]]  # the outcomes as they come
+Run = Callable[[Sequence[BatchRecording]], Iterator[Outcome]]  # the outcomes as they come
 
 EXIT_GOOD, EXIT_SOME_FAILED = 0, 65
 _OWN_NAMES = frozenset((LEDGER, CSV, PARQUET, PAGE))
@@ -41,7 +41,7 @@ _OWN_NAMES = frozenset((LEDGER, CSV, PARQUET, PAGE))
 
 def batch(args: argparse.Namespace) -> int:
     """Reconstructs every recording of the sources; EXIT_GOOD where each has an answer, be it that there is no scene."""
-    with waiting("looking for recordings"):
+    with show_waiting("looking for recordings"):
         found = recordings(args.sources, args.out, _OWN_NAMES)
     options = replay_options(args)
     if args.in_place and not args.write_back:
@@ -53,31 +53,31 @@ def batch(args: argparse.Namespace) -> int:
     return run_batch(args, found, partial(replay, tuple(options)), ["splatnode", "replay", *options])
 
 
-def replay(options: Sequence[str], recording: Recording, folder: Path) -> Sequence[str]:
+def replay(options: Sequence[str], recording: BatchRecording, folder: Path) -> Sequence[str]:
     """The command that reconstructs a recording, on whatever machine this is called."""
     return python.command("splatnode", "replay", recording.source, "--out", str(folder), *options)
 
 
-def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told_command: list[str]) -> int:
+def run_batch(args: argparse.Namespace, found: list[BatchRecording], work: Work, told_command: list[str]) -> int:
     """Runs `work` for the recordings that have not come to an end, then writes the tables of all.
 
     `args` has out, resume, retry, cores, max_memory, timeout_s, write_back, in_place, ray, results and json;
     `told_command` is what the ledger says of it.
     Raises ValueError, OtherBatch, OSError.
     """
-    running = _here(args, work) if args.ray is None else _on_ray(args, work)
-    with result_folder(args.out):
+    running = _run_locally(args, work) if args.ray is None else _run_on_ray(args, work)
+    with hold_result_folder(args.out):
         _check_new(args.out, args.resume or args.retry)
-        with Ledger(args.out, told_command) as ledger, running as run, telling(quiet=args.json) as tell:
+        with Ledger(args.out, told_command) as ledger, running as run, show_progress(quiet=args.json) as tell:
             run_again = {None, FAILED} if args.retry else {None}
             todo = [recording for recording in found if ledger.verdict(recording) in run_again]
             if len(todo) < len(found):
                 tell(f"{len(found) - len(todo)} of {len(found)} recordings came to an end before")
             for told in _run(todo, run, ledger, tell):
                 if not args.json:
-                    taken_away()
+                    clear_progress()
                     say(told)
-            tell(Step("writing the tables"))
+            tell(ProgressStep("writing the tables"))
             counts = _write_tables(args.out, found, ledger, tell)
             all_written = not args.write_back or _write_back(args, ledger.rows(found), tell)
     if args.json:
@@ -89,20 +89,20 @@ def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told
 
 
 @contextlib.contextmanager
-def _here(args: argparse.Namespace, work: Work) -> Iterator[Run]:
+def _run_locally(args: argparse.Namespace, work: Work) -> Iterator[Run]:
     plan = Plan(args.out, chosen_cores(args.cores), Limits(args.max_memory, args.timeout_s))
     yield lambda todo: run_all(todo, work, plan)
 
 
 @contextlib.contextmanager
-def _on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
+def _run_on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
     """Raises NoCluster; ValueError where a Ray of this machine has too little memory; ModuleNotFoundError."""
     from splatnode.recon.jobs import ray  # takes a second, and is an extra
 
     results = args.results or str(args.out.resolve())
     job = Job(work, results, Limits(args.max_memory, args.timeout_s), own_version())
     try:
-        with ray.joined(args.ray, None if args.ray else len(chosen_cores(args.cores))):
+        with ray.join_cluster(args.ray, None if args.ray else len(chosen_cores(args.cores))):
             remove_leftovers(args.out)
             if (why := cluster.shortage(args.max_memory)) is not None and not args.ray:
                 raise ValueError(why)
@@ -113,22 +113,22 @@ def _on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
         remove_leftovers(args.out)
 
 
-def _run(todo: Sequence[Recording], run: Run, ledger: Ledger, tell: Tell) -> Iterator[str]:
+def _run(todo: Sequence[BatchRecording], run: Run, ledger: Ledger, tell: Tell) -> Iterator[str]:
     """A line for each recording that has come to its end and has been written down."""
     doing, began_s = "reconstructing", time.monotonic()
     if todo:
-        tell(Step(doing, 0, len(todo), "recording"))
+        tell(ProgressStep(doing, 0, len(todo), "recording"))
     for done, found in enumerate(run(todo), start=1):
         ledger.append(found)
-        step = Step(doing, done, len(todo), "recording")
-        left = "" if in_place() else f"{done} of {len(todo)} ({times(step, time.monotonic() - began_s)}): "
-        yield f"{left}{found.name}: {found.verdict}, {found.seconds:.1f} s{f': {found.message}' * found.failed}"
+        step = ProgressStep(doing, done, len(todo), "recording")
+        left = "" if is_interactive() else f"{done} of {len(todo)} ({format_times(step, time.monotonic() - began_s)}): "
+        yield f"{left}{found.name}: {found.verdict}, {found.seconds:.1f} s{f': {found.message}' * found.has_failed}"
         tell(step)
 
 
 def _write_back(args: argparse.Namespace, rows: Iterator[Outcome], tell: Tell) -> bool:
     """Whether the cameras lie in or beside all data sets and logs that they are of."""
-    tell(Step("writing the cameras back"))
+    tell(ProgressStep("writing the cameras back"))
     written = list(write_back(rows, args.out, args.in_place))
     for each in written:
         tell(each.sentence)
@@ -137,7 +137,7 @@ def _write_back(args: argparse.Namespace, rows: Iterator[Outcome], tell: Tell) -
     return not any(each.failed for each in written)
 
 
-def _write_tables(out: Path, found: Sequence[Recording], ledger: Ledger, tell: Tell) -> dict[str, int]:
+def _write_tables(out: Path, found: Sequence[BatchRecording], ledger: Ledger, tell: Tell) -> dict[str, int]:
     """How many recordings have which verdict, the most frequent first; the tables are in the order of these."""
     verdicts = {recording: verdict for recording in found if (verdict := ledger.verdict(recording)) is not None}
     counts = dict(sorted(Counter(verdicts.values()).items(), key=lambda each: (-each[1], each[0])))
@@ -159,4 +159,6 @@ def _check_new(out: Path, goes_on: bool) -> None:
         if not goes_on:
             raise ValueError(f"{out} holds a batch already; --resume goes on with it, or give another --out")
     elif strangers := sorted(path.name for path in out.iterdir() if path.name != LOCK):
-        raise ValueError(f"--out must be a new or an empty folder, {out} holds {printable(strangers[0])}; give another")
+        raise ValueError(
+            f"--out must be a new or an empty folder, {out} holds {sanitize_text(strangers[0])}; give another"
+        )

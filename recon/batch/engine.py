@@ -8,12 +8,14 @@ from functools import partial
 from pathlib import Path
 
 from splatnode.recon.batch.answer import Outcome
-from splatnode.recon.batch.keeping import hidden, hidden_log, kept, remove_leftovers
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.keeping import finalize_result, partial_folder, partial_log, remove_leftovers
+from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import Child, Limits
-from splatnode.recon.jobs.engine import ends
+from splatnode.recon.jobs.engine import run_processes
 
-Work = Callable[[Recording, Path], Sequence[str]]  # the command that writes a recording's result into this new folder
+Work = Callable[
+    [BatchRecording, Path], Sequence[str]
+]  # the command that writes a recording's result into this new folder
 
 
 @dataclass(frozen=True)
@@ -25,22 +27,22 @@ class Plan:
     limits: Limits
 
 
-def run_all(todo: Iterable[Recording], work: Work, plan: Plan) -> Generator[Outcome, None, None]:
+def run_all(todo: Iterable[BatchRecording], work: Work, plan: Plan) -> Generator[Outcome, None, None]:
     """The outcomes as they come; a recording whose outcome is given has its result folder, if it has any.
 
     What is running when the iterator is closed, or when the process dies, leaves nothing but hidden files, which the
     next call removes.
     """
     remove_leftovers(plan.out)
-    take, start = partial(next, iter(todo), None), partial(_started, work, plan.out)
-    running = ends(take, start, [(core,) for core in plan.cores], plan.limits)
+    take, start = partial(next, iter(todo), None), partial(_start_replay, work, plan.out)
+    running = run_processes(take, start, [(core,) for core in plan.cores], plan.limits)
     try:
         for recording, end in running:
-            yield kept(recording, plan.out, recording.name, end)
+            yield finalize_result(recording, plan.out, recording.name, end)
     finally:
         running.close()
         remove_leftovers(plan.out)
 
 
-def _started(work: Work, out: Path, recording: Recording, cores: Sequence[int]) -> Child:
-    return Child.started(work(recording, hidden(out, recording.name)), hidden_log(out, recording.name), cores)
+def _start_replay(work: Work, out: Path, recording: BatchRecording, cores: Sequence[int]) -> Child:
+    return Child.start(work(recording, partial_folder(out, recording.name)), partial_log(out, recording.name), cores)

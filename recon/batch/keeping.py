@@ -7,8 +7,8 @@ import os
 import shutil
 from pathlib import Path
 
-from splatnode.recon.batch.answer import Outcome, outcome
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.answer import Outcome, read_outcome
+from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import End
 
 LOG = "replay.log"  # in a result folder: what its process said; of one that failed NAME.log, beside the results
@@ -16,31 +16,35 @@ PARTIAL = ".partial"  # the end of a hidden name, of what is being made
 _OLD = ".old"
 
 
-def hidden(out: Path, name: str) -> Path:
-    """Where the result `name` is made."""
+def partial_folder(out: Path, name: str) -> Path:
+    """Returns the folder in which the result `name` is made."""
     return out / f".{name}{PARTIAL}"
 
 
-def hidden_log(out: Path, name: str) -> Path:
+def partial_log(out: Path, name: str) -> Path:
     return out / f".{name}.log{PARTIAL}"
 
 
-def kept(recording: Recording, out: Path, made_as: str, end: End) -> Outcome:
+def finalize_result(recording: BatchRecording, out: Path, made_as: str, end: End) -> Outcome:
     """Gives the result that was made as `hidden(out, made_as)` its name; of a failure what was said is kept."""
-    partial, log = hidden(out, made_as), hidden_log(out, made_as)
-    found, final, failed_log = outcome(recording, partial, end), out / recording.name, out / f"{recording.name}.log"
-    if found.failed:
+    partial, log = partial_folder(out, made_as), partial_log(out, made_as)
+    found, final, failed_log = (
+        read_outcome(recording, partial, end),
+        out / recording.name,
+        out / f"{recording.name}.log",
+    )
+    if found.has_failed:
         os.replace(log, failed_log)
         shutil.rmtree(partial, ignore_errors=True)
         return found
     failed_log.unlink(missing_ok=True)
     os.replace(log, partial / LOG)
-    while not _took_place(partial, final, hidden(out, made_as + _OLD)):
+    while not _replace_result(partial, final, partial_folder(out, made_as + _OLD)):
         continue
     return found
 
 
-def _took_place(partial: Path, final: Path, old: Path) -> bool:
+def _replace_result(partial: Path, final: Path, old: Path) -> bool:
     """Whether `partial` has its name now; not where another run of the same recording was just faster.
 
     What is there is left by a driver that was killed before it could write the outcome down, or was run again.

@@ -19,10 +19,10 @@ import msgspec
 
 from splatnode.capture.process.durable import open_itself
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import record_of
 from splatnode.recon.batch.answer import Outcome
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 
 log = logging.getLogger(__name__)
 
@@ -73,12 +73,12 @@ class Ledger:
         self._note(found, self._file.seek(0, os.SEEK_END))
         self._write(msgspec.structs.asdict(found))
 
-    def verdict(self, recording: Recording) -> str | None:
-        """Of its last end, which may be FAILED; None: it came to none."""
+    def verdict(self, recording: BatchRecording) -> str | None:
+        """Returns the verdict of the recording's last run, which may be FAILED; None: it has none."""
         last = self._last.get(_key(recording))
         return last and last.verdict
 
-    def rows(self, wanted: Iterable[Recording]) -> Iterator[Outcome]:
+    def rows(self, wanted: Iterable[BatchRecording]) -> Iterator[Outcome]:
         """The last outcome of each recording, in this order; nothing for one that has none."""
         with self.path.open("rb") as file:
             for last in (self._last.get(_key(recording)) for recording in wanted):
@@ -111,7 +111,7 @@ class Ledger:
             raise OtherBatch(f"{self.path} has format {header.batch}, expected {_FORMAT}; give another --out")
         if header.command != command:
             raise OtherBatch(
-                f"{self.path} is of a batch with other options: {printable(' '.join(header.command))}. Now they are "
+                f"{self.path} is of a batch with other options: {sanitize_text(' '.join(header.command))}. Now they are "
                 f"{' '.join(command)}. Give the same ones, or another --out"
             )
 
@@ -119,7 +119,7 @@ class Ledger:
         try:
             self._note(_outcome(line), place)
         except ValueError as error:  # its recording is run again
-            event(log, logging.WARNING, "line_unreadable", file=self.path, byte=place, error=printable(error))
+            event(log, logging.WARNING, "line_unreadable", file=self.path, byte=place, error=sanitize_text(error))
 
     def _note(self, found: Outcome, place: int) -> None:
         self._last[_key(found)] = _Last(place, sys.intern(found.verdict))
@@ -130,7 +130,7 @@ class Ledger:
         os.fsync(self._file.fileno())
 
 
-def _key(of: Recording | Outcome) -> Key:
+def _key(of: BatchRecording | Outcome) -> Key:
     return of.name, of.source
 
 

@@ -12,15 +12,15 @@ from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from splatnode.capture.logged.mcap import UnusableLog, unpacked
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
-from splatnode.recon.result.export.foxglove import Message, add_messages, written
+from splatnode.capture.logged.mcap import UnusableLog, unpack_chunk
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.recon.result.export.foxglove import Message, add_messages, encode_mcap
 
 
-def encoded(messages: Sequence[Message], schemas: Mapping[str, str]) -> bytes:
+def encode_messages(messages: Sequence[Message], schemas: Mapping[str, str]) -> bytes:
     """The file; `schemas` names that of each topic."""
-    return written(Writer, messages, schemas)
+    return encode_mcap(Writer, messages, schemas)
 
 
 def write_with_messages(source: Path, target: Path, messages: Sequence[Message], schemas: Mapping[str, str]) -> None:
@@ -29,19 +29,19 @@ def write_with_messages(source: Path, target: Path, messages: Sequence[Message],
     The messages, attachments and metadata of `source` keep their order, times and bytes, which is checked here by
     reading both. The same messages give the same file, however often. Raises UnusableLog, OSError.
     """
-    with source.open("rb") as stream, target.open("wb") as file, _as_log(source):
+    with source.open("rb") as stream, target.open("wb") as file, _raise_as_unusable_log(source):
         writer = Writer(file)
         _copy(stream, writer, schemas)
         add_messages(writer, messages, schemas)
         writer.finish()
-    with source.open("rb") as before, target.open("rb") as after, _as_log(source):
+    with source.open("rb") as before, target.open("rb") as after, _raise_as_unusable_log(source):
         for one, other in zip_longest(_contents(before, schemas), _contents(after, schemas)):
             if one != other:
-                raise UnusableLog(f"{printable(str(source))!r} could not be copied as it is; it is left unchanged")
+                raise UnusableLog(f"{sanitize_text(str(source))!r} could not be copied as it is; it is left unchanged")
 
 
-def _as_log(file: Path) -> Any:
-    return foreign(UnusableLog, f"{printable(str(file))!r} is no MCAP file that is whole")
+def _raise_as_unusable_log(file: Path) -> Any:
+    return guard_untrusted(UnusableLog, f"{sanitize_text(str(file))!r} is no MCAP file that is whole")
 
 
 def _copy(stream: IO[bytes], writer: Writer, left_out: Collection[str]) -> None:
@@ -73,7 +73,7 @@ def _copy(stream: IO[bytes], writer: Writer, left_out: Collection[str]) -> None:
 
 
 def _contents(stream: IO[bytes], left_out: Collection[str]) -> Iterator[tuple]:
-    """What must be the same in a copy, in its order; numbers of schemas and channels need not be."""
+    """Yields what must be the same in a copy, in order; numbers of schemas and channels need not be."""
     schemas: dict[int, tuple] = {0: ()}
     channels: dict[int, tuple] = {}
     for record in _records(stream):
@@ -99,5 +99,5 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
     for record in StreamReader(stream, emit_chunks=True).records:
         if isinstance(record, DataEnd):
             return
-        yield from unpacked(record)
+        yield from unpack_chunk(record)
     raise UnusableLog("it ends before the end of its data")

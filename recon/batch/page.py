@@ -8,11 +8,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from urllib.parse import quote
 
-from splatnode.capture.process.printable import escaped
+from splatnode.capture.process.printable import escape_text
 from splatnode.recon.batch.answer import Outcome
-from splatnode.recon.batch.pictures import address
+from splatnode.recon.batch.pictures import make_data_url
 from splatnode.recon.batch.tables import replacing
-from splatnode.recon.result.bounds_in_words import rounded_up
+from splatnode.recon.result.bounds_in_words import format_rounded_up
 
 PAGE = "index.html"
 _MOST_PICTURES = 2000  # of about 10 kB; the recordings after them are shown without
@@ -49,26 +49,26 @@ def _lines(rows: Iterable[Outcome], verdicts: Mapping[str, int], folder: Path) -
         yield f'<tr><td class="text"><a href="#{_text(code)}">{_text(code)}</a></td><td>{count}</td></tr>\n'
     yield "</table>\n<p>Each claim holds for 95 % of all cameras: directions in degrees, positions in percent of the "
     yield "distance to the scene. Seconds are of one core, from the start of the process to its end.</p>\n<table><tr>"
-    yield "".join(f"<th{_of_text(head)}>{head}</th>" for head in _HEADS) + "</tr>\n"
+    yield "".join(f"<th{_format_class(head)}>{head}</th>" for head in _HEADS) + "</tr>\n"
     last = None
     for number, row in enumerate(rows):
-        picture = address(folder / row.name, Path(row.source)) if number < _MOST_PICTURES else None
+        picture = make_data_url(folder / row.name, Path(row.source)) if number < _MOST_PICTURES else None
         yield _row(row, picture, begins=row.verdict != last)
         last = row.verdict
     yield "</table></body></html>\n"
 
 
 def _row(row: Outcome, picture: str | None, begins: bool) -> str:
-    target = f"{row.name}.log" if row.failed else f"{row.name}/"
+    target = f"{row.name}.log" if row.has_failed else f"{row.name}/"
     image = f'<img src="{picture}" alt="" loading="lazy">' if picture else ""
     link = f'<a href="./{_path(target)}">{_text(row.name)}</a>'
     cells = [
         f"<td>{image}</td>",
         f'<td class="text">{link}<br><small>{_text(row.source)}</small></td>',
         f'<td class="text"><b>{_text(row.verdict)}</b><br>{_text(row.message)}</td>',
-        _cell(None if row.rotation_deg is None else f"{rounded_up(row.rotation_deg)}°"),
-        _cell(None if row.centre_percent is None else f"{rounded_up(row.centre_percent)} %"),
-        _cell(_of(row.photographs, row.left_out)),
+        _cell(None if row.rotation_deg is None else f"{format_rounded_up(row.rotation_deg)}°"),
+        _cell(None if row.centre_percent is None else f"{format_rounded_up(row.centre_percent)} %"),
+        _cell(_format_count(row.photographs, row.left_out)),
         _cell(row.gaussians),
         _cell(f"{row.seconds:.1f}"),
         _cell(f"{row.memory_mb:.0f}"),
@@ -77,13 +77,13 @@ def _row(row: Outcome, picture: str | None, begins: bool) -> str:
     return f"<tr{mark}>{''.join(cells)}</tr>\n"
 
 
-def _of(placed: int | None, left_out: int | None) -> str | None:
+def _format_count(placed: int | None, left_out: int | None) -> str | None:
     if placed is None:
         return None
     return f"{placed} of {placed + left_out}" if left_out else str(placed)
 
 
-def _of_text(head: str) -> str:
+def _format_class(head: str) -> str:
     return ' class="text"' if head in ("recording", "verdict") else ""
 
 
@@ -92,8 +92,8 @@ def _cell(value: object) -> str:
 
 
 def _text(raw: str) -> str:
-    """What somebody named, as a page shows it: neither markup nor a character that does more than show."""
-    return html.escape(escaped(raw))
+    """Escapes untrusted text for the page: no markup, and no character that does more than show."""
+    return html.escape(escape_text(raw))
 
 
 def _path(name: str) -> str:

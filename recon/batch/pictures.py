@@ -15,7 +15,7 @@ PREVIEW = "preview.png"
 _WIDTH, _QUALITY = 320, 70  # pixels, of JPEG
 
 
-def address(result: Path, source: Path) -> str | None:
+def make_data_url(result: Path, source: Path) -> str | None:
     """A `data:` address of a JPEG; None where there is nothing to show."""
     path = result / PREVIEW
     if not path.is_file():
@@ -28,10 +28,10 @@ def address(result: Path, source: Path) -> str | None:
     except (UnusableImage, OSError):
         return None
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
-    return None if image is None else _encoded(image)
+    return None if image is None else _encode_preview(image)
 
 
-def _encoded(image: np.ndarray) -> str:
+def _encode_preview(image: np.ndarray) -> str:
     height, width = image.shape[:2]
     size = min(_WIDTH, width), max(1, round(height * min(_WIDTH, width) / width))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

@@ -15,10 +15,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from splatnode.capture.lerobot.data_set import UnusableDataSet
-from splatnode.capture.lerobot.pyarrow import bounded_table
+from splatnode.capture.lerobot.pyarrow import open_bounded_table
 from splatnode.capture.lerobot.tables import check_whole
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.recon.batch.answer import Outcome
 
 _ROWS, _AT_A_TIME = 10_000, 500  # in memory at a time: of a batch, and of cameras
@@ -50,24 +50,24 @@ def write(path: Path, rows: Iterable[Outcome]) -> None:
     _write(path, map(msgspec.structs.asdict, rows), SCHEMA, _ROWS)
 
 
-def write_seen(source: Path, target: Path, rows: Iterable[Mapping[str, Any]], anew: Container[_Seen]) -> None:
+def write_cameras(source: Path, target: Path, rows: Iterable[Mapping[str, Any]], anew: Container[_Seen]) -> None:
     """A table of what cameras of episodes are known: `rows`, and those of `source`, if it is there, but of `anew`.
 
     `anew` are the episodes and cameras of `rows`. Both are in the order of these, and so is `target`. Raises
     UnusableDataSet where `source` is no such table, OSError.
     """
-    kept = (row for row in _earlier(source) if _of(row) not in anew) if source.exists() else ()
-    _write(target, heapq.merge(kept, rows, key=_of), _SIDE, _AT_A_TIME)
+    kept = (row for row in _read_rows(source) if _row_key(row) not in anew) if source.exists() else ()
+    _write(target, heapq.merge(kept, rows, key=_row_key), _SIDE, _AT_A_TIME)
 
 
-def _of(row: Mapping[str, Any]) -> _Seen:
+def _row_key(row: Mapping[str, Any]) -> _Seen:
     return row["episode_index"], row["camera"]
 
 
 @contextlib.contextmanager
-def _reading(said: str) -> Iterator[None]:
-    """What fails in here is raised as UnusableDataSet. pyarrow says of damaged bytes, too, that they are an OSError."""
-    with foreign(UnusableDataSet, said):
+def _raise_as_unusable_data_set(said: str) -> Iterator[None]:
+    """Raises failures inside as UnusableDataSet. pyarrow raises OSError for damaged bytes, too."""
+    with guard_untrusted(UnusableDataSet, said):
         try:
             yield
         except OSError as error:
@@ -76,16 +76,18 @@ def _reading(said: str) -> Iterator[None]:
             raise ValueError(str(error)) from error
 
 
-def _earlier(file: Path) -> Iterator[dict[str, Any]]:
+def _read_rows(file: Path) -> Iterator[dict[str, Any]]:
     """The rows of a table that `write_seen` wrote, some at a time. Raises UnusableDataSet where it is none, OSError."""
-    shown = printable(str(file))
+    shown = sanitize_text(str(file))
     must = f"{shown!r} must be a table of cameras that splatnode wrote, for others to be added"
     said = f"{must}; move it away, or mend it"
     check_whole(file, UnusableDataSet, said)
-    with _reading(said), bounded_table(file) as table:
+    with _raise_as_unusable_data_set(said), open_bounded_table(file) as table:
         names = set(table.schema_arrow.names)
         if others := sorted(names - set(_SIDE.names)):
-            raise UnusableDataSet(f"{must}; it has other columns ({printable(', '.join(others), 200)}): move it away")
+            raise UnusableDataSet(
+                f"{must}; it has other columns ({sanitize_text(', '.join(others), 200)}): move it away"
+            )
         if missing := sorted({"episode_index", "camera"} - names):
             raise UnusableDataSet(f"{must}; it has no column {missing[0]}: move it away")
         for some in table.iter_batches(_AT_A_TIME):
@@ -102,26 +104,26 @@ def write_with_columns(source: Path, target: Path, by_camera: Mapping[str, Mappi
     an episode is null. Raises UnusableDataSet where `source` cannot be read or has other columns of these names,
     OSError.
     """
-    shown = repr(printable(str(source)))
+    shown = repr(sanitize_text(str(source)))
     check_whole(source, UnusableDataSet, shown)
     with contextlib.ExitStack() as opened:
-        with _reading(shown):
-            table = opened.enter_context(bounded_table(source))
+        with _raise_as_unusable_data_set(shown):
+            table = opened.enter_context(open_bounded_table(source))
         writer: pq.ParquetWriter | None = None
         for index in range(table.num_row_groups):
-            with _reading(shown):
+            with _raise_as_unusable_data_set(shown):
                 some = table.read_row_group(index, use_threads=False)
-            some = _with_columns(some, by_camera, shown)
+            some = _add_columns(some, by_camera, shown)
             writer = writer or opened.enter_context(pq.ParquetWriter(target, some.schema, compression="snappy"))
             writer.write_table(some)
         if writer is None:
-            empty = _with_columns(table.schema_arrow.empty_table(), by_camera, shown)
+            empty = _add_columns(table.schema_arrow.empty_table(), by_camera, shown)
             pq.write_table(empty, target, compression="snappy")
 
 
-def _with_columns(table: pa.Table, by_camera: Mapping[str, Mapping[int, Mapping[str, Any]]], shown: str) -> pa.Table:
+def _add_columns(table: pa.Table, by_camera: Mapping[str, Mapping[int, Mapping[str, Any]]], shown: str) -> pa.Table:
     """As `write_with_columns`, of some rows. Raises UnusableDataSet."""
-    with _reading(shown):
+    with _raise_as_unusable_data_set(shown):
         episodes = table.column("episode_index").to_pylist()
     for camera, known in by_camera.items():
         is_known = pa.array([episode in known for episode in episodes], pa.bool_())
@@ -129,7 +131,7 @@ def _with_columns(table: pa.Table, by_camera: Mapping[str, Mapping[int, Mapping[
             title = f"{_PREFIX}/{camera}/{name}"
             values = pa.array([known[episode][name] if episode in known else None for episode in episodes], kind)
             if title in table.column_names:
-                with _reading(f"{shown}: the column {printable(title)}"):
+                with _raise_as_unusable_data_set(f"{shown}: the column {sanitize_text(title)}"):
                     before = table.column(title).cast(kind)
                 merged = pc.call_function("if_else", [is_known, values, before])
                 table = table.set_column(table.column_names.index(title), title, merged)

@@ -12,11 +12,11 @@ import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.recon.batch.answer import Outcome, without_answer
+from splatnode.recon.batch.answer import Outcome, make_failed_outcome
 from splatnode.recon.batch.engine import Work
-from splatnode.recon.batch.keeping import hidden, hidden_log, kept
-from splatnode.recon.batch.sources import REPORT, Recording
-from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, finished
+from splatnode.recon.batch.keeping import finalize_result, partial_folder, partial_log
+from splatnode.recon.batch.sources import REPORT, BatchRecording
+from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, wait_for_end
 from splatnode.recon.jobs.cores import free_core
 from splatnode.recon.jobs.version import other_version
 
@@ -25,7 +25,7 @@ _OF_STORE = "://"  # in the address of an object store
 
 @dataclass(frozen=True)
 class Job:
-    """What all recordings of a batch have in common."""
+    """The settings that all recordings of a batch share."""
 
     work: Work  # that can be pickled: a function of a module, or a partial of one
     results: str  # a folder that all workers share, or an address that fsspec knows, such as s3://bucket/run
@@ -33,13 +33,13 @@ class Job:
     version: str  # of the splatnode that began the batch
 
 
-def run_recording(recording: Recording, job: Job) -> Outcome:
+def run_recording(recording: BatchRecording, job: Job) -> Outcome:
     """Runs it on a core of this machine that no other recording is on; the result is in `job.results` then.
 
     What fails is an outcome. Raises OSError where the results cannot be written.
     """
     if (other := other_version(job.version)) is not None:
-        return without_answer(recording, NOT_RUN, other)
+        return make_failed_outcome(recording, NOT_RUN, other)
     if _OF_STORE not in job.results:
         return _run(recording, job, Path(job.results))
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
@@ -48,20 +48,20 @@ def run_recording(recording: Recording, job: Job) -> Outcome:
         return found
 
 
-def _run(recording: Recording, job: Job, out: Path) -> Outcome:
+def _run(recording: BatchRecording, job: Job, out: Path) -> Outcome:
     out.mkdir(parents=True, exist_ok=True)
     made_as = f"{recording.name}.{uuid.uuid4().hex[:12]}"
     try:
         with free_core() as core:
-            child = Child.started(job.work(recording, hidden(out, made_as)), hidden_log(out, made_as), (core,))
-            end = finished(child, job.limits)
-        return kept(recording, out, made_as, end)
+            child = Child.start(job.work(recording, partial_folder(out, made_as)), partial_log(out, made_as), (core,))
+            end = wait_for_end(child, job.limits)
+        return finalize_result(recording, out, made_as, end)
     finally:
-        shutil.rmtree(hidden(out, made_as), ignore_errors=True)
-        hidden_log(out, made_as).unlink(missing_ok=True)
+        shutil.rmtree(partial_folder(out, made_as), ignore_errors=True)
+        partial_log(out, made_as).unlink(missing_ok=True)
 
 
-def _upload(folder: Path, recording: Recording, results: str) -> None:
+def _upload(folder: Path, recording: BatchRecording, results: str) -> None:
     """The report is the last file, so that a result that has one is whole."""
     import fsspec  # brought by torch; its own packages know the stores
 

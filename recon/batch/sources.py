@@ -16,7 +16,7 @@ from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.printable import printable_name
+from splatnode.capture.process.printable import sanitize_name
 
 log = logging.getLogger(__name__)
 
@@ -33,14 +33,16 @@ _MARKED = 8  # hexadecimal digits that tell recordings of one name apart
 
 
 @dataclass(frozen=True)
-class Recording:
+class BatchRecording:
     """One run of `splatnode replay`."""
 
     name: str  # of its result folder; no other recording of the batch has it
     source: str  # the absolute path of a folder of photographs, or of a film as `capture/film.py` names it
 
 
-def recordings(sources: Sequence[Path], out: Path | None, own_names: frozenset[str] = frozenset()) -> list[Recording]:
+def recordings(
+    sources: Sequence[Path], out: Path | None, own_names: frozenset[str] = frozenset()
+) -> list[BatchRecording]:
     """All recordings, once each, in the order of the sources; results that lie in `out` are none.
 
     A source is a folder of photographs, a video, an MCAP file (each of its image topics is a recording), a LeRobot data
@@ -57,32 +59,34 @@ def recordings(sources: Sequence[Path], out: Path | None, own_names: frozenset[s
                 f"{str(source)!r} is not there; give a folder, a video, an MCAP file, a data set, or a list (.txt)"
             )
         before = len(found)
-        for path, label in _found(source, out and out.resolve(), seen):
+        for path, label in _find_recordings(source, out and out.resolve(), seen):
             found.setdefault(real(path), label)
         if len(found) == before:
             raise ValueError(f"no photographs and no videos in {str(source)!r}, or only some that were named already")
     times = Counter(found.values())
     return [
-        Recording(_marked(label, path) if times[label] > 1 or label in own_names else label, str(path))
+        BatchRecording(_add_digest(label, path) if times[label] > 1 or label in own_names else label, str(path))
         for path, label in found.items()
     ]
 
 
-def _found(source: Path, out: Path | None, seen: set[Path], lists: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
+def _find_recordings(
+    source: Path, out: Path | None, seen: set[Path], lists: tuple[Path, ...] = ()
+) -> Iterator[tuple[Path, str]]:
     """Paths of recordings, each with what it is called; `lists` led to this source. What is in `seen` has been here."""
     if _is(source.is_dir):
-        for path in _walked(source, out, seen):
+        for path in _walk_folder(source, out, seen):
             yield from _parts(path, _label(path, source))
     elif source.suffix.lower() == LIST and _is(source.is_file):
-        for path in listed(source, lists, seen):
-            yield from _found(path, out, seen, (*lists, real(source)))
+        for path in read_list(source, lists, seen):
+            yield from _find_recordings(path, out, seen, (*lists, real(source)))
     elif real(source) not in seen:
         seen.add(real(source))
         yield from _parts(source, _label(source))
 
 
 def real(path: Path) -> Path:
-    """Where a path leads, links and all; a circle of links, and a path that is too long, lead to themselves."""
+    """Resolves a path and its links; a circle of links, and a path that is too long, lead to themselves."""
     return Path(os.path.realpath(path))
 
 
@@ -100,7 +104,7 @@ def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
     So is a file or a data set that cannot be read: its recording says why.
     """
     try:
-        names = parts(path)
+        names = list_parts(path)
     except (ValueError, OSError, ModuleNotFoundError) as error:
         raise_shortage(error)
         names = []
@@ -110,23 +114,23 @@ def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
         yield path, label
 
 
-def parts(path: Path) -> list[str]:
-    """What recordings an MCAP file or a data set holds, as `film` names them; none of anything else.
+def list_parts(path: Path) -> list[str]:
+    """Lists the recordings of an MCAP file or a data set, as `film` names them; none of anything else.
 
     Raises ValueError, OSError and ModuleNotFoundError where it cannot be read.
     """
     if path.suffix.lower() == film.MCAP and path.is_file():
         return [topic.name for topic in mcap.image_topics(path)]
-    return data_set.parts(path) if data_set.is_data_set(path) else []
+    return data_set.list_parts(path) if data_set.is_data_set(path) else []
 
 
-def listed(path: Path, lists: Collection[Path], seen: set[Path]) -> Iterator[Path]:
+def read_list(path: Path, lists: Collection[Path], seen: set[Path]) -> Iterator[Path]:
     """The paths that a list names, which are relative to its own folder; empty lines and those of a # say nothing.
 
     A list that is in `seen`, because another one named it, too, names nothing more. Raises ValueError where it is one
     of the resolved `lists`, which led to it, where these are many, and where it is no list; OSError.
     """
-    own, shown = real(path), repr(printable_name(str(path)))
+    own, shown = real(path), repr(sanitize_name(str(path)))
     if own in lists:
         raise ValueError(f"the list {shown} leads to itself; take it out of what it names")
     if len(lists) >= _DEEPEST_LIST:
@@ -142,7 +146,7 @@ def listed(path: Path, lists: Collection[Path], seen: set[Path]) -> Iterator[Pat
             yield path.parent / name
 
 
-def _walked(folder: Path, out: Path | None, seen: set[Path]) -> Iterator[Path]:
+def _walk_folder(folder: Path, out: Path | None, seen: set[Path]) -> Iterator[Path]:
     """The recordings at and below `folder`, in natural order; links may lead in a circle, and each place counts once.
 
     A folder that cannot be looked into is one, too: its recording says why.
@@ -164,7 +168,7 @@ def _walked(folder: Path, out: Path | None, seen: set[Path]) -> Iterator[Path]:
             if below is None:
                 yield path
             elif len(under_way) > _DEEPEST:
-                log.warning("%s: folders more than %d deep are not looked into", printable_name(str(folder)), _DEEPEST)
+                log.warning("%s: folders more than %d deep are not looked into", sanitize_name(str(folder)), _DEEPEST)
             else:
                 under_way.append(iter(below))
 
@@ -184,7 +188,7 @@ def _below(folder: Path) -> list[Path] | None:
 
 
 def _label(path: Path, source: Path | None = None) -> str:
-    """What a recording is called: its place below the source that was named, or its own name; `images` says nothing."""
+    """Labels a recording by its path below the named source, or by its own name; `images` says nothing."""
     file, part = film.file_and_part(path)
     own = real(file)
     below = [] if source is None else list(path.relative_to(source).parts)
@@ -198,9 +202,9 @@ def _label(path: Path, source: Path | None = None) -> str:
 
 
 def _name(parts: Sequence[str]) -> str:
-    return printable_name("_".join(filter(None, parts)), _LONGEST).lstrip(".") or "recording"
+    return sanitize_name("_".join(filter(None, parts)), _LONGEST).lstrip(".") or "recording"
 
 
-def _marked(label: str, path: Path) -> str:
+def _add_digest(label: str, path: Path) -> str:
     digest = hashlib.sha256(os.fsencode(path)).hexdigest()[:_MARKED]
     return f"{label}~{digest}"

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.printable import cell, escaped
+from splatnode.capture.process.printable import cell, escape_text
 from splatnode.recon.batch.answer import Outcome
 
 CSV, PARQUET = "batch.csv", "batch.parquet"
@@ -20,12 +20,12 @@ BEING_WRITTEN = ".partial"  # the end of the hidden name under which a file is w
 
 
 def write_csv(path: Path, rows: Iterable[Outcome]) -> None:
-    """What is not known is empty; text is what a spreadsheet takes for text. Raises OSError."""
+    """Writes rows; the unknown is empty, text is what a spreadsheet takes for text. Raises OSError."""
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for row in rows:
-            writer.writerow(map(cell, msgspec.structs.astuple(shown(row))))
+            writer.writerow(map(cell, msgspec.structs.astuple(escape_source(row))))
 
 
 def write_parquet(path: Path, rows: Iterable[Outcome]) -> None:
@@ -33,12 +33,12 @@ def write_parquet(path: Path, rows: Iterable[Outcome]) -> None:
     from splatnode.recon.batch import pyarrow  # takes half a second, and is an extra
 
     with replacing(path) as temporary:
-        pyarrow.write(temporary, map(shown, rows))
+        pyarrow.write(temporary, map(escape_source, rows))
 
 
-def shown(row: Outcome) -> Outcome:
-    """With a source that is text: bytes of a file's name that are no UTF-8 are escapes."""
-    return msgspec.structs.replace(row, source=escaped(row.source))
+def escape_source(row: Outcome) -> Outcome:
+    """Returns the row with its source as text: bytes of a file's name that are no UTF-8 become escapes."""
+    return msgspec.structs.replace(row, source=escape_text(row.source))
 
 
 @contextlib.contextmanager

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.process.arguments import add_json, positive, seconds
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 from splatnode.recon.jobs.arguments import add_max_memory, add_ray
-from splatnode.recon.replay_verb import add_choice, add_way
+from splatnode.recon.replay_verb import add_reconstruction_options, add_selection_options
 
 
 def replay_options(args: argparse.Namespace) -> list[str]:
@@ -24,7 +24,7 @@ def replay_options(args: argparse.Namespace) -> list[str]:
 
 
 def _options_of_replay(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
-    return *add_way(parser), *add_choice(parser.add_mutually_exclusive_group())
+    return *add_reconstruction_options(parser), *add_selection_options(parser.add_mutually_exclusive_group())
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,5 +71,5 @@ BATCH = Verb(
     "batch",
     "reconstruct many folders of photographs, videos, logs and data sets",
     _arguments,
-    lazily("splatnode.recon.batch.command", "batch"),
+    import_lazily("splatnode.recon.batch.command", "batch"),
 )

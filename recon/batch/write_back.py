@@ -20,12 +20,12 @@ from splatnode.capture.lerobot import data_set
 from splatnode.capture.logged.mcap import topics
 from splatnode.capture.logged.order import read_times
 from splatnode.capture.process.folders import LOCK
-from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.lock import LockHeld, exclusive
 from splatnode.recon.batch.answer import Outcome
 from splatnode.recon.batch.sources import OWN_SUFFIX
 from splatnode.recon.batch.tables import BEING_WRITTEN, replacing
 from splatnode.recon.result.export import read_cameras
-from splatnode.recon.result.export.foxglove import Message, calibration, pose, time
+from splatnode.recon.result.export.foxglove import Message, make_calibration, make_pose, make_time
 from splatnode.recon.result.snapshot import CameraEstimate
 
 CAMERAS = "cameras.json"
@@ -35,14 +35,14 @@ _INFO, _WARNING = 2, 3  # Foxglove's numbers of levels
 
 
 @dataclass(frozen=True)
-class WrittenBack:
-    """What became of one data set or log."""
+class WriteBackOutcome:
+    """The outcome of one data set or log."""
 
     sentence: str
     failed: bool = False
 
 
-def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[WrittenBack]:
+def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[WriteBackOutcome]:
     """Writes the cameras of `rows`, whose results lie in `out`; one after the other, what becomes of each file.
 
     `in_place` adds columns to the tables of a data set, and topics to an MCAP file. Recordings of neither are left.
@@ -52,24 +52,24 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
         file, part = film.file_and_part(Path(row.source))
-        if part and not row.failed and (file.is_dir() or file.suffix.lower() == film.MCAP):
+        if part and not row.has_failed and (file.is_dir() or file.suffix.lower() == film.MCAP):
             found[file].append((part, row))
     for file, parts in found.items():
-        write = _with_log if file.suffix.lower() == film.MCAP else _into_data_set
+        write = _write_log if file.suffix.lower() == film.MCAP else _write_data_set
         try:
-            with _alone(file):
+            with _lock_exclusively(file):
                 sentence = write(file, parts, out, in_place)
-        except Held as error:
+        except LockHeld as error:
             why = f"{error}, which writes there; run this again with --resume when it has ended"
-            yield WrittenBack(f"the cameras of {file} were not written back: {why}", failed=True)
+            yield WriteBackOutcome(f"the cameras of {file} were not written back: {why}", failed=True)
         except (OSError, ValueError, ModuleNotFoundError) as error:
-            yield WrittenBack(f"the cameras of {file} were not written back: {error}", failed=True)
+            yield WriteBackOutcome(f"the cameras of {file} were not written back: {error}", failed=True)
         else:
-            yield WrittenBack(sentence)
+            yield WriteBackOutcome(sentence)
 
 
 @contextlib.contextmanager
-def _alone(file: Path) -> Iterator[None]:
+def _lock_exclusively(file: Path) -> Iterator[None]:
     """One process at a time writes a log or a data set; what a killed one has left is removed. Raises Held, OSError."""
     if file.is_dir():
         lock, begun = file / "meta" / LOCK, (file / "meta").rglob(f".*{BEING_WRITTEN}")
@@ -85,14 +85,14 @@ def _alone(file: Path) -> Iterator[None]:
             lock.unlink(missing_ok=True)
 
 
-def _into_data_set(folder: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:
+def _write_data_set(folder: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:
     """Raises OSError, UnusableDataSet, ModuleNotFoundError without pyarrow."""
     from splatnode.recon.batch import pyarrow  # takes half a second, and is an extra
 
     info = data_set.read_info(folder)
     numbered = [(*data_set.episode_and_camera(folder, info, part), row) for part, row in parts]
     numbered.sort(key=lambda each: each[:2])
-    seen = ((episode, key, _seen(row, out, info.fps)) for episode, key, row in numbered)
+    seen = ((episode, key, _make_camera_row(row, out, info.fps)) for episode, key, row in numbered)
     if in_place:
         by_key: defaultdict[str, dict[int, Mapping[str, Any]]] = defaultdict(dict)
         for episode, key, values in seen:
@@ -105,12 +105,12 @@ def _into_data_set(folder: Path, parts: Sequence[tuple[str, Outcome]], out: Path
     table = folder / TABLE
     rows = ({"episode_index": episode, "camera": key, **values} for episode, key, values in seen)
     with replacing(table) as temporary:
-        pyarrow.write_seen(table, temporary, rows, anew={(episode, key) for episode, key, _ in numbered})
+        pyarrow.write_cameras(table, temporary, rows, anew={(episode, key) for episode, key, _ in numbered})
     return f"{len(parts)} recordings are rows of {table}"
 
 
-def _seen(row: Outcome, out: Path, rate: float) -> dict[str, Any]:
-    """What is known of a recording: a verdict, and its keyframes, with the frames' numbers in the episode."""
+def _make_camera_row(row: Outcome, out: Path, rate: float) -> dict[str, Any]:
+    """Returns a recording's verdict and its keyframes, with the frames' numbers in the episode."""
     cameras = _cameras(row, out)
     indices = [_index(camera) for camera in cameras]
     return {
@@ -128,7 +128,7 @@ def _seen(row: Outcome, out: Path, rate: float) -> dict[str, Any]:
     }
 
 
-def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:
+def _write_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:
     """Raises OSError, UnusableLog, ModuleNotFoundError without mcap."""
     from splatnode.recon.batch import mcap
 
@@ -137,7 +137,7 @@ def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_pl
     for topic, row in parts:
         names = {kind: f"{topic}/splatnode/{kind}" for kind in ("pose", "calibration", "verdict")}
         schemas |= {names["pose"]: "PoseInFrame", names["calibration"]: "CameraCalibration", names["verdict"]: "Log"}
-        told += _of_topic(file, topic, row, out, names)
+        told += _make_topic_messages(file, topic, row, out, names)
     told.sort(key=lambda each: each[1])
     target = file if in_place else file.with_name(file.stem + OWN_SUFFIX)
     with replacing(target) as temporary:
@@ -145,12 +145,14 @@ def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_pl
             mcap.write_with_messages(target, temporary, told, schemas)
             shutil.copymode(target, temporary)
         else:
-            temporary.write_bytes(mcap.encoded(told, schemas))
+            temporary.write_bytes(mcap.encode_messages(told, schemas))
     where = "topics of that file" if in_place else str(target)
     return f"{len(parts)} topics of {file} have cameras in {where}"
 
 
-def _of_topic(file: Path, topic: str, row: Outcome, out: Path, names: Mapping[str, str]) -> Iterator[Message]:
+def _make_topic_messages(
+    file: Path, topic: str, row: Outcome, out: Path, names: Mapping[str, str]
+) -> Iterator[Message]:
     """The verdict with the first picture, and of each keyframe its pose and lens: logged when its picture was logged.
 
     Their own time stamps are those of the pictures' headers, which a simulation may count from its beginning.
@@ -162,15 +164,15 @@ def _of_topic(file: Path, topic: str, row: Outcome, out: Path, names: Mapping[st
         if index == 0:
             level = _INFO if row.published else _WARNING
             said = {"message": f"{row.verdict}: {row.message}", "name": "splatnode", "file": "", "line": 0}
-            yield names["verdict"], ns, {"timestamp": time(stamp_ns), "level": level, **said}
+            yield names["verdict"], ns, {"timestamp": make_time(stamp_ns), "level": level, **said}
         if (camera := by_index.get(index)) is not None:
             placed = {
-                "timestamp": time(stamp_ns),
+                "timestamp": make_time(stamp_ns),
                 "frame_id": f"{topic}/{_WORLD}",
-                "pose": pose(camera.T_world_camera),
+                "pose": make_pose(camera.T_world_camera),
             }
             yield names["pose"], ns, placed
-            yield names["calibration"], ns, calibration(camera, stamp_ns, f"{topic}/{_CAMERA}")
+            yield names["calibration"], ns, make_calibration(camera, stamp_ns, f"{topic}/{_CAMERA}")
 
 
 def _cameras(row: Outcome, out: Path) -> Sequence[CameraEstimate]:
@@ -178,5 +180,5 @@ def _cameras(row: Outcome, out: Path) -> Sequence[CameraEstimate]:
 
 
 def _index(camera: CameraEstimate) -> int:
-    """Of the frame in its topic or episode, which its name ends with."""
+    """Returns the frame's number in its topic or episode, with which its name ends."""
     return int(Path(camera.name).stem.rpartition("_")[2])

@@ -84,15 +84,15 @@ def default_threads() -> int:
 
 def set_threads(threads: int) -> None:
     """Bounds the core's threads, for the whole process. Raises ValueError below 1."""
-    library().core_set_threads(_checked(threads))
+    library().core_set_threads(_check_threads(threads))
 
 
-def allowed_threads() -> int:
+def num_usable_threads() -> int:
     """As many as the work of this thread may take, itself included."""
     return min(default_threads(), _limit.threads or sys.maxsize)
 
 
-def limited_threads() -> int | None:
+def current_thread_limit() -> int | None:
     """The limit that holds for the work of this thread; None: there is none."""
     return _limit.threads
 
@@ -102,12 +102,12 @@ def limit_threads(threads: int | None) -> None:
 
     Raises ValueError below 1.
     """
-    library().core_limit_threads(0 if threads is None else _checked(threads))
+    library().core_limit_threads(0 if threads is None else _check_threads(threads))
     _limit.threads = threads
 
 
 @contextmanager
-def at_most(threads: int | None) -> Iterator[None]:
+def apply_thread_limit(threads: int | None) -> Iterator[None]:
     """Inside the block the work of this thread takes at most so many threads; None: no other limit than before.
 
     Raises ValueError below 1.
@@ -120,7 +120,7 @@ def at_most(threads: int | None) -> Iterator[None]:
         limit_threads(before)
 
 
-def _checked(threads: int) -> int:
+def _check_threads(threads: int) -> int:
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
     return threads
@@ -149,7 +149,7 @@ def _processor_flags() -> set[str]:
 
 
 def _aarch64_flags() -> set[str]:
-    """Of those that matter here. An emulator's /proc/cpuinfo is its host's, but what it tells the program is right."""
+    """Returns the CPU flags that matter. An emulator's /proc/cpuinfo is its host's; this query is right."""
     if sys.platform == "darwin":
         return {"asimddp"}  # from the first processors of Apple's own on
     capabilities = ctypes.CDLL(None).getauxval

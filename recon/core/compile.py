@@ -72,7 +72,7 @@ def machine() -> str:
 
 
 def library_path(instruction_set: str, of_machine: str | None = None) -> Path:
-    """Where the library for an instruction set of this machine, or of another, lies."""
+    """Returns the path of the library for an instruction set of this machine, or of another."""
     return HERE / f"_core_{of_machine or machine()}_{instruction_set}.so"
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from splatnode.capture.process import python
 from splatnode.recon.core.compile import TARGETS, find_compiler, find_zig, machine
 from splatnode.recon.core.trial import Trial, TrialFailed, try_artefact
-from splatnode.recon.core.wheels import FROM_COPY, ROOT, asked_for, build_wheel
+from splatnode.recon.core.wheels import FROM_COPY, ROOT, build_wheel, parse_arguments
 
 _NOT_PACKED = (".*", "out", "build", "dist", "docs", "__pycache__", "*.egg-info", "_core_*")
 _BUILD_SDIST = f"{FROM_COPY}; from splatnode.recon.core import backend; print(backend.build_sdist(sys.argv[2]))"
@@ -72,14 +72,14 @@ def build_sdist(out: Path) -> Path:
     with tempfile.TemporaryDirectory(prefix="splatnode-sdist-") as folder:
         copy = Path(folder) / "splatnode"
         shutil.copytree(ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(*_NOT_PACKED))
-        command = python.isolated("-c", _BUILD_SDIST, str(copy), str(out.resolve()))
+        command = python.make_isolated_command("-c", _BUILD_SDIST, str(copy), str(out.resolve()))
         result = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"the sdist was not built:\n{result.stderr[-4000:]}")
     return out / result.stdout.splitlines()[-1]
 
 
-def least_system(said: str) -> str:
+def find_required_platform(said: str) -> str:
     """The platform tag that a wheel deserves, in what `auditwheel show` says of it. Raises RuntimeError without one."""
     words = " ".join(said.split())
     _, found, rest = words.partition('is consistent with the following platform tag: "')
@@ -90,15 +90,15 @@ def least_system(said: str) -> str:
 
 def check_tag(wheel: Path) -> None:
     """Raises RuntimeError where a wheel for Linux needs a newer system than its name says, or cannot be judged."""
-    command = python.isolated("-m", "auditwheel", "show", str(wheel))
+    command = python.make_isolated_command("-m", "auditwheel", "show", str(wheel))
     result = subprocess.run(command, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"auditwheel cannot read {wheel.name}: {result.stderr[-1000:]}")
-    if not wheel.stem.endswith(deserved := least_system(result.stdout)):
+    if not wheel.stem.endswith(deserved := find_required_platform(result.stdout)):
         raise RuntimeError(f"{wheel.name} needs {deserved}")
 
 
-def on_trial(name: str, artefact: Path, compiler: bool = True) -> Row:
+def run_trial(name: str, artefact: Path, compiler: bool = True) -> Row:
     """The row of an artefact that is installed and run; what was seen where it fails goes to standard error."""
     size_bytes = artefact.stat().st_size
     print(f"trying {name} in a clean environment", file=sys.stderr, flush=True)
@@ -116,22 +116,22 @@ def _wheel_row(target: str, out: Path) -> Row:
     if target.startswith("linux-"):
         check_tag(wheel)
     if target == target_here():
-        return on_trial(wheel.name, wheel)
+        return run_trial(wheel.name, wheel)
     return Row(wheel.name, wheel.stat().st_size, None, _NO_TRIAL, good=True)
 
 
 def _sdist_rows(out: Path) -> list[Row]:
     sdist = build_sdist(out)
-    rows = [on_trial(f"{sdist.name}, compiler of PyPI", sdist, compiler=False)]
+    rows = [run_trial(f"{sdist.name}, compiler of PyPI", sdist, compiler=False)]
     compiler = find_compiler()
     if compiler is None or compiler == find_zig():
         remark = "no compiler is installed here"
         return [*rows, Row(f"{sdist.name}, compiler installed", sdist.stat().st_size, None, remark, good=True)]
-    return [*rows, on_trial(f"{sdist.name}, {compiler[0]}", sdist)]
+    return [*rows, run_trial(f"{sdist.name}, {compiler[0]}", sdist)]
 
 
 def _row_or_failure(name: str, make: Callable[[], list[Row]]) -> list[Row]:
-    """What `make` makes; an artefact that cannot be built, or that is not what its name says, has a row of its own."""
+    """Returns the rows of `make`; an artefact that cannot be built, or is mislabelled, has its own row."""
     try:
         return make()
     except RuntimeError as error:
@@ -141,7 +141,7 @@ def _row_or_failure(name: str, make: Callable[[], list[Row]]) -> list[Row]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Makes the release and prints the table; 1 where anything is not good."""
-    targets, out = asked_for("release", __doc__, argv)
+    targets, out = parse_arguments("release", __doc__, argv)
     rows: list[Row] = []
     for target in targets:
         print(f"building the wheel for {target}", file=sys.stderr, flush=True)

@@ -23,7 +23,7 @@ class TrialFailed(Exception):
 
 @dataclass(frozen=True)
 class Trial:
-    """What an artefact did in a clean environment."""
+    """The result of an artefact's trial in a clean environment."""
 
     installed_bytes: int  # with all that it requires, and the byte code that pip compiles
     install_s: float
@@ -37,8 +37,8 @@ def try_artefact(artefact: Path, constraints: Path, folder: Path, compiler: bool
     """
     environment = folder / "environment"
     programs = environment / "bin"
-    variables = clean(os.environ, None if compiler else programs)
-    _run(python.isolated("-m", "venv", str(environment)), folder, variables)
+    variables = clean_environment(os.environ, None if compiler else programs)
+    _run(python.make_isolated_command("-m", "venv", str(environment)), folder, variables)
     before, began_s = size_of(environment), time.monotonic()
     pip = [str(programs / "python"), "-I", "-m", "pip", "install", "--quiet", "-c", str(constraints)]
     _run([*pip, str(artefact)], folder, variables)
@@ -47,10 +47,10 @@ def try_artefact(artefact: Path, constraints: Path, folder: Path, compiler: bool
     if lacking := [name for name in sorted(WANTED) if not (folder / "configs" / name).is_file()]:
         raise TrialFailed(f"`splatnode config --write` does not write {', '.join(lacking)}")
     report = _run([str(programs / "splatnode"), "demo", "--out", "demo", "--json"], folder, variables)
-    return Trial(installed_bytes, install_s, verdict_of(json.loads(report)))
+    return Trial(installed_bytes, install_s, format_verdict(json.loads(report)))
 
 
-def verdict_of(report: dict[str, Any]) -> str:
+def format_verdict(report: dict[str, Any]) -> str:
     """The demo's report in a few words. Raises TrialFailed where its scene is not published, or was not measured."""
     code = report["verdict"]["code"]
     if not report["verdict"]["publishable"] or "held_out" not in report:
@@ -58,7 +58,7 @@ def verdict_of(report: dict[str, Any]) -> str:
     return f"{code}, {report['held_out']['psnr']:.1f} dB, {report['seconds']['total']:.0f} s"
 
 
-def clean(variables: os._Environ[str] | dict[str, str], only_path: Path | None) -> dict[str, str]:
+def clean_environment(variables: os._Environ[str] | dict[str, str], only_path: Path | None) -> dict[str, str]:
     """The environment variables without what tells of this checkout; with `only_path`, without any compiler, too."""
     kept = {name: value for name, value in variables.items() if not name.startswith(_OURS)}
     if only_path is None:
@@ -73,7 +73,7 @@ def size_of(folder: Path) -> int:
 
 
 def _run(command: list[str], folder: Path, variables: dict[str, str]) -> str:
-    """What the command prints. Raises TrialFailed where it fails."""
+    """Returns the output of the command. Raises TrialFailed where it fails."""
     result = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True)
     if result.returncode != 0:
         said = (result.stderr or result.stdout).strip()[-_LAST:]

@@ -38,7 +38,7 @@ def build_wheel(target: str, out: Path) -> Path:
     with tempfile.TemporaryDirectory(prefix="splatnode-wheel-") as folder:
         for name in _PACKED:
             _copy(ROOT / name, Path(folder) / name)
-        command = python.isolated("-c", _BUILD, folder, str(out.resolve()), target)
+        command = python.make_isolated_command("-c", _BUILD, folder, str(out.resolve()), target)
         result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"the wheel for {target} was not built:\n{result.stderr[-4000:]}")
@@ -53,7 +53,7 @@ def _copy(source: Path, to: Path) -> None:
         shutil.copy2(source, to)
 
 
-def asked_for(verb: str, description: str | None, argv: Sequence[str] | None) -> tuple[list[str], Path]:
+def parse_arguments(verb: str, description: str | None, argv: Sequence[str] | None) -> tuple[list[str], Path]:
     """The targets, all by default, and the folder that the arguments of `./run VERB` name."""
     parser = argparse.ArgumentParser(prog=f"./run {verb}", description=description)
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"some of {', '.join(TARGETS)} (default: all)")
@@ -66,7 +66,7 @@ def asked_for(verb: str, description: str | None, argv: Sequence[str] | None) ->
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Builds the wheels that are asked for, and prints their paths; 1 where one could not be built."""
-    targets, out = asked_for("wheels", __doc__, argv)
+    targets, out = parse_arguments("wheels", __doc__, argv)
     failed = 0
     for target in targets:
         try:

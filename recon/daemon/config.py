@@ -8,15 +8,15 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.messaging.network import Network
-from splatnode.recon.config import Config as Reconstruction
-from splatnode.recon.daemon.free_space import Config as FreeSpace
-from splatnode.recon.daemon.tracking import Config as Tracking
+from splatnode.recon.config import ReconstructionConfig as Reconstruction
+from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
+from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
 from splatnode.recon.result.message import MAX_CAMERAS
 
 Positive = Annotated[int, msgspec.Meta(ge=1)]
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()  # the same as in capture's configuration
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # of the live camera against a finished scene

@@ -19,41 +19,41 @@ from collections.abc import Callable, Iterator
 import msgspec
 
 from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
+from splatnode.capture.messaging.commands import Answer, CommandServer, MarkProblemsSeen
 from splatnode.capture.messaging.network import files_for_strangers
 from splatnode.capture.messaging.services import RECON_CONTROL, RECON_DEPTH, RECON_MAP, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.capture.process.after_ready import after_ready
+from splatnode.capture.process.after_ready import wrap_late_errors
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.logs import event, use_structured_lines
 from splatnode.capture.process.memory import resident_mb
-from splatnode.capture.process.printable import printable
-from splatnode.capture.process.problems import Problems, is_said
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.problems import Problems, is_logged
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.process.state_directory import state_directory
-from splatnode.capture.process.stop_signals import on_first
+from splatnode.capture.process.stop_signals import handle_first_signal
 from splatnode.capture.process.unfailing import Unfailing
-from splatnode.recon.config import overlaid
+from splatnode.recon.config import apply_changes
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.disk_space import DiskSpace
-from splatnode.recon.daemon.free_space import NOT_FINAL, Mapped
-from splatnode.recon.daemon.inbox import Inbox, LeftOut
+from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.inbox import Inbox, RemovedFrame
 from splatnode.recon.daemon.intake import Intake
-from splatnode.recon.daemon.map_offer import MapOffer
-from splatnode.recon.daemon.output import Published
-from splatnode.recon.daemon.status import ReconStatus, State
+from splatnode.recon.daemon.map_offer import OccupancyPublisher
+from splatnode.recon.daemon.output import PublishedSnapshot
+from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
-from splatnode.recon.metric.arguments import marker_changes
+from splatnode.recon.metric.arguments import collect_marker_changes
 from splatnode.recon.result import bounds_in_words
-from splatnode.recon.result.depth_message import depth_header
-from splatnode.recon.result.export.staged import completed
-from splatnode.recon.result.folder import result_folder
-from splatnode.recon.result.message import CameraRecord, camera_record, to_message
+from splatnode.recon.result.depth_message import make_depth_header
+from splatnode.recon.result.export.staged import finish_interrupted_write
+from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record
 from splatnode.recon.result.snapshot import CameraEstimate
 
 log = logging.getLogger(__name__)
@@ -70,27 +70,27 @@ STUCK_S = (
 def recon(args: argparse.Namespace) -> int:
     """Runs until SIGTERM or SIGINT and returns 0. A second signal ends the process at once."""
     use_structured_lines()
-    config = load_config(args.config, Config) if args.config else Config()
+    config = load_config(args.config, DaemonConfig) if args.config else DaemonConfig()
     if args.checkpoint:
         config = msgspec.structs.replace(config, checkpoint=args.checkpoint)
     if args.out:
         config = msgspec.structs.replace(config, out=args.out)
     if args.marker:
-        recipe = overlaid(config.reconstruction, {"metric": marker_changes(args)})
+        recipe = apply_changes(config.reconstruction, {"metric": collect_marker_changes(args)})
         config = msgspec.structs.replace(config, reconstruction=recipe)
     stopping = threading.Event()
-    on_first((signal.SIGTERM, signal.SIGINT), stopping.set)
+    handle_first_signal((signal.SIGTERM, signal.SIGINT), stopping.set)
     with Daemon(config, stopping) as daemon:
         daemon.run()
     return 0
 
 
 class Daemon:
-    def __init__(self, config: Config, stopping: threading.Event) -> None:
+    def __init__(self, config: DaemonConfig, stopping: threading.Event) -> None:
         """Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
-        with self._closing_on_error():
+        with self._close_on_error():
             raise_file_limit()
             network = config.network
             make_sure_of_room(_FILES + files_for_strangers(network, _SOCKETS), _THREADS)
@@ -101,26 +101,26 @@ class Daemon:
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
             self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
-            self._resources.enter_context(result_folder(config.out))
+            self._resources.enter_context(hold_result_folder(config.out))
             for folder in config.out.glob("scene-*"):
-                completed(folder, [folder / "colmap"])
+                finish_interrupted_write(folder, [folder / "colmap"])
         self._disk_space = DiskSpace(config, self._store)
         self._inbox = Inbox()
-        self._newest = _Newest()
+        self._newest = _NewestSnapshot()
         self._problems = Problems()
         self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
-        self._worker = Worker(config, self._store, self._inbox, self._newest.put, stopping)
+        self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._scene_numbers = Numbering()
         session = self._scene_numbers.session
         self._depth_numbers = Numbering(session)
         self._status_numbers = Numbering(session)
-        self._maps = None if maps is None else MapOffer(maps, Numbering(session))
+        self._maps = None if maps is None else OccupancyPublisher(maps, Numbering(session))
         self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()
-        self._shown: Published | None = None
+        self._shown: PublishedSnapshot | None = None
         self._errors: list[BaseException] = []
-        self._heart, self._told = Unfailing("the heartbeat"), State.LOADING.value  # the service manager's
+        self._heart, self._told = Unfailing("the heartbeat"), ReconState.LOADING.value  # the service manager's
 
     def __enter__(self) -> Daemon:
         return self
@@ -131,11 +131,11 @@ class Daemon:
     def run(self) -> None:
         """Runs until the daemon is stopped. Raises Failed where one of its threads ended."""
         manager = ServiceManager()
-        with after_ready(manager):
+        with wrap_late_errors(manager):
             self._run(manager)
 
     def _run(self, manager: ServiceManager) -> None:
-        threads = [self._thread(each.run) for each in (self._intake, self._worker, self._watcher)]
+        threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher)]
         manager.ready()
         event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
         next_status_s = 0.0
@@ -147,7 +147,7 @@ class Daemon:
                 if self._maps is not None:
                     self._maps.serve()
                 self._publish()
-                self._tell_map(self._worker.mapped)
+                self._publish_map(self._worker.current_map)
                 if time.monotonic() >= next_status_s:
                     next_status_s = time.monotonic() + self._config.status_every_s
                     self._heart.do(self._beat)
@@ -156,29 +156,29 @@ class Daemon:
         finally:
             self._stopping.set()
             manager.stopping()
-            self._end(threads)
+            self._join_threads(threads)
         if self._errors:
             raise self._errors[0]
         event(log, logging.INFO, "stopped")
 
     def _beat(self) -> None:
-        status = self._status()
+        status = self._make_status()
         self._told = f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}"
         self._heartbeat.send(status)
 
-    def _thread(self, run: Callable[[], None]) -> threading.Thread:
-        def guarded() -> None:
+    def _start_thread(self, run: Callable[[], None]) -> threading.Thread:
+        def run_and_record_error() -> None:
             try:
                 run()
             except BaseException as error:
                 self._errors.append(error)
                 self._stopping.set()
 
-        thread = threading.Thread(target=guarded, name=type(run).__name__, daemon=True)
+        thread = threading.Thread(target=run_and_record_error, name=type(run).__name__, daemon=True)
         thread.start()
         return thread
 
-    def _end(self, threads: list[threading.Thread]) -> None:
+    def _join_threads(self, threads: list[threading.Thread]) -> None:
         """Waits until the threads have written what they are writing: an export, a keyframe."""
         deadline = time.monotonic() + END_S
         for thread in threads:
@@ -191,54 +191,54 @@ class Daemon:
         if shown is None:
             return
         self._shown = shown
-        self._tell_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
+        self._publish_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
         numbers = self._scene_numbers.next()
         self._sequence = int(numbers["sequence"])
         try:
-            header, arrays = to_message(shown.snapshot, shown.scene_id, numbers)
+            header, arrays = encode_snapshot(shown.snapshot, shown.scene_id, numbers)
             depth = self._depth_numbers.next()
-            self._depths.publish(depth_header(shown.snapshot, shown.scene_id, self._sequence, depth))
+            self._depths.publish(make_depth_header(shown.snapshot, shown.scene_id, self._sequence, depth))
             self._scenes.publish(header, arrays)
         except Exception as error:  # of one snapshot; the next one may do
-            if is_said(self._problems.add("scenes that could not be shown", f"{type(error).__name__}: {error}")):
+            if is_logged(self._problems.add("scenes that could not be shown", f"{type(error).__name__}: {error}")):
                 log.exception("a scene could not be shown")
 
-    def _tell_map(self, found: Mapped | str) -> None:
+    def _publish_map(self, found: OccupancyResult | str) -> None:
         if self._maps is not None:
-            self._maps.tell(found, self._shown, self._sequence)
+            self._maps.publish(found, self._shown, self._sequence)
 
     def _answer(self, command: Command) -> Answer:
-        if isinstance(command, Seen):
-            self._problems.seen()
+        if isinstance(command, MarkProblemsSeen):
+            self._problems.mark_seen()
             return Answer(True, "the problems are not told again")
-        left, here = self._worker.scenes_left_with(command.name), command.name in self._store.names
+        left, here = self._worker.find_inactive_scenes(command.name), command.name in self._store.names
         if not left and not here:
             known = ", ".join(sorted(self._store.names)) or "none yet"
-            return Answer(False, printable(f"no keyframe {command.name!r}; there are: {known}"))
+            return Answer(False, sanitize_text(f"no keyframe {command.name!r}; there are: {known}"))
         try:
             if left:
-                self._store.retract_elsewhere(command.name, left)
+                self._store.request_removal(command.name, left)
             if here:
                 self._store.forget(command.name, "retracted")
         except OSError as error:
             return Answer(
-                False, printable(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
+                False, sanitize_text(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
             )
         if here:
-            self._inbox.put_at_once(LeftOut(command.name))
+            self._inbox.enqueue_now(RemovedFrame(command.name))
         event(log, logging.INFO, "retracted", frame=command.name, left=",".join(left))
         those = f"{', '.join(left)}, which the camera has left, is built anew without it when no keyframe waits"
         told = [*(["the scene is built anew without it"] if here else []), *([those] if left else [])]
-        return Answer(True, printable(f"{command.name} is removed; {'; '.join(told)}"))
+        return Answer(True, sanitize_text(f"{command.name} is removed; {'; '.join(told)}"))
 
-    def _status(self) -> ReconStatus:
+    def _make_status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None
         intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked
         delay_s, delay = worker.delay
-        scenes, maps, loops = worker.known
+        scenes, maps, loops = worker.map_counts
         return ReconStatus(
             **self._status_numbers.next(),
-            state=State.FULL if intake.full else State.LOADING if worker.loading else worker.place.state,
+            state=ReconState.FULL if intake.full else ReconState.LOADING if worker.loading else worker.place.state,
             uptime_s=time.monotonic() - self._started_s,
             scene_id=self._store.scene_id,
             keyframe=intake.newest,
@@ -248,12 +248,14 @@ class Daemon:
             iterations=snapshot.iterations if snapshot else 0,
             final=bool(snapshot and snapshot.final),
             verdict=snapshot.verdict.code.value if snapshot else "",
-            message=printable(snapshot.verdict.message) if snapshot else "",
-            bounds=printable(bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale)) if snapshot else "",
+            message=sanitize_text(snapshot.verdict.message) if snapshot else "",
+            bounds=sanitize_text(bounds_in_words.format_widest_bounds(snapshot.cameras, snapshot.scale))
+            if snapshot
+            else "",
             keyframe_s=worker.place.keyframe_s,
             delay_s=delay_s,
             delay=delay,
-            unfinished=worker.unfinished,
+            unfinished=worker.num_unfinished,
             scenes=scenes,
             maps=maps,
             loops=loops,
@@ -263,20 +265,20 @@ class Daemon:
             rss_mb=resident_mb(),
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
-            tracked=_shown_camera(tracked),
-            problem=self._problem(),
+            tracked=_make_live_camera_record(tracked),
+            problem=self._describe_problem(),
         )
 
-    def _problem(self) -> str:
-        """What keeps the node from working as it should now, and what went wrong that nobody has seen yet."""
+    def _describe_problem(self) -> str:
+        """Describes what keeps the node from working now, and problems that nobody has acknowledged yet."""
         for what, endpoint in (("commands", self._commands), ("requests for scenes", self._scenes)):
             self._problems.count(f"{what} that were refused", endpoint.refused, endpoint.why_refused)
         intake = self._intake
-        now = intake.full or intake.unconnected or self._worker.problem or self._disk_space.problem()
-        return printable("; ".join(filter(None, (now, str(self._problems)))))
+        now = intake.full or intake.unconnected or self._worker.problem or self._disk_space.describe_problem()
+        return sanitize_text("; ".join(filter(None, (now, str(self._problems)))))
 
     @contextlib.contextmanager
-    def _closing_on_error(self) -> Iterator[None]:
+    def _close_on_error(self) -> Iterator[None]:
         try:
             yield
         except BaseException:
@@ -284,27 +286,27 @@ class Daemon:
             raise
 
 
-def _shown_camera(tracked: CameraEstimate | None) -> CameraRecord | None:
+def _make_live_camera_record(tracked: CameraEstimate | None) -> CameraRecord | None:
     """None, too, for one that nothing can be seen through: tracking went astray."""
     try:
-        return None if tracked is None else camera_record(tracked)
+        return None if tracked is None else make_camera_record(tracked)
     except ValueError as error:
         log.debug("where the live camera is cannot be told: %s", error)
         return None
 
 
-class _Newest:
+class _NewestSnapshot:
     """Holds the newest snapshot that has not been published, between two threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._shown: Published | None = None
+        self._shown: PublishedSnapshot | None = None
 
-    def put(self, shown: Published) -> None:
+    def update(self, shown: PublishedSnapshot) -> None:
         with self._lock:
             self._shown = shown
 
-    def take(self) -> Published | None:
+    def take(self) -> PublishedSnapshot | None:
         with self._lock:
             shown, self._shown = self._shown, None
             return shown

@@ -8,8 +8,8 @@ from splatnode.capture.process.disk_space import shortage
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
-from splatnode.recon.result.size import result_bytes
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.result.size import estimate_result_bytes
 
 log = logging.getLogger(__name__)
 
@@ -21,18 +21,18 @@ BYTES_A_GAUSSIAN = 56  # 14 numbers of 4 bytes
 class DiskSpace:
     """The free space where the daemon writes, against what it may still write."""
 
-    def __init__(self, config: Config, store: Store) -> None:
+    def __init__(self, config: DaemonConfig, store: Store) -> None:
         self._config, self._store = config, store
         self._told = ""
 
-    def problem(self) -> str:
-        """What may not fit, and where; empty where there is room for all. A change is logged."""
+    def describe_problem(self) -> str:
+        """Describes what may not fit and where; empty where there is room for all. A change is logged."""
         further_keyframes = max(0, self._config.max_views - len(self._store.names))
         most_gaussians = self._config.max_gaussians
         checkpoint_bytes = further_keyframes * BYTES_A_KEYFRAME + most_gaussians * BYTES_A_GAUSSIAN
         try:
             problem = shortage(self._store.directory, checkpoint_bytes, "the checkpoint") or shortage(
-                self._config.out, result_bytes(most_gaussians, self._config.max_views), "the result"
+                self._config.out, estimate_result_bytes(most_gaussians, self._config.max_views), "the result"
             )
         except OSError as error:
             if is_shortage(error):  # this time it is not known

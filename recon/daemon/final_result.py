@@ -7,7 +7,7 @@ import time
 
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.output import Output
-from splatnode.recon.daemon.places import State
+from splatnode.recon.daemon.places import SubmapState
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -22,14 +22,14 @@ class FinalResult:
 
     def write(self, snapshot: Snapshot, work: IncrementalReconstruction) -> bool:
         """Writes the scene as the final one of its keyframes; False where the disk does not take it."""
-        written = self._output.export(snapshot, work, self._store, State.HERE, sorted(self._store.names))
+        written = self._output.export(snapshot, work, self._store, SubmapState.HERE, sorted(self._store.names))
         # What is kept as final is not exported after a restart.
         self._output.save(self._store, work, final=written)
         self.names = frozenset(work.names) if written else frozenset()
         self._not_before_s = time.monotonic() + AGAIN_S
         return written
 
-    def write_refused(self, shown: Snapshot | None, work: IncrementalReconstruction, at_once: bool) -> bool:
+    def retry_write(self, shown: Snapshot | None, work: IncrementalReconstruction, at_once: bool) -> bool:
         """Writes a final scene that is shown and that the disk did not take; False where there is none, or not now."""
         if shown is None or not shown.final or self.names == frozenset(work.names):
             return False

@@ -10,11 +10,11 @@ import logging
 from collections.abc import Callable, Iterable, Iterator
 
 from splatnode.capture.process.logs import event
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import membership
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
-from splatnode.recon.modelling import Shown
+from splatnode.recon.modelling import SceneWithVerdict
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +23,7 @@ STEP = 10  # iterations between pauses
 Forget = Callable[[str, str], None]  # a keyframe's name, and why
 
 
-def screened(work: IncrementalReconstruction, keyframes: Iterable[Keyframe], forget: Forget) -> list[Keyframe]:
+def screen_keyframes(work: IncrementalReconstruction, keyframes: Iterable[Keyframe], forget: Forget) -> list[Keyframe]:
     """Those of the keyframes that show something new, and sharply; what does not is forgotten."""
     kept: list[Keyframe] = []
     for keyframe in keyframes:
@@ -35,23 +35,23 @@ def screened(work: IncrementalReconstruction, keyframes: Iterable[Keyframe], for
     return kept
 
 
-def judge(work: IncrementalReconstruction, forget: Forget, pause: Pause) -> None:
+def verify_keyframes(work: IncrementalReconstruction, forget: Forget, pause: Pause) -> None:
     """Estimates thoroughly which keyframes belong to the place; those that contradict it are forgotten."""
-    membership.prove(work, pause)
-    for keyframe in membership.contradicting(work, pause):
+    membership.verify_provisional(work, pause)
+    for keyframe in membership.find_contradicting(work, pause):
         forget(keyframe.name, "it contradicts the scene")
 
 
-def refine(work: IncrementalReconstruction, config: Config, pause: Pause) -> Iterator[Shown]:
+def refine(work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause) -> Iterator[SceneWithVerdict]:
     """The scene of all keyframes at every checkpoint, and at the end; it is not shown yet.
 
     Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
     """
     steps = itertools.count(1)
 
-    def now_and_then() -> None:
+    def pause_periodically() -> None:
         if next(steps) % STEP == 0:
             pause()
 
     work.rebuild(pause)
-    yield from work.refine(work.begun, config.optimize, now_and_then)
+    yield from work.refine(work.initial_scene, config.optimize, pause_periodically)

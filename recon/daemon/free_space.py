@@ -13,8 +13,8 @@ import numpy as np
 
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.recon.daemon.status import State
-from splatnode.recon.daemon.watcher import Finished
+from splatnode.recon.daemon.status import ReconState
+from splatnode.recon.daemon.watcher import FinalScene
 from splatnode.recon.occupancy.build import occupancy_map
 from splatnode.recon.occupancy.occupancy_map import OccupancyMap
 from splatnode.recon.result.depth_file import read_depths
@@ -27,58 +27,60 @@ NOT_FINAL = "a map is made of a scene that is final: when no keyframe has come f
 LOST = "the last keyframes do not belong to the scene: where the robot is now is not known"
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class OccupancyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     live: bool = False  # send the map of each scene that is final, as the service recon.map
     # Side of a voxel, in the unit of the scene; nothing: as `splatnode map` chooses it
     voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class Mapped:
-    """What became of the map of a scene."""
+class OccupancyResult:
+    """The occupancy map of a scene, or the reason why there is none."""
 
-    of: Finished
+    of: FinalScene
     occupancy: OccupancyMap | None
     why: str = ""  # there is none
 
 
-class FreeSpace:
+class OccupancyMapper:
     """Maps the present scene. `make` is for the thread that works; any thread may ask for `current`."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: OccupancyConfig) -> None:
         self._config = config
-        self._made: Mapped | None = None
+        self._made: OccupancyResult | None = None
 
-    def make(self, finished: Finished | None, state: State, folder: Path, pause: Callable[[], None]) -> bool:
+    def map_scene(
+        self, finished: FinalScene | None, state: ReconState, folder: Path, pause: Callable[[], None]
+    ) -> bool:
         """Maps the final scene, of which `folder` is the result; False where there was nothing to do.
 
         What `pause` raises ends the work.
         """
-        if not self._config.live or finished is None or state is State.LOST or self._is_of(finished):
+        if not self._config.live or finished is None or state is ReconState.LOST or self._is_map_of(finished):
             return False
         try:
-            snapshot = _with_depths(finished.snapshot, folder)
+            snapshot = _add_depths(finished.snapshot, folder)
             occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=pause), ""
         except ValueError as error:
             occupancy, why = None, str(error)
-        self._made = Mapped(finished, occupancy, why)
+        self._made = OccupancyResult(finished, occupancy, why)
         shares = {} if occupancy is None else {name: round(share, 4) for name, share in occupancy.shares.items()}
         event(log, logging.INFO, "map", why=why, **shares)
         return True
 
-    def current(self, finished: Finished | None, state: State) -> Mapped | str:
+    def find_current_map(self, finished: FinalScene | None, state: ReconState) -> OccupancyResult | str:
         """The map of this scene as it is now, or why there is none."""
-        if state is State.LOST:
+        if state is ReconState.LOST:
             return LOST
         made = self._made
         return made if made is not None and made.of is finished else NOT_FINAL
 
-    def _is_of(self, finished: Finished) -> bool:
+    def _is_map_of(self, finished: FinalScene) -> bool:
         return self._made is not None and self._made.of is finished
 
 
-def _with_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
-    """With the confirmed depths; those of a scene that an earlier process made final are in its result alone."""
+def _add_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
+    """Adds the multi-view consistent depths, from the result folder if an earlier process made the scene."""
     if snapshot.depths or not folder.is_dir():
         return snapshot
     try:

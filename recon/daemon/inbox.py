@@ -15,7 +15,7 @@ WAIT_S = 0.1  # between looks at whether the daemon stops
 
 
 @dataclass(frozen=True, eq=False)
-class Arrived:
+class ArrivedKeyframe:
     """A keyframe that the checkpoint holds."""
 
     keyframe: Keyframe
@@ -23,21 +23,21 @@ class Arrived:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class RemovedFrame:
     """A frame that the checkpoint names as left out, or no longer holds."""
 
     name: str
 
 
-Event = Arrived | LeftOut
+Event = ArrivedKeyframe | RemovedFrame
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     """Nobody waits for the one that puts."""
 
 
-def _both_arrived(one: Event, other: Event) -> bool:
-    return isinstance(one, Arrived) and isinstance(other, Arrived)
+def _are_both_keyframes(one: Event, other: Event) -> bool:
+    return isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)
 
 
 class Inbox:
@@ -52,9 +52,9 @@ class Inbox:
     def oldest_s(self) -> float | None:
         """When the keyframe came that waits longest (monotonic); None: none waits."""
         with self._changed:
-            return next((each.at_s for each in self._events if isinstance(each, Arrived)), None)
+            return next((each.at_s for each in self._events if isinstance(each, ArrivedKeyframe)), None)
 
-    def put(self, event: Event, stopping: threading.Event, meanwhile: Callable[[], None] = _nothing) -> None:
+    def enqueue(self, event: Event, stopping: threading.Event, meanwhile: Callable[[], None] = _do_nothing) -> None:
         """Waits where the inbox is full, until there is room or the daemon stops; calls `meanwhile` again and again."""
         with self._changed:
             while len(self._events) >= CAPACITY and not stopping.is_set():
@@ -63,18 +63,18 @@ class Inbox:
             self._events.append(event)
             self._changed.notify_all()
 
-    def put_at_once(self, event: LeftOut) -> None:
+    def enqueue_now(self, event: RemovedFrame) -> None:
         """Also where the inbox is full: who gives commands does not wait for the work."""
         with self._changed:
             self._events.append(event)
             self._changed.notify_all()
 
-    def get(self, timeout_s: float) -> list[Event]:
+    def dequeue(self, timeout_s: float) -> list[Event]:
         """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []
-            while self._events and 0 < len(events) < BATCH and _both_arrived(events[0], self._events[0]):
+            while self._events and 0 < len(events) < BATCH and _are_both_keyframes(events[0], self._events[0]):
                 events.append(self._events.popleft())
             self._changed.notify_all()
             return events

@@ -13,11 +13,11 @@ from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.keyframes import KeyframeClient
 from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
-from splatnode.capture.process.problems import Problems, is_said
-from splatnode.recon.config import Config
+from splatnode.capture.process.problems import Problems, is_logged
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.checkpoint.stored_frame import StoredFrame
-from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.inbox import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.preparation import prepare
 
@@ -32,7 +32,7 @@ class Intake:
     def __init__(
         self,
         network: Network,
-        config: Config,
+        config: ReconstructionConfig,
         store: Store,
         inbox: Inbox,
         problems: Problems,
@@ -49,12 +49,12 @@ class Intake:
         """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
         while not self._stopping.is_set():
             try:
-                with KeyframeClient(self._network, self._store.seen, recon=self._store.identity) as client:
+                with KeyframeClient(self._network, self._store.frame_keys, recon=self._store.identity) as client:
                     self._receive(client)
             except Exception as error:
                 expected = isinstance(error, NotAllowed)
-                self._say_unconnected(str(error) if expected else f"{type(error).__name__}: {error}")
-                if not expected and is_said(self._problems.add("failures of the keyframes' connection", error)):
+                self._report_unconnected(str(error) if expected else f"{type(error).__name__}: {error}")
+                if not expected and is_logged(self._problems.add("failures of the keyframes' connection", error)):
                     log.exception("the connection that keyframes come by failed")
                 self._stopping.wait(RETRY_S)
 
@@ -65,15 +65,15 @@ class Intake:
             self.refused, self.duplicates = before + client.refused, client.duplicates
             self._problems.count("keyframes that were refused", self.refused, client.why_refused)
             if client.served is not None:
-                self._say_unconnected("" if client.served else ANOTHER_IS_SERVED)
+                self._report_unconnected("" if client.served else ANOTHER_IS_SERVED)
             if received is not None:
-                self._take(client, received)
+                self._store_received(client, received)
 
-    def _take(self, client: KeyframeClient, received: ReceivedFrame) -> None:
+    def _store_received(self, client: KeyframeClient, received: ReceivedFrame) -> None:
         arrived_s = time.monotonic()
         while not self._stopping.is_set():
             try:
-                stored = self._store.put(received)
+                stored = self._store.add_frame(received)
             except Exception as error:
                 if is_shortage(error):
                     self._wait_for_memory(client, received.frame.name)
@@ -81,32 +81,32 @@ class Intake:
                 if not isinstance(error, OSError):
                     client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
                     return
-                self._say_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
+                self._report_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
                 self._stopping.wait(RETRY_S)
                 client.say_ready()
                 continue
             self.full = ""
             client.acknowledge(received)
             if stored is not None:  # what the camera could not give is told with the next scene, and disturbs none
-                self._hand_over(client, stored, arrived_s)
+                self._enqueue_keyframe(client, stored, arrived_s)
             return
 
-    def _hand_over(self, client: KeyframeClient, stored: StoredFrame, arrived_s: float) -> None:
+    def _enqueue_keyframe(self, client: KeyframeClient, stored: StoredFrame, arrived_s: float) -> None:
         self.newest = stored.number
         name = stored.frame.name
         try:
-            keyframe = self._prepared(client, stored)
+            keyframe = self._prepare_keyframe(client, stored)
         except Exception as error:  # a frame that cannot be used must not stop those that can
             if is_shortage(error):  # the daemon stops: the next start prepares it
                 return
-            if is_said(self._problems.add("keyframes that cannot be used", f"{name}: {error}")):
+            if is_logged(self._problems.add("keyframes that cannot be used", f"{name}: {error}")):
                 log.exception("%s cannot be used", name)
             self._forget(name, f"cannot be used: {error}")
-            self._inbox.put(LeftOut(name), self._stopping, client.say_ready)
+            self._inbox.enqueue(RemovedFrame(name), self._stopping, client.say_ready)
             return
-        self._inbox.put(Arrived(keyframe, arrived_s), self._stopping, client.say_ready)
+        self._inbox.enqueue(ArrivedKeyframe(keyframe, arrived_s), self._stopping, client.say_ready)
 
-    def _prepared(self, client: KeyframeClient, stored: StoredFrame) -> Keyframe:
+    def _prepare_keyframe(self, client: KeyframeClient, stored: StoredFrame) -> Keyframe:
         """Waits where the memory does not suffice; while the daemon stops, that is raised."""
         while True:
             try:
@@ -120,7 +120,7 @@ class Intake:
                 return keyframe
 
     def _wait_for_memory(self, client: KeyframeClient, name: str) -> None:
-        self._say_full(f"{name} has to wait: {SHORT_OF_MEMORY}")
+        self._report_full(f"{name} has to wait: {SHORT_OF_MEMORY}")
         self._stopping.wait(RETRY_S)
         client.say_ready()
 
@@ -130,12 +130,12 @@ class Intake:
         except OSError as error:  # it stays stored, and is found to be unusable again after a restart
             log.error("%s cannot be removed from the checkpoint: %s", name, error)
 
-    def _say_full(self, problem: str) -> None:
+    def _report_full(self, problem: str) -> None:
         if problem != self.full:
             log.error("%s", problem)
         self.full = problem
 
-    def _say_unconnected(self, problem: str) -> None:
+    def _report_unconnected(self, problem: str) -> None:
         if problem and problem != self.unconnected:
             log.error("%s", problem)
         self.unconnected = problem

@@ -15,26 +15,33 @@ from pathlib import Path
 
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import finishing, membership, places
-from splatnode.recon.daemon.atlas.atlas import Atlas
+from splatnode.recon.daemon.atlas.atlas import LoopDetector
 from splatnode.recon.daemon.checkpoint import checkpoint, left, made_anew
 from splatnode.recon.daemon.checkpoint.ledger import CheckpointError
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
-from splatnode.recon.modelling import Shown
+from splatnode.recon.modelling import SceneWithVerdict
 
 log = logging.getLogger(__name__)
 
 AGAIN_S = 300.0  # after a place could not be finished
 
-_Step = Callable[[Store, checkpoint.Restored, Pause], bool]
+_Step = Callable[[Store, checkpoint.RestoredReconstruction, Pause], bool]
 
 
-class LeftPlaces:
-    def __init__(self, here: Store, config: Config, output: Output, atlas: Atlas, fallback_s: float = math.inf) -> None:
+class InactiveSubmaps:
+    def __init__(
+        self,
+        here: Store,
+        config: ReconstructionConfig,
+        output: Output,
+        atlas: LoopDetector,
+        fallback_s: float = math.inf,
+    ) -> None:
         """`here` is the checkpoint which has left/ in it, `config` how scenes are made.
 
         Fallbacks take at most `fallback_s` seconds of each step with a place.
@@ -46,39 +53,45 @@ class LeftPlaces:
         self._retract_after_s = -math.inf  # monotonic: a keyframe could not be taken out before
 
     @property
-    def unfinished(self) -> int:
+    def num_unfinished(self) -> int:
         """Places that were left and are not finished."""
-        return len(left.folders(self._here.directory))
+        return len(left.list_left_folders(self._here.directory))
 
-    def leave_out(self, seconds: float) -> None:
-        """Of the seconds that the report will tell: they were spent otherwise."""
+    def exclude_seconds(self, seconds: float) -> None:
+        """Excludes these seconds, which were spent on other work, from the report."""
         if self._work is not None:
             self._work.clock.leave_out(seconds)
 
-    def judge_next(self, pause: Pause) -> bool:
+    def verify_next(self, pause: Pause) -> bool:
         """Judges the oldest place that is not judged yet with all its evidence, and compares it with the others.
 
         Its scene stays a draft, in a result folder, unless there is none to be made. False where there is none to be
         judged now. What places that were left are to lose is taken out of them first. What `pause` raises ends the
         work; it is begun again another time, as after a failure.
         """
-        self._retract()
-        return self._work_on([each for each in self._waiting if not self._atlas.knows(each.name)], self._judge, pause)
+        self._remove_keyframes()
+        return self._process_first(
+            [each for each in self._pending_folders if not self._atlas.has_scene(each.name)], self._verify, pause
+        )
 
-    def finish_next(self, pause: Pause) -> bool:
+    def finalize_next(self, pause: Pause) -> bool:
         """Makes the scene of the oldest place that is judged, as good as it gets, and writes its result.
 
         False where there is none to be made now; `pause` as for `judge_next`.
         """
-        return self._work_on([each for each in self._waiting if self._atlas.knows(each.name)], self._make, pause)
+        return self._process_first(
+            [each for each in self._pending_folders if self._atlas.has_scene(each.name)], self._finalize, pause
+        )
 
     @property
-    def _waiting(self) -> list[Path]:
+    def _pending_folders(self) -> list[Path]:
         """The folders of the places that are not finished, the oldest first; not those that failed a moment ago."""
         now = time.monotonic()
-        return [each for each in left.folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now]
+        return [
+            each for each in left.list_left_folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now
+        ]
 
-    def _work_on(self, folders: Sequence[Path], step: _Step, pause: Pause) -> bool:
+    def _process_first(self, folders: Sequence[Path], step: _Step, pause: Pause) -> bool:
         """Takes the step with the first of the places; False where there is none, or the disk did not take it."""
         if not folders:
             return False
@@ -104,13 +117,13 @@ class LeftPlaces:
             del self._not_before_s[folder]
         return True
 
-    def _retract(self) -> None:
+    def _remove_keyframes(self) -> None:
         """Takes out of the places that were left what they are to lose; their scenes are not final then."""
         if time.monotonic() < self._retract_after_s:
             return
         for scene, name in self._here.ledger.retracted:
             try:
-                self._take_out(scene, name)
+                self._remove_keyframe(scene, name)
             except OSError as error:
                 raise_shortage(error)
                 self._output.complain(
@@ -119,11 +132,11 @@ class LeftPlaces:
                 self._retract_after_s = time.monotonic() + AGAIN_S
                 return
 
-    def _take_out(self, scene: str, name: str) -> None:
+    def _remove_keyframe(self, scene: str, name: str) -> None:
         """Raises OSError."""
         folder = left.reopen(self._here.directory, scene)
         if folder is not None:
-            self._atlas.forget(scene)
+            self._atlas.remove_scene(scene)
             made_anew.remove(folder, "codes")
             self._not_before_s.pop(folder, None)
             try:
@@ -132,79 +145,83 @@ class LeftPlaces:
             except CheckpointError as error:
                 raise_shortage(error)
                 self._output.complain(f"{name} cannot be taken out of {scene}: {error}")
-        self._here.was_retracted(scene, name)
+        self._here.confirm_removal(scene, name)
 
-    def _judge(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+    def _verify(self, store: Store, found: checkpoint.RestoredReconstruction, pause: Pause) -> bool:
         """Whether the place is judged now, and its result written."""
         work = found.work
-        if found.final and not found.new and not self._part(store, work, pause):  # as it was when the place was left
-            self._output.finished(store.scene_id)
+        if (
+            found.final and not found.new and not self._split_off(store, work, pause)
+        ):  # as it was when the place was left
+            self._output.mark_finished(store.scene_id)
         else:
             event(log, logging.INFO, "judging", scene=store.scene_id)
-            self._weigh(store, found, pause)
+            self._verify_keyframes(store, found, pause)
             self._output.save_fallbacks(store, work)
             if not work.estimate_soon(pause).publishable:
-                return self._make(store, found, pause)
+                return self._finalize(store, found, pause)
             work.update(pause)
-            snapshot = work.snapshot(store.dropped, final=False)
-            if not self._output.export(snapshot, work, store, places.State.LEFT, work.names):
+            snapshot = work.snapshot(store.frames_dropped, final=False)
+            if not self._output.export(snapshot, work, store, places.SubmapState.LEFT, work.names):
                 return False
             self._output.save(store, work, final=False)
         work.release_scene()  # the checkpoint has it, and comparing takes memory, too
         give_back_memory()
-        self._atlas.keep(store, work.graph, self._atlas.compare(store.scene_id, work.graph, pause))
+        self._atlas.add_scene(store, work.graph, self._atlas.detect_loops(store.scene_id, work.graph, pause))
         return True
 
-    def _weigh(self, store: Store, found: checkpoint.Restored, pause: Pause) -> None:
+    def _verify_keyframes(self, store: Store, found: checkpoint.RestoredReconstruction, pause: Pause) -> None:
         """All evidence on all keyframes; those that do not belong to the place are forgotten."""
         work = found.work
 
         def forget(name: str, reason: str) -> None:
             store.forget(name, reason)
-            work.retract([name])
+            work.remove_keyframes([name])
 
-        for keyframe in finishing.screened(work, found.new, forget):  # that came shortly before the place was left
-            work.add(keyframe, pause)
-        finishing.judge(work, forget, pause)
-        if self._part(store, work, pause):
+        for keyframe in finishing.screen_keyframes(
+            work, found.new, forget
+        ):  # that came shortly before the place was left
+            work.add_keyframe(keyframe, pause)
+        finishing.verify_keyframes(work, forget, pause)
+        if self._split_off(store, work, pause):
             work.estimate_thoroughly(pause)
-        for keyframe in work.aside:
+        for keyframe in work.keyframes_deferred:
             forget(keyframe.name, "it does not fit the scene")
 
-    def _part(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> bool:
+    def _split_off(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> bool:
         """Whether some of the keyframes showed other places, and are places of their own now, which wait here."""
-        parts = membership.apart(work, pause)
+        parts = membership.find_separate_groups(work, pause)
         for keyframes in parts:
             names = [keyframe.name for keyframe in keyframes]
-            scene = store.part(names)
-            self._output.parted(scene, names)
+            scene = store.split_off(names)
+            self._output.add_split_submap(scene, names)
             event(log, logging.INFO, "parted", scene=store.scene_id, part=scene, keyframes=len(names))
-            work.retract(names)
+            work.remove_keyframes(names)
         return bool(parts)
 
-    def _make(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+    def _finalize(self, store: Store, found: checkpoint.RestoredReconstruction, pause: Pause) -> bool:
         """Whether the scene of a place that is judged is final now, and its result written."""
         work = found.work
         if not found.final:
             event(log, logging.INFO, "finishing", scene=store.scene_id)
             work.release_scene()  # it is made anew
-            work.show(_last(work, self._config, pause))
+            work.show(_refine_to_end(work, self._config, pause))
             work.estimate_soon(pause)
-            snapshot = work.snapshot(store.dropped, final=True)
-            if not self._output.export(snapshot, work, store, places.State.FINISHED, work.names):
+            snapshot = work.snapshot(store.frames_dropped, final=True)
+            if not self._output.export(snapshot, work, store, places.SubmapState.FINISHED, work.names):
                 return False
             self._output.save(store, work, final=True)
         if work.scene is None:  # one that is refused is of no use later
-            self._atlas.forget(store.scene_id)
+            self._atlas.remove_scene(store.scene_id)
             left.remove(store.directory)
         else:
-            store.remove_shown()
-            store.finish()
+            store.remove_scene_files()
+            store.finalize()
         return True
 
 
-def _last(work: IncrementalReconstruction, config: Config, pause: Pause) -> Shown:
-    show = Shown()
+def _refine_to_end(work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause) -> SceneWithVerdict:
+    show = SceneWithVerdict()
     for show in finishing.refine(work, config, pause):  # noqa: B007
         pass
     return show

@@ -11,14 +11,14 @@ from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shorta
 from splatnode.recon.daemon import places
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.metres import Metres
-from splatnode.recon.daemon.places import Place, Places, State, described
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.metres import MetricScaler
+from splatnode.recon.daemon.places import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.write import write_result_folder
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,7 @@ PROVISIONAL = "-provisional"  # ends the name of a result folder whose scene is 
 
 
 @dataclass(frozen=True, eq=False)
-class Published:
+class PublishedSnapshot:
     """A snapshot that viewers may see, with the id of its scene."""
 
     snapshot: Snapshot
@@ -35,17 +35,21 @@ class Published:
 
 class Output:
     def __init__(
-        self, config: Config, store: Store, publish: Callable[[Published], None], complain: Callable[[str], None]
+        self,
+        config: DaemonConfig,
+        store: Store,
+        publish: Callable[[PublishedSnapshot], None],
+        complain: Callable[[str], None],
     ) -> None:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
         self._config, self._store, self._publish, self.complain = config, store, publish, complain
-        self.places = Places(config.out, store.identity)
-        self._metres = Metres(config.reconstruction.metric)
+        self.places = SubmapIndex(config.out, store.identity)
+        self._metres = MetricScaler(config.reconstruction.metric)
 
     def publish(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """Shows what `work` has come to, in metres where these are known; what is shown."""
-        measured = self._metres.of_shown(snapshot, work)
-        self._publish(Published(measured, self._store.scene_id))
+        measured = self._metres.scale_snapshot(snapshot, work)
+        self._publish(PublishedSnapshot(measured, self._store.scene_id))
         return measured
 
     def save(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
@@ -67,7 +71,7 @@ class Output:
         snapshot: Snapshot,
         work: IncrementalReconstruction,
         place: Store,
-        state: State,
+        state: SubmapState,
         kept: Sequence[str],
     ) -> bool:
         """Writes the place's result folder, all of it or nothing; returns whether it was written.
@@ -79,35 +83,35 @@ class Output:
         provisional = folder.with_name(folder.name + PROVISIONAL)
         folder = folder if snapshot.final else provisional
         judged = snapshot.final or not snapshot.verdict.provisional
-        before = self.places.cameras(place.scene_id) if judged else {}
+        before = self.places.load_cameras(place.scene_id) if judged else {}
         try:
-            measured = self._metres.of_written(snapshot, work)
-            finish(measured, folder, seed=recipe.seed, preset_name="live")
+            measured = self._metres.scale_result(snapshot, work)
+            write_result_folder(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)
-            self.places.tell(_described(place, state, folder.name, snapshot, kept))
+            self.places.update(_make_submap_record(place, state, folder.name, snapshot, kept))
             if judged:
-                self.places.link(place.scene_id, before)
+                self.places.link_scene(place.scene_id, before)
         except OSError as error:
             self.complain(SHORT_OF_MEMORY if is_shortage(error) else error.strerror or str(error))
             return False
-        known = bounds_in_words.of_cameras(measured.cameras, measured.scale)
+        known = bounds_in_words.format_widest_bounds(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
         return True
 
-    def tell(self, snapshot: Snapshot, state: State, kept: Sequence[str]) -> None:
+    def update_index(self, snapshot: Snapshot, state: SubmapState, kept: Sequence[str]) -> None:
         """Writes into the index what is known of the present place, which has no result in a folder."""
-        self._write(lambda: self.places.tell(_described(self._store, state, None, snapshot, kept)))
+        self._write_index(lambda: self.places.update(_make_submap_record(self._store, state, None, snapshot, kept)))
 
-    def parted(self, scene_id: str, names: Sequence[str]) -> None:
+    def add_split_submap(self, scene_id: str, names: Sequence[str]) -> None:
         """Writes into the index that these keyframes of a place that was left are one of their own."""
-        self._write(lambda: self.places.tell(places.not_judged(scene_id, names)))
+        self._write_index(lambda: self.places.update(places.make_unverified_record(scene_id, names)))
 
-    def finished(self, scene_id: str) -> None:
+    def mark_finished(self, scene_id: str) -> None:
         """Writes into the index that the camera has left a place whose scene is final."""
-        self._write(lambda: self.places.finished(scene_id))
+        self._write_index(lambda: self.places.mark_finished(scene_id))
 
-    def _write(self, write: Callable[[], None]) -> None:
+    def _write_index(self, write: Callable[[], None]) -> None:
         try:
             write()
         except OSError as error:
@@ -118,6 +122,10 @@ def _why(error: OSError) -> str:
     return SHORT_OF_MEMORY if is_shortage(error) else f"{error.strerror}: make room on the disk"
 
 
-def _described(place: Store, state: State, folder: str | None, snapshot: Snapshot, kept: Sequence[str]) -> Place:
+def _make_submap_record(
+    place: Store, state: SubmapState, folder: str | None, snapshot: Snapshot, kept: Sequence[str]
+) -> SubmapRecord:
     ledger = place.ledger
-    return described(place.scene_id, state, folder, snapshot, kept, place.dropped, ledger.follows, ledger.shared)
+    return make_submap_record(
+        place.scene_id, state, folder, snapshot, kept, place.frames_dropped, ledger.follows, ledger.shared
+    )

@@ -10,7 +10,7 @@ from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.preview import PreviewHeader
-from splatnode.capture.process.problems import Problems, is_said
+from splatnode.capture.process.problems import Problems, is_logged
 
 log = logging.getLogger(__name__)
 
@@ -18,7 +18,7 @@ READ_S = 0.05  # between reads: a queue that is full keeps the oldest, and this 
 RETRY_S = 1.0  # after the connection failed
 
 
-class Previews:
+class PreviewReceiver:
     """The newest preview. One thread runs `run`, another takes."""
 
     def __init__(self, network: Network, problems: Problems, stopping: threading.Event) -> None:
@@ -43,7 +43,7 @@ class Previews:
             except NotAllowed:  # which the keyframes' connection tells, too
                 self._stopping.wait(RETRY_S)
             except Exception as error:  # a key's file, for one, may be written just now
-                self._say_unconnected(error)
+                self._report_unconnected(error)
                 self._stopping.wait(RETRY_S)
 
     def _receive(self, subscriber: Subscriber) -> None:
@@ -58,11 +58,11 @@ class Previews:
                 with self._lock:
                     self._newest = newest
 
-    def _say_unconnected(self, error: Exception) -> None:
+    def _report_unconnected(self, error: Exception) -> None:
         """Once, however long it lasts."""
         why = f"{type(error).__name__}: {error}"
         if why == self._unconnected:
             return
         self._unconnected = why
-        if is_said(self._problems.add("failures of the previews' connection", why)):
+        if is_logged(self._problems.add("failures of the previews' connection", why)):
             log.error("the connection that previews come by failed", exc_info=error)

@@ -12,7 +12,7 @@ from splatnode.capture.messaging.wire import Header
 from splatnode.recon.result.message import CameraRecord
 
 
-class State(enum.Enum):
+class ReconState(enum.Enum):
     LOADING = "loading"  # what an earlier process knew, after a start
     WAITING = "waiting"  # until there are keyframes enough for a scene
     GROWING = "growing"  # adds keyframes to the scene
@@ -25,7 +25,7 @@ class State(enum.Enum):
 PLACES = 8  # that a heartbeat tells of; places.json has all
 
 
-class PlaceStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SubmapStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A place, as it was when it was last worked on."""
 
     scene_id: Name
@@ -38,7 +38,7 @@ class PlaceStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    state: State
+    state: ReconState
     uptime_s: Amount
     scene_id: Name
     keyframe: Count  # number of the last one that was taken, -1 before
@@ -57,7 +57,7 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     scenes: Count  # whose cameras are judged with all evidence, of all places
     maps: Count  # that these are, joined by the chains and loops that count
     loops: Count
-    newest_places: Annotated[tuple[PlaceStatus, ...], msgspec.Meta(max_length=PLACES)]
+    newest_places: Annotated[tuple[SubmapStatus, ...], msgspec.Meta(max_length=PLACES)]
     refused: Count  # malformed messages
     duplicates: Count  # keyframes that came again
     rss_mb: Amount

@@ -19,9 +19,9 @@ from scipy.special import chdtr
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe
-from splatnode.recon.geometry import MIN_DEPTH, project, to_camera
+from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera
 from splatnode.recon.matching import features, nearest_neighbours
-from splatnode.recon.registration.straightened import straight_pixels
+from splatnode.recon.registration.straightened import undistort_pixels
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
@@ -32,7 +32,7 @@ MIN_VARIANCE_PX2 = 1e-4  # of a coordinate: a hundredth of a pixel is the best t
 DAMPING = 1e-9  # added to the normal matrix, which points in one line leave singular
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
     num_features: int = 2000  # of a preview, at most
     longer_side: int = 800  # of the preview in which features are found, pixels
@@ -48,7 +48,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Landmarks:
+class KeyframeLandmarks:
     """The features of one keyframe, with their points in the world."""
 
     name: str
@@ -57,8 +57,8 @@ class Landmarks:
 
 
 @dataclass(frozen=True, eq=False)
-class Position:
-    """Where a preview was taken, with its uncertainty."""
+class LocalizedCamera:
+    """The estimated camera of a preview, with its uncertainty."""
 
     T_world_camera: Array  # (4, 4)
     covariance: Array  # (6, 6) of a small motion in the camera's frame: translation, then rotation vector
@@ -68,7 +68,7 @@ class Position:
 
 
 @dataclass(frozen=True)
-class Motion:
+class CameraMotion:
     """Between two positions. Lengths are relative to the median depth of the points, as scenes have no scale."""
 
     moved: bool
@@ -84,44 +84,50 @@ class Motion:
         )
 
 
-def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config) -> list[Landmarks]:
+def compute_landmarks(
+    snapshot: Snapshot, keyframes: Sequence[Keyframe], config: TrackingConfig
+) -> list[KeyframeLandmarks]:
     """The features of the snapshot's keyframes, where the Gaussians are opaque enough for a depth."""
     cameras = {camera.name: camera for camera in snapshot.cameras}
     known = []
     for keyframe in (keyframe for keyframe in keyframes if keyframe.name in cameras):
-        camera, found = cameras[keyframe.name], keyframe.features.of_tilt(PLAIN)
+        camera, found = cameras[keyframe.name], keyframe.features.select_tilt(PLAIN)
         render = render_arrays(
             snapshot.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
         )
-        pixels = _shown_at(found.points[found.point_of], keyframe, camera)
+        pixels = _undistort_pixels(found.points[found.point_of], keyframe, camera)
         column, row = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         depth = render.depth[row, column].astype(np.float64)
         good = (depth > 0) & (render.alpha[row, column] >= config.min_alpha)
         rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(camera.K).T
         T_world_camera = camera.T_world_camera
         points = (rays * depth[:, None])[good] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        known.append(Landmarks(keyframe.name, points, found.descriptors[good]))
+        known.append(KeyframeLandmarks(keyframe.name, points, found.descriptors[good]))
     return known
 
 
-def _shown_at(points: Array, keyframe: Keyframe, camera: CameraEstimate) -> Array:
+def _undistort_pixels(points: Array, keyframe: Keyframe, camera: CameraEstimate) -> Array:
     """(M, 2) pixels of the camera's picture for pixels (M, 2) of the keyframe, as it was photographed."""
     if camera.lens is None:
         return points * keyframe.scale
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-    return straight_pixels(points, camera.lens, Intrinsics(camera.width, camera.height, fx, fy, cx, cy, "estimated"))
+    return undistort_pixels(points, camera.lens, Intrinsics(camera.width, camera.height, fx, fy, cx, cy, "estimated"))
 
 
-def locate(
-    image: npt.NDArray[np.uint8], K: Array, known: Sequence[Landmarks], config: Config, likely: Sequence[str] = ()
-) -> Position | None:
-    """Where `image` (H, W, 3) with intrinsics `K` was taken; None where too few features match the scene's.
+def localize(
+    image: npt.NDArray[np.uint8],
+    K: Array,
+    known: Sequence[KeyframeLandmarks],
+    config: TrackingConfig,
+    likely: Sequence[str] = (),
+) -> LocalizedCamera | None:
+    """Localizes `image` (H, W, 3) with intrinsics `K`; None where too few features match the scene's.
 
     `likely` names the keyframes to compare it with; without them it is compared with all.
     """
     found = features.extract(image, _feature_config(config))
     chosen = [each for each in known if each.name in likely] if likely else list(known)
-    ratio_test = nearest_neighbours.Config()
+    ratio_test = nearest_neighbours.NearestNeighbourConfig()
     matches = [nearest_neighbours.match(found.descriptors, each.descriptors, ratio_test) for each in chosen]
     best = sorted(range(len(chosen)), key=lambda i: -len(matches[i]))[: config.keyframes]
     if not best or sum(len(matches[i]) for i in best) < config.min_inliers:
@@ -133,10 +139,10 @@ def locate(
     if inliers.sum() < max(config.min_inliers, config.min_share * len(inliers)):
         return None
     covariance = _covariance(T_world_camera, pixels[inliers], points[inliers], K, config.independent)
-    return Position(T_world_camera, covariance, K, points[inliers], tuple(chosen[i].name for i in best))
+    return LocalizedCamera(T_world_camera, covariance, K, points[inliers], tuple(chosen[i].name for i in best))
 
 
-def motion(before: Position, now: Position, config: Config) -> Motion:
+def measure_motion(before: LocalizedCamera, now: LocalizedCamera, config: TrackingConfig) -> CameraMotion:
     """How the camera moved between two positions, and how certain that is."""
     T_before_now = np.linalg.inv(before.T_world_camera) @ now.T_world_camera
     rotation = Rotation.from_matrix(T_before_now[:3, :3]).as_rotvec()
@@ -146,7 +152,7 @@ def motion(before: Position, now: Position, config: Config) -> Motion:
     longer_side = 2 * max(now.K[0, 2], now.K[1, 2])
     shift = float(np.median(np.hypot(u - u_now, v - v_now))) * config.longer_side / longer_side
     certainty = float(chdtr(6, mahalanobis2))  # as scipy.stats has it, which takes half a second to load
-    return Motion(
+    return CameraMotion(
         moved=certainty >= config.certainty and shift >= config.shift_px,
         rotation_deg=float(np.degrees(np.linalg.norm(rotation))),
         translation_rel=float(np.linalg.norm(step[:3]) / max(np.median(depth), MIN_DEPTH)),
@@ -158,32 +164,34 @@ def motion(before: Position, now: Position, config: Config) -> Motion:
 class Tracker:
     """Remembers where the camera stood and tells when it has moved."""
 
-    def __init__(self, known: Sequence[Landmarks], config: Config) -> None:
+    def __init__(self, known: Sequence[KeyframeLandmarks], config: TrackingConfig) -> None:
         self._known, self._config = known, config
-        self._stood: Position | None = None
+        self._stood: LocalizedCamera | None = None
         self._in_a_row = 0
         self._likely: tuple[str, ...] = ()
 
-    def track(self, image: npt.NDArray[np.uint8], K: Array) -> tuple[Position | None, Motion | None]:
-        """Where the camera is, and how it has moved since the first preview that was located; None where unknown.
+    def track(self, image: npt.NDArray[np.uint8], K: Array) -> tuple[LocalizedCamera | None, CameraMotion | None]:
+        """Returns the camera and its motion since the first localized preview; None where unknown.
 
         `moved` is set once the configured number of previews in a row show a motion.
         """
-        position = locate(image, K, self._known, self._config, self._likely)
+        position = localize(image, K, self._known, self._config, self._likely)
         self._likely = position.keyframes if position else ()
         if position is None:
             return None, None
         if self._stood is None:
             self._stood = position
-        found = motion(self._stood, position, self._config)
+        found = measure_motion(self._stood, position, self._config)
         self._in_a_row = self._in_a_row + 1 if found.moved else 0
         confirmed = self._in_a_row >= self._config.confirmations
-        return position, Motion(confirmed, found.rotation_deg, found.translation_rel, found.shift_px, found.certainty)
+        return position, CameraMotion(
+            confirmed, found.rotation_deg, found.translation_rel, found.shift_px, found.certainty
+        )
 
 
-def _feature_config(config: Config) -> features.Config:
+def _feature_config(config: TrackingConfig) -> features.FeatureConfig:
     side = config.longer_side
-    return features.Config(num_features=config.num_features, max_longer_side=side, min_longer_side=side)
+    return features.FeatureConfig(num_features=config.num_features, max_longer_side=side, min_longer_side=side)
 
 
 def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -204,7 +212,7 @@ def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tupl
 
 def _project(T_world_camera: Array, K: Array, points: Array) -> Array:
     """(N, 3) columns, rows and depths of world points (N, 3)."""
-    in_camera = to_camera(points, T_world_camera)
+    in_camera = transform_to_camera(points, T_world_camera)
     return np.c_[project(in_camera, K), np.maximum(in_camera[:, 2], MIN_DEPTH)]
 
 

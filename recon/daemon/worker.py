@@ -10,20 +10,20 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from splatnode.capture.process.disk_space import is_of_disk
+from splatnode.capture.process.disk_space import is_disk_error
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon.atlas.atlas import Atlas
-from splatnode.recon.daemon.atlas.links import Kind
+from splatnode.recon.daemon.atlas.atlas import LoopDetector
+from splatnode.recon.daemon.atlas.links import EdgeKind
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.free_space import FreeSpace, Mapped
-from splatnode.recon.daemon.inbox import BATCH, Arrived, Event, Inbox, LeftOut
-from splatnode.recon.daemon.left_places import LeftPlaces
-from splatnode.recon.daemon.output import Output, Published
-from splatnode.recon.daemon.present_place import Abandoned, PresentPlace
-from splatnode.recon.daemon.status import PLACES, PlaceStatus
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
+from splatnode.recon.daemon.inbox import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame
+from splatnode.recon.daemon.left_places import InactiveSubmaps
+from splatnode.recon.daemon.output import Output, PublishedSnapshot
+from splatnode.recon.daemon.present_place import Abandoned, ActiveSubmap
+from splatnode.recon.daemon.status import PLACES, SubmapStatus
 
 log = logging.getLogger(__name__)
 
@@ -35,10 +35,10 @@ LADDER_S = 4.0  # in which more matches may be looked for, also on a slow machin
 class Worker:
     def __init__(
         self,
-        config: Config,
+        config: DaemonConfig,
         store: Store,
         inbox: Inbox,
-        publish: Callable[[Published], None],
+        publish: Callable[[PublishedSnapshot], None],
         stopping: threading.Event,
     ) -> None:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
@@ -46,132 +46,135 @@ class Worker:
         ladder = asked if asked.most_s is not None else msgspec.structs.replace(asked, most_s=LADDER_S)
         self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None, ladder=ladder)
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
-        self._output = Output(config, store, publish, self._complain)
-        self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)
-        self._free_space = FreeSpace(config.map)
-        self._atlas = Atlas(store.directory, self._recipe, self._output.places)
-        self._left = LeftPlaces(store, self._recipe, self._output, self._atlas, config.fallback_s)
+        self._output = Output(config, store, publish, self._report_problem)
+        self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause)
+        self._free_space = OccupancyMapper(config.map)
+        self._atlas = LoopDetector(store.directory, self._recipe, self._output.places)
+        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_s)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
         self._shortage = ""  # the last one that was told
         self.problem = ""
         self.moved_s = time.monotonic()  # when the work last got on
         self.rests = 0  # how often there was nothing to do
-        self._backlog: list[Arrived] = []  # keyframes that an earlier process stored and did not work in
+        self._backlog: list[ArrivedKeyframe] = []  # keyframes that an earlier process stored and did not work in
         self.loading = len(store.names)  # keyframes of an earlier process that are not known again yet
 
     @property
-    def unfinished(self) -> int:
+    def num_unfinished(self) -> int:
         """Places that the camera has left and whose scenes are not final yet."""
-        return self._left.unfinished
+        return self._left.num_unfinished
 
     @property
-    def known(self) -> tuple[int, int, int]:
+    def map_counts(self) -> tuple[int, int, int]:
         """How many scenes are judged, how many maps they are, and how many loops count."""
         poses, links = self._output.places.poses, self._output.places.links
-        loops = sum(link.kind is Kind.LOOP and link.retracted is None for link in links)
+        loops = sum(link.kind is EdgeKind.LOOP and link.retracted is None for link in links)
         return len(poses), len({pose.map for pose in poses}), loops
 
     @property
-    def newest_places(self) -> tuple[PlaceStatus, ...]:
-        """What is known of the newest places, each as it was when it was last worked on."""
-        return tuple(each.status for each in self._output.places.newest(PLACES))
+    def newest_places(self) -> tuple[SubmapStatus, ...]:
+        """The status of the newest submaps, each as of when it was last worked on."""
+        return tuple(each.status for each in self._output.places.select_newest(PLACES))
 
     @property
-    def mapped(self) -> Mapped | str:
+    def current_map(self) -> OccupancyResult | str:
         """The map of the present scene as it is now, or why there is none."""
-        return self._free_space.current(self.place.finished, self.place.state)
+        return self._free_space.find_current_map(self.place.finished, self.place.state)
 
-    def scenes_left_with(self, name: str) -> list[str]:
+    def find_inactive_scenes(self, name: str) -> list[str]:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
-        return [scene for scene in self._output.places.scenes_of(name) if scene != self._store.scene_id]
+        return [scene for scene in self._output.places.find_scenes(name) if scene != self._store.scene_id]
 
     @property
     def delay(self) -> tuple[float, str]:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
         if self.loading:
-            return time.monotonic() - self._quiet_since_s, f"{_keyframes(self.loading)} being loaded"
+            return time.monotonic() - self._quiet_since_s, f"{_format_keyframe_count(self.loading)} being loaded"
         under_way, waiting = [*self.place.under_way, *self._backlog], len(self._inbox)
         oldest_s = under_way[0].at_s if under_way else self._inbox.oldest_s
         if oldest_s is None:
             return 0.0, ""
-        return time.monotonic() - oldest_s, f"{_keyframes(len(under_way))} being worked in, {waiting} more waiting"
+        return (
+            time.monotonic() - oldest_s,
+            f"{_format_keyframe_count(len(under_way))} being worked in, {waiting} more waiting",
+        )
 
     def run(self) -> None:
         """Until the daemon stops; an export that has begun is finished. Raises MemoryError and the like."""
-        found = self._restored()
+        found = self._restore()
         self.loading = 0
         if found is not None:
-            self._backlog = [Arrived(keyframe, time.monotonic()) for keyframe in found.new]
-            self._guarded(lambda: self.place.go_on(found))
+            self._backlog = [ArrivedKeyframe(keyframe, time.monotonic()) for keyframe in found.new]
+            self._run_step(lambda: self.place.resume(found))
         give_back_memory()
         while not self._stopping.is_set():
-            worked = self._turn(min(IDLE_S, self._config.settle_s))
+            worked = self._process_events(min(IDLE_S, self._config.settle_s))
             if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
-                self._guarded(self._rest, present=False)
-        self._guarded(self.place.export_provisionally)
+                self._run_step(self._process_idle, present=False)
+        self._run_step(self.place.export_provisionally)
 
-    def _rest(self) -> None:
-        """What there is time for while nothing is to be done for the present place."""
-        if self.place.write_refused():
+    def _process_idle(self) -> None:
+        """Does one step of work that is left while the active submap needs nothing."""
+        if self.place.retry_write():
             self.problem = ""
             return
         if not (
-            self._map()
-            or self._left.judge_next(self._meanwhile)
-            or self.place.compare(self._atlas)
-            or self._left.finish_next(self._meanwhile)
+            self._map_scene()
+            or self._left.verify_next(self._serve_active_submap)
+            or self.place.detect_loops(self._atlas)
+            or self._left.finalize_next(self._serve_active_submap)
         ):
             self.rests += 1
 
-    def _map(self) -> bool:
+    def _map_scene(self) -> bool:
         """Maps the present scene, if it is final; False where that was done. Abandoned when something comes."""
         folder = self._config.out / self._store.scene_id
-        return self._free_space.make(self.place.finished, self.place.state, folder, lambda: self._pause(-math.inf))
+        return self._free_space.map_scene(self.place.finished, self.place.state, folder, lambda: self._pause(-math.inf))
 
-    def _turn(self, wait_s: float) -> bool:
+    def _process_events(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""
         self.moved_s = time.monotonic()
-        events = self._next_events(wait_s)
-        arrived = [each for each in events if isinstance(each, Arrived)]
-        left_out = [each.name for each in events if isinstance(each, LeftOut)]
+        events = self._take_events(wait_s)
+        arrived = [each for each in events if isinstance(each, ArrivedKeyframe)]
+        left_out = [each.name for each in events if isinstance(each, RemovedFrame)]
         now = time.monotonic()
         if arrived:
-            self._guarded(lambda: self._take_in(arrived))
+            self._run_step(lambda: self._add_keyframes(arrived))
         elif left_out:
-            self._guarded(lambda: self.place.leave_out(left_out))
+            self._run_step(lambda: self.place.remove_frames(left_out))
         elif self.place.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.settle_s:
             return False
         else:
-            self._guarded(lambda: self._take_in([]) if self.place.owed else self.place.settle())
+            self._run_step(lambda: self._add_keyframes([]) if self.place.owed else self.place.finalize())
         self._quiet_since_s = time.monotonic()
         return True
 
-    def _next_events(self, wait_s: float) -> Sequence[Event]:
-        """What is worked in next: first what an earlier process stored, as many at a time as if it had just come."""
+    def _take_events(self, wait_s: float) -> Sequence[Event]:
+        """Returns the events to process next: first what an earlier process stored, a batch at a time."""
         if self._backlog:
             events, self._backlog = self._backlog[:BATCH], self._backlog[BATCH:]
             return events
-        return self._inbox.get(wait_s)
+        return self._inbox.dequeue(wait_s)
 
-    def _take_in(self, arrived: list[Arrived]) -> None:
+    def _add_keyframes(self, arrived: list[ArrivedKeyframe]) -> None:
         """A keyframe that was retracted while it was prepared comes after the word of that, and is not taken in."""
         self.problem = ""
         stored = [each for each in arrived if self._store.holds(each.keyframe.frame)]
         if stored or not arrived:
-            self.place.take_in(stored)
+            self.place.add_keyframes(stored)
 
-    def _meanwhile(self) -> None:
+    def _serve_active_submap(self) -> None:
         """While the scene of a place that was left is finished, the present one goes on.
 
         Raises Abandoned if the daemon stops.
         """
         self._pause(math.inf)
         began = time.monotonic()
-        self._turn(0.0)
+        self._process_events(0.0)
         if self.place.settled:
-            self._guarded(self._map, present=False)
-        self._left.leave_out(time.monotonic() - began)
+            self._run_step(self._map_scene, present=False)
+        self._left.exclude_seconds(time.monotonic() - began)
 
     def _pause(self, until_s: float) -> None:
         """Raises Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""
@@ -180,7 +183,7 @@ class Worker:
         if self._stopping.is_set() or (waiting and self.moved_s > until_s):
             raise Abandoned
 
-    def _guarded(self, step: Callable[[], object], present: bool = True) -> None:
+    def _run_step(self, step: Callable[[], object], present: bool = True) -> None:
         """A step that fails is told, and repeated only where memory or the disk did not suffice.
 
         `present`: whether it is for the present place.
@@ -196,7 +199,7 @@ class Worker:
         except Exception as error:
             log.exception("a step of the reconstruction failed")
             short = is_shortage(error)
-            again = short or is_of_disk(error)
+            again = short or is_disk_error(error)
             self.problem = f"{type(error).__name__}: {error}"
             if present:
                 self.place.settled = not again
@@ -206,8 +209,8 @@ class Worker:
                 self._not_before_s = time.monotonic() + self._wait_s
                 self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
 
-    def _restored(self) -> checkpoint.Restored | None:
-        """What an earlier process knew. Raises MemoryError and the like: the next start may have memory enough."""
+    def _restore(self) -> checkpoint.RestoredReconstruction | None:
+        """Restores what an earlier process knew. Raises MemoryError: a restart may have more memory."""
         try:
             return checkpoint.restore(self._store, self._recipe)
         except Exception as error:
@@ -217,10 +220,10 @@ class Worker:
             self.problem = f"the checkpoint cannot be restored: {error}"
             return None
 
-    def _complain(self, problem: str) -> None:
+    def _report_problem(self, problem: str) -> None:
         self.problem = problem
         log.error("%s", problem)
 
 
-def _keyframes(number: int) -> str:
+def _format_keyframe_count(number: int) -> str:
     return "1 keyframe is" if number == 1 else f"{number} keyframes are"

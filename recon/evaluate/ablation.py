@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import msgspec
 
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.scene import pixelwise, seeding
 
 BASE, WHOLE = "instantsplat-xl", "paper"
 _LOSSES = {"point-render": "point_render", "depth": "depth", "normal": "normal", "semantic": "semantic"}
 _SETTINGS = ("pseudo-views", "down-sampling", "pose-refinement")
-_NO_THINNING = seeding.Config(depth_tolerance=0.0)
+_NO_THINNING = seeding.GaussianInitializationConfig(depth_tolerance=0.0)
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Variant:
     against: str
 
 
-def names() -> tuple[str, ...]:
+def list_names() -> tuple[str, ...]:
     """Base, each loss alone, the whole, and the whole without each part."""
     with_one = (f"{BASE}+{part}" for part in _LOSSES)
     without_one = (f"{WHOLE}-{part}" for part in (*_LOSSES, *_SETTINGS))
@@ -35,34 +35,34 @@ def names() -> tuple[str, ...]:
 
 def is_variant(method: str) -> bool:
     """Whether a method exists for the ablation alone."""
-    return method in names() and method not in (BASE, WHOLE)
+    return method in list_names() and method not in (BASE, WHOLE)
 
 
-def variants(methods: Collection[str]) -> list[Variant]:
+def list_variants(methods: Collection[str]) -> list[Variant]:
     """Those of `methods` that the ablation compares, in order."""
-    found = [name for name in names() if name in methods]
+    found = [name for name in list_names() if name in methods]
     return [Variant(name, WHOLE if name.startswith(f"{WHOLE}-") else BASE) for name in found]
 
 
-def configs(whole: Config) -> dict[str, Config]:
+def make_configs(whole: ReconstructionConfig) -> dict[str, ReconstructionConfig]:
     """The variants that are no methods by themselves, by name."""
     losses = whole.optimize.regularise.losses
 
-    def with_regularise(**changes: object) -> Config:
+    def replace_regularise(**changes: object) -> ReconstructionConfig:
         changed = msgspec.structs.replace(whole.optimize.regularise, **changes)
         return msgspec.structs.replace(whole, optimize=msgspec.structs.replace(whole.optimize, regularise=changed))
 
-    with_one = {f"{BASE}+{part}": with_regularise(losses={name: losses[name]}) for part, name in _LOSSES.items()}
+    with_one = {f"{BASE}+{part}": replace_regularise(losses={name: losses[name]}) for part, name in _LOSSES.items()}
     without_one = {
-        f"{WHOLE}-{part}": with_regularise(losses={name: loss for name, loss in losses.items() if name != left_out})
+        f"{WHOLE}-{part}": replace_regularise(losses={name: loss for name, loss in losses.items() if name != left_out})
         for part, left_out in _LOSSES.items()
     }
-    thick = msgspec.structs.replace(whole.pixelwise or pixelwise.Config(), down_sampling=_NO_THINNING)
+    thick = msgspec.structs.replace(whole.pixelwise or pixelwise.PixelwiseConfig(), down_sampling=_NO_THINNING)
     fixed = msgspec.structs.replace(whole.optimize, refine_poses=False)
     return {
         **with_one,
         **without_one,
-        f"{WHOLE}-pseudo-views": with_regularise(pseudo_views=0),
+        f"{WHOLE}-pseudo-views": replace_regularise(pseudo_views=0),
         f"{WHOLE}-down-sampling": msgspec.structs.replace(whole, pixelwise=thick),
         f"{WHOLE}-pose-refinement": msgspec.structs.replace(whole, optimize=fixed),
     }

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.rasterize.render import Render
-from splatnode.recon.result.export import viewer_safe
-from splatnode.recon.result.export.formats.ply import ply_bytes
+from splatnode.recon.result.export import sanitize_gaussians
+from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 
@@ -31,7 +31,7 @@ class Appearance(Protocol):
 
     @property
     def num_bytes(self) -> int:
-        """Of the scene as it would be published."""
+        """Returns the size of the scene as it would be published."""
         ...
 
     def depth(self, T_world_camera: Array) -> float:
@@ -52,22 +52,22 @@ class Appearance(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FieldSnapshot(Snapshot):
-    """What a method without Gaussians publishes. It is sent from process to process, so `appearance` can be pickled."""
+    """The snapshot of a method without Gaussians; `appearance` is pickled from process to process."""
 
     appearance: Appearance
 
 
-def appearance_of(snapshot: Snapshot, rasterize: Rasterize) -> Appearance | None:
+def make_appearance(snapshot: Snapshot, rasterize: Rasterize) -> Appearance | None:
     """How a snapshot's scene looks; None where its verdict forbids publishing it, or it has none."""
     if not snapshot.verdict.publishable:
         return None
     if isinstance(snapshot, FieldSnapshot):
         return snapshot.appearance
-    gaussians = viewer_safe(snapshot.gaussians)
-    return Splats(gaussians, rasterize) if len(gaussians) else None
+    gaussians = sanitize_gaussians(snapshot.gaussians)
+    return GaussianAppearance(gaussians, rasterize) if len(gaussians) else None
 
 
-class Splats:
+class GaussianAppearance:
     """Gaussians on black."""
 
     def __init__(self, gaussians: GaussianArrays, rasterize: Rasterize) -> None:
@@ -81,7 +81,7 @@ class Splats:
 
     @property
     def num_bytes(self) -> int:
-        return ply_bytes(len(self._gaussians), self._gaussians.sh.shape[1])
+        return compute_ply_bytes(len(self._gaussians), self._gaussians.sh.shape[1])
 
     def depth(self, T_world_camera: Array) -> float:
         """The median depth of the Gaussians in front of the camera; 1 where there are none."""

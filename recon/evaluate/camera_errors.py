@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import align_cameras, angles_deg, spread, umeyama
+from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, umeyama
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class CameraErrors:
     ate_instantsplat: float | None
 
 
-def camera_errors(Ts_estimated: Array, Ts_true: Array, Ks_estimated: Array, Ks_true: Array) -> CameraErrors:
+def compare_cameras(Ts_estimated: Array, Ts_true: Array, Ks_estimated: Array, Ks_true: Array) -> CameraErrors:
     """Compares (C, 4, 4) T_world_camera and (C, 3, 3) K, in the same order and for the same image sizes."""
     if Ts_estimated.shape != Ts_true.shape or Ks_estimated.shape != Ks_true.shape:
         raise ValueError(
@@ -40,7 +40,7 @@ def camera_errors(Ts_estimated: Array, Ts_true: Array, Ks_estimated: Array, Ks_t
         )
     if len(Ts_true) == 0:
         return CameraErrors(None, None, None, None, None)
-    focal = 100.0 * float(np.abs(_focal(Ks_estimated) / _focal(Ks_true) - 1.0).mean())
+    focal = 100.0 * float(np.abs(_compute_focal(Ks_estimated) / _compute_focal(Ks_true) - 1.0).mean())
     if len(Ts_true) < 2:
         return CameraErrors(None, None, None, focal, None)
     rotations_estimated, rotations_true = Ts_estimated[:, :3, :3], Ts_true[:, :3, :3]
@@ -54,24 +54,24 @@ def camera_errors(Ts_estimated: Array, Ts_true: Array, Ks_estimated: Array, Ks_t
                 rotations_true[first].transpose(0, 2, 1) @ rotations_true[second],
             ).max()
         ),
-        centre_pct=centre_error_pct(Ts_estimated[:, :3, 3], Ts_true[:, :3, 3]),
+        centre_pct=compute_centre_error_pct(Ts_estimated[:, :3, 3], Ts_true[:, :3, 3]),
         focal_pct=focal,
-        ate_instantsplat=ate_instantsplat(Ts_estimated, Ts_true),
+        ate_instantsplat=compute_ate_instantsplat(Ts_estimated, Ts_true),
     )
 
 
-def centre_error_pct(estimated: Array, true: Array) -> float | None:
+def compute_centre_error_pct(estimated: Array, true: Array) -> float | None:
     """RMS distance of centres (C, 3) after Umeyama's similarity, in percent of the true ones' RMS spread.
 
     None where the true camera does not move.
     """
-    apart = spread(true)
+    apart = compute_rms_radius(true)
     if apart <= 1e-9 * (1.0 + float(np.abs(true).max())):
         return None
-    return 100.0 * _rms_after_umeyama(estimated, true) / apart
+    return 100.0 * _compute_rms_after_umeyama(estimated, true) / apart
 
 
-def ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:
+def compute_ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:
     """The "ATE" of InstantSplat's released evaluation, only for comparison with published figures.
 
     It aligns the translation columns t = -R C of the world-to-camera matrices, each set centred and divided by its
@@ -87,13 +87,13 @@ def ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:
         if norm <= 1e-9 * (1.0 + float(np.abs(t).max())):
             return None
         columns.append(centred / norm)
-    return _rms_after_umeyama(*columns)
+    return _compute_rms_after_umeyama(*columns)
 
 
-def _rms_after_umeyama(source: Array, target: Array) -> float:
+def _compute_rms_after_umeyama(source: Array, target: Array) -> float:
     moved = umeyama(source, target)(source)
     return math.sqrt(float(((moved - target) ** 2).sum(1).mean()))
 
 
-def _focal(Ks: Array) -> Array:
+def _compute_focal(Ks: Array) -> Array:
     return np.sqrt(Ks[:, 0, 0] * Ks[:, 1, 1])

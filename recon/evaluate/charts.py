@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from splatnode.recon.evaluate.ablation import is_variant, variants
-from splatnode.recon.evaluate.protocol import Row, mean
-from splatnode.recon.evaluate.summary import MethodMean, method_means, shared
-from splatnode.recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
+from splatnode.recon.evaluate.ablation import is_variant, list_variants
+from splatnode.recon.evaluate.protocol import Row, compute_mean
+from splatnode.recon.evaluate.summary import MethodMean, compute_method_means, select_shared_runs
+from splatnode.recon.evaluate.tables import PSNR, SSIM, Measure, compute_paired_changes, select_lpips
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")
@@ -50,19 +50,21 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """
     files = {}
     measured = [
-        p for p in method_means(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None
+        p
+        for p in compute_method_means(select_shared_runs([row for row in rows if not is_variant(row.method)]))
+        if p.psnr is not None
     ]
     if timed := [p for p in measured if p.seconds]:
-        files["speed_accuracy.png"] = png(speed_accuracy(timed))
+        files["speed_accuracy.png"] = encode_png(draw_speed_accuracy(timed))
     if sized := [p for p in measured if p.num_gaussians]:
-        files["parsimony.png"] = png(parsimony(sized))
+        files["parsimony.png"] = encode_png(draw_parsimony(sized))
     scored = [row for row in rows if row.final and row.psnr is not None]
     if any(is_variant(row.method) for row in scored):
-        files["ablation.png"] = png(ablation(scored))
+        files["ablation.png"] = encode_png(draw_ablation(scored))
     return files
 
 
-def speed_accuracy(measured: Sequence[MethodMean]) -> Figure:
+def draw_speed_accuracy(measured: Sequence[MethodMean]) -> Figure:
     """Seconds against quality: a curve a method through its checkpoints, a bubble's area is the number of Gaussians."""
     largest = max((p.num_gaussians or 0.0 for p in measured), default=0.0)
 
@@ -70,32 +72,38 @@ def speed_accuracy(measured: Sequence[MethodMean]) -> Figure:
         share = (point.num_gaussians or 0.0) / largest if largest else 0.0
         return _SMALLEST + (_LARGEST - _SMALLEST) * share
 
-    figure = _grid(measured, "seconds (log scale)", lambda p: p.seconds, area)
-    _head(figure, "Quality of held-out views against time", f"Area: number of Gaussians, at most {largest:,.0f}. ")
+    figure = _draw_grid(measured, "seconds (log scale)", lambda p: p.seconds, area)
+    _set_title(figure, "Quality of held-out views against time", f"Area: number of Gaussians, at most {largest:,.0f}. ")
     return figure
 
 
-def parsimony(measured: Sequence[MethodMean]) -> Figure:
+def draw_parsimony(measured: Sequence[MethodMean]) -> Figure:
     """Number of Gaussians against quality: what a method buys with its scene's size."""
-    figure = _grid(measured, "Gaussians (log scale)", lambda p: p.num_gaussians, lambda p: 45.0)
-    _head(figure, "Quality of held-out views against the number of Gaussians")
+    figure = _draw_grid(measured, "Gaussians (log scale)", lambda p: p.num_gaussians, lambda p: 45.0)
+    _set_title(figure, "Quality of held-out views against the number of Gaussians")
     return figure
 
 
-def ablation(scored: Sequence[Row]) -> Figure:
-    """What each variant changes against what it is compared with: bars are means, dots the runs that both have."""
-    shown = [v for v in variants({row.method for row in scored}) if v.method != v.against]
-    measures = [measure for measure in (PSNR, SSIM, lpips(scored)) if measure is not None]
+def draw_ablation(scored: Sequence[Row]) -> Figure:
+    """Draws what each variant changes against its reference: bars are means, dots the common runs."""
+    shown = [v for v in list_variants({row.method for row in scored}) if v.method != v.against]
+    measures = [measure for measure in (PSNR, SSIM, select_lpips(scored)) if measure is not None]
     figure = Figure(figsize=(4.6 * len(measures), 0.36 * len(shown) + 1.9), dpi=150, layout="constrained")
     axes = figure.subplots(1, len(measures), squeeze=False, sharey=True)[0]
     for chart, measure in zip(axes, measures, strict=True):
         for place, variant in enumerate(shown):
-            changes = paired(scored, variant.method, variant.against, measure)
-            chart.barh(place, mean(changes) or 0.0, height=0.6, color=_COLOURS[_colour_of(changes, measure)], alpha=0.8)
+            changes = compute_paired_changes(scored, variant.method, variant.against, measure)
+            chart.barh(
+                place,
+                compute_mean(changes) or 0.0,
+                height=0.6,
+                color=_COLOURS[_choose_bar_colour(changes, measure)],
+                alpha=0.8,
+            )
             chart.scatter(changes, [place] * len(changes), s=14, c=INK, zorder=3)
         chart.axvline(0.0, color=INK, linewidth=1.0)
         chart.set_title(f"{measure.name} ({'more' if measure.higher_is_better else 'less'} is better)", fontsize=10)
-        plain(chart)
+        style_axes(chart)
     axes[0].set_yticks(range(len(shown)), [f"{v.method}  vs. {v.against}" for v in shown])
     axes[0].invert_yaxis()
     figure.suptitle(
@@ -104,12 +112,12 @@ def ablation(scored: Sequence[Row]) -> Figure:
     return figure
 
 
-def _colour_of(changes: Sequence[float], measure: Measure) -> int:
-    """Of a bar: 0 where the change is for the better, else 1."""
-    return int(((mean(changes) or 0.0) > 0) != measure.higher_is_better)
+def _choose_bar_colour(changes: Sequence[float], measure: Measure) -> int:
+    """Returns the colour of a bar: 0 where the change is for the better, else 1."""
+    return int(((compute_mean(changes) or 0.0) > 0) != measure.higher_is_better)
 
 
-def pareto_front(pairs: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
+def find_pareto_front(pairs: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
     """The (cost, quality) pairs that no other beats in both, by rising cost."""
     front: list[tuple[float, float]] = []
     sign = 1.0 if higher_is_better else -1.0
@@ -119,7 +127,7 @@ def pareto_front(pairs: Sequence[tuple[float, float]], higher_is_better: bool) -
     return front
 
 
-def _grid(
+def _draw_grid(
     measured: Sequence[MethodMean],
     x_label: str,
     x: Callable[[MethodMean], float | None],
@@ -127,7 +135,7 @@ def _grid(
 ) -> Figure:
     """A row of charts a number of views, a column a measure."""
     views = sorted({p.views for p in measured})
-    qualities = _qualities(measured)
+    qualities = _select_qualities(measured)
     methods = list(dict.fromkeys(p.method for p in measured))
     figure = Figure(figsize=(4.3 * len(qualities), 3.3 * len(views) + 1.5), dpi=150, layout="constrained")
     axes = figure.subplots(len(views), len(qualities), squeeze=False, sharex=True)
@@ -135,12 +143,12 @@ def _grid(
         here = [p for p in measured if p.views == count]
         for column, quality in enumerate(qualities):
             chart = axes[row][column]
-            _chart(chart, here, methods, quality, x, area)
+            _draw_chart(chart, here, methods, quality, x, area)
             chart.set_title(f"{count} views" if column == 0 else "", loc="left", color=INK, fontsize=11, weight="bold")
             if row == len(views) - 1:
                 chart.set_xlabel(x_label, color=_MUTED)
     handles = [
-        Line2D([], [], color=style(i)[0], marker=style(i)[1], label=method, linewidth=1.8)
+        Line2D([], [], color=choose_style(i)[0], marker=choose_style(i)[1], label=method, linewidth=1.8)
         for i, method in enumerate(methods)
     ]
     handles.append(Line2D([], [], color=_MUTED, linestyle=(0, (4, 3)), linewidth=1.2, label="Pareto front"))
@@ -148,7 +156,7 @@ def _grid(
     return figure
 
 
-def _chart(
+def _draw_chart(
     chart: Axes,
     here: Sequence[MethodMean],
     methods: Sequence[str],
@@ -157,14 +165,14 @@ def _chart(
     area: Callable[[MethodMean], float],
 ) -> None:
     drawn = [(p, cost, value) for p in here if (cost := x(p)) and (value := quality.value(p)) is not None]
-    front = pareto_front([(cost, value) for _, cost, value in drawn], quality.higher_is_better)
+    front = find_pareto_front([(cost, value) for _, cost, value in drawn], quality.higher_is_better)
     if front:
         chart.step(
             *zip(*front, strict=True), where="post", color=_MUTED, linestyle=(0, (4, 3)), linewidth=1.2, zorder=1
         )
     for i, method in enumerate(methods):
         curve = [entry for entry in drawn if entry[0].method == method]
-        colour, marker = style(i)
+        colour, marker = choose_style(i)
         costs, values = [cost for _, cost, _ in curve], [value for _, _, value in curve]
         chart.plot(costs, values, color=colour, linewidth=1.8, zorder=2)
         chart.scatter(
@@ -179,17 +187,17 @@ def _chart(
         )
     chart.set_xscale("log")
     chart.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    chart.xaxis.set_major_formatter(FuncFormatter(_short))
+    chart.xaxis.set_major_formatter(FuncFormatter(_format_tick))
     chart.xaxis.set_minor_formatter(NullFormatter())
     chart.tick_params(labelbottom=True)
     chart.margins(0.12, 0.15)
     if not quality.higher_is_better:
         chart.invert_yaxis()
     chart.set_ylabel(quality.label if quality.higher_is_better else f"{quality.label} (axis turned)", color=_MUTED)
-    plain(chart)
+    style_axes(chart)
 
 
-def plain(chart: Axes) -> None:
+def style_axes(chart: Axes) -> None:
     """A chart with a light grid and no frame."""
     chart.grid(color=_GRID, linewidth=0.7)
     chart.set_axisbelow(True)
@@ -198,31 +206,31 @@ def plain(chart: Axes) -> None:
     chart.tick_params(colors=_MUTED, labelsize=8)
 
 
-def _qualities(measured: Sequence[MethodMean]) -> list[Quality]:
+def _select_qualities(measured: Sequence[MethodMean]) -> list[Quality]:
     """PSNR, SSIM and the LPIPS that was measured more often, VGG's rather than AlexNet's: checkpoints lack it."""
     counts = {quality: sum(quality.value(p) is not None for p in measured) for quality in (_LPIPS_VGG, _LPIPS_ALEX)}
     most = max(counts, key=lambda quality: counts[quality])
     return [_PSNR, _SSIM, *([most] if counts[most] else [])]
 
 
-def style(index: int) -> tuple[str, str]:
+def choose_style(index: int) -> tuple[str, str]:
     """The colour and the marker of the method in this place."""
     return _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
 
 
-def _short(value: float, _position: int) -> str:
+def _format_tick(value: float, _position: int) -> str:
     """1500 as 1.5k: ticks must fit beside each other."""
     if value >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
 
 
-def _head(figure: Figure, title: str, remark: str = "") -> None:
+def _set_title(figure: Figure, title: str, remark: str = "") -> None:
     remark += "Means over the runs that published a scene; up and left is better."
     figure.suptitle(f"{title}\n{remark}", x=0.01, ha="left", color=INK, fontsize=11)
 
 
-def png(figure: Figure) -> bytes:
+def encode_png(figure: Figure) -> bytes:
     """The figure as the bytes of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", facecolor="white")

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from splatnode.capture.colmap_images import binary_images, content_lines, text_images
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.recon.evaluate.json_file import MAX_BYTES, EvaluationFileError
 
 _PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # parameters of each
@@ -44,10 +44,12 @@ def read_model(folder: Path) -> list[ColmapImage]:
     Raises EvaluationFileError where it is none, or is of distorted photographs; OSError.
     """
     suffix = "bin" if (folder / "cameras.bin").exists() else "txt"
-    cameras_file, images_file = _content(folder / f"cameras.{suffix}"), _content(folder / f"images.{suffix}")
-    with foreign(EvaluationFileError, str(folder)):
+    cameras_file, images_file = _read_content(folder / f"cameras.{suffix}"), _read_content(folder / f"images.{suffix}")
+    with guard_untrusted(EvaluationFileError, str(folder)):
         try:
-            cameras = dict(_binary_cameras(cameras_file) if suffix == "bin" else _text_cameras(cameras_file.decode()))
+            cameras = dict(
+                _parse_binary_cameras(cameras_file) if suffix == "bin" else _parse_text_cameras(cameras_file.decode())
+            )
             images = binary_images(images_file) if suffix == "bin" else text_images(images_file.decode())
             return [
                 ColmapImage(name, (w, x, y, z), (tx, ty, tz), cameras[camera_id])
@@ -59,29 +61,29 @@ def read_model(folder: Path) -> list[ColmapImage]:
             raise EvaluationFileError(f"{folder} must be a COLMAP model of undistorted photographs: {error}") from error
 
 
-def _content(path: Path) -> bytes:
+def _read_content(path: Path) -> bytes:
     return read_bounded(path, MAX_BYTES, EvaluationFileError, str(path))
 
 
-def _camera(model: str, width: int, height: int, lens: tuple[float, ...]) -> ColmapCamera:
+def _make_camera(model: str, width: int, height: int, lens: tuple[float, ...]) -> ColmapCamera:
     if model not in _PINHOLES or len(lens) != _PINHOLES[model]:
-        raise ValueError(f"a camera is {printable(model, 100)} with {len(lens)} parameters, not PINHOLE with 4")
+        raise ValueError(f"a camera is {sanitize_text(model, 100)} with {len(lens)} parameters, not PINHOLE with 4")
     fx, fy, cx, cy = lens if len(lens) == 4 else (lens[0], *lens)
     return ColmapCamera(width, height, fx, fy, cx, cy)
 
 
-def _text_cameras(text: str) -> Iterator[tuple[int, ColmapCamera]]:
+def _parse_text_cameras(text: str) -> Iterator[tuple[int, ColmapCamera]]:
     for line in content_lines(text):
         if line.strip():
             number, model, width, height, *lens = line.split()
-            yield int(number), _camera(model, int(width), int(height), tuple(map(float, lens)))
+            yield int(number), _make_camera(model, int(width), int(height), tuple(map(float, lens)))
 
 
-def _binary_cameras(data: bytes) -> Iterator[tuple[int, ColmapCamera]]:
+def _parse_binary_cameras(data: bytes) -> Iterator[tuple[int, ColmapCamera]]:
     (count,), position = struct.unpack_from("<Q", data), 8
     for _ in range(count):  # ends at the latest where the bytes do
         number, model, width, height = struct.unpack_from("<IiQQ", data, position)
         size = _PINHOLES.get(_NUMBERS.get(model, ""), 0)
         lens = struct.unpack_from(f"<{size}d", data, position + 24)
-        yield number, _camera(_NUMBERS.get(model, f"of model {model}"), width, height, lens)
+        yield number, _make_camera(_NUMBERS.get(model, f"of model {model}"), width, height, lens)
         position += 24 + 8 * size

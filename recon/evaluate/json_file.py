@@ -8,7 +8,7 @@ from typing import TypeVar
 import msgspec
 
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.records import record_in
 
 T = TypeVar("T")
@@ -25,7 +25,7 @@ def read_json(path: Path, kind: type[T], expected: str) -> T:
 
     Raises EvaluationFileError, OSError.
     """
-    with foreign(EvaluationFileError, str(path)):
+    with guard_untrusted(EvaluationFileError, str(path)):
         try:
             return record_in(read_bounded(path, MAX_BYTES, EvaluationFileError, str(path)), kind)
         except msgspec.MsgspecError as error:

@@ -19,7 +19,7 @@ WRITE_EVERY_S = 5.0  # the whole, at most so often,
 _SHARE = 20.0  # and so seldom that writing it takes at most this part of the time: 1 / 20
 
 
-class Kept:
+class Journal:
     """Use it as a context manager: at the end, however that comes, the whole is written and the journal removed."""
 
     def __init__(self, journal: Path, write: Callable[[], None]) -> None:
@@ -28,7 +28,7 @@ class Kept:
         self._file: IO[bytes] = open_itself(journal, "a+b")
         self._unwritten, self._next_s = 0, time.monotonic() + WRITE_EVERY_S
 
-    def left(self) -> list[Any]:
+    def recover_records(self) -> list[Any]:
         """The records that a killed process has left, to be asked for before any is added.
 
         Half a line is dropped, and so is a record with a number that is not finite, which `write` could not write.
@@ -37,7 +37,7 @@ class Kept:
         content = self._file.read()
         end = content.rfind(b"\n") + 1
         self._file.truncate(end)
-        records = list(_records(content[:end].splitlines()))
+        records = list(_parse_records(content[:end].splitlines()))
         self._unwritten = len(records)
         return records
 
@@ -50,7 +50,7 @@ class Kept:
         if time.monotonic() >= self._next_s:
             self._write_all()
 
-    def __enter__(self) -> Kept:
+    def __enter__(self) -> Journal:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -69,7 +69,7 @@ class Kept:
         self._next_s = ended_s + max(WRITE_EVERY_S, _SHARE * (ended_s - began_s))
 
 
-def _records(lines: Iterable[bytes]) -> Iterator[Any]:
+def _parse_records(lines: Iterable[bytes]) -> Iterator[Any]:
     """The records of the lines but those with NaN or an infinity, which Python reads and JSON does not have."""
     for line in lines:
         odd: list[str] = []

@@ -35,7 +35,7 @@ def _check_same_shape(image: Tensor, truth: Tensor) -> None:
         raise ValueError(f"images must both be (H, W, 3), got {tuple(image.shape)} and {tuple(truth.shape)}")
 
 
-def best_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
+def fit_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
     """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so.
 
     What is white in `truth` may have been brighter, and does not count; where nothing does, the gain is 1.

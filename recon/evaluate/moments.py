@@ -11,7 +11,7 @@ from pathlib import Path
 
 from splatnode.capture.process.private import temporary_folder
 from splatnode.recon.evaluate.protocol import STAGES
-from splatnode.recon.evaluate.timing import Timing, timing
+from splatnode.recon.evaluate.timing import Timing, measure_timing
 from splatnode.recon.jobs.alone import Moment as Since
 from splatnode.recon.jobs.alone import now
 from splatnode.recon.result.report import peak_rss_mb
@@ -19,7 +19,7 @@ from splatnode.recon.result.snapshot import Snapshot
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class RunMoment:
     snapshot: Snapshot
     checkpoint: int | None  # None: the end of the run
     seconds: Mapping[str, float | None]  # STAGES and "total"
@@ -31,11 +31,11 @@ class Moment:
 class RunOutcome:
     """The moments of a run, and why it failed if it did."""
 
-    moments: tuple[Moment, ...]
+    moments: tuple[RunMoment, ...]
     error: str | None
 
 
-def run_to_its_end(
+def run_to_end(
     reconstruct: Callable[[], Iterator[Snapshot]], checkpoints: Sequence[int], spent_s: float = 0.0
 ) -> RunOutcome:
     """The first moment at or beyond each checkpoint, and the end. `spent_s` went before it and is added to its time.
@@ -76,5 +76,5 @@ def _run_and_save(
 
 def _save(folder: Path, number: int, snapshot: Snapshot, checkpoint: int | None, total: float, since: Since) -> None:
     seconds: dict[str, float | None] = {stage: snapshot.seconds.get(stage) for stage in STAGES}
-    moment = Moment(snapshot, checkpoint, {**seconds, "total": total}, timing(since), peak_rss_mb())
+    moment = RunMoment(snapshot, checkpoint, {**seconds, "total": total}, measure_timing(since), peak_rss_mb())
     (folder / f"{number:04d}").write_bytes(pickle.dumps(moment))

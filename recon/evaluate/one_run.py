@@ -9,17 +9,17 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate.appearance import Rasterize
-from splatnode.recon.evaluate.moments import Moment, run_to_its_end
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.moments import RunMoment, run_to_end
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import FAILED, STAGES, Poses, Row, Run, Settings, evaluate, ignore_render
 from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.renders import Renders
-from splatnode.recon.evaluate.shown import counts_of, surfaces
+from splatnode.recon.evaluate.shown import compute_surfaces, count_visibility_by_name
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start import Start, find_start
-from splatnode.recon.evaluate.timing import Timing, had_alone, most_taken, timing
+from splatnode.recon.evaluate.timing import Timing, find_largest_share, had_alone, measure_timing
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.jobs.alone import now
 from splatnode.recon.result.snapshot import Snapshot
@@ -36,7 +36,7 @@ class Scoring:
     """How the snapshots of a run are scored; it is sent to the run's process."""
 
     rasterize: Rasterize
-    networks: Callable[[], Networks]  # loads them: a module's function, or a functools.partial of one
+    networks: Callable[[], PerceptualNetworks]  # loads them: a module's function, or a functools.partial of one
     settings: Settings
     by_region: bool = False  # also of what two training photographs show, one, or none (shown.py)
 
@@ -56,8 +56,8 @@ class Job:
 
 
 @dataclass(frozen=True, eq=False)
-class Done:
-    """What a run leaves: its checkpoints and its end, or its failure, and renders by `renders.Renders`."""
+class RunResult:
+    """The result of a run: its checkpoints and end, or its failure, and renders by `renders.Renders`."""
 
     rows: list[Row]
     renders: Mapping[str, bytes]
@@ -69,30 +69,30 @@ class TimedStart:
     timed_on: Timing
 
 
-def timed_start(scene: EvaluationScene, split: Split, config: Config) -> TimedStart:
+def time_start(scene: EvaluationScene, split: Split, config: ReconstructionConfig) -> TimedStart:
     """Cameras and points that several methods start from."""
     frames, since = scene.frames(split.train), now()
     start = find_start(frames, config)
-    return TimedStart(start, timing(since))
+    return TimedStart(start, measure_timing(since))
 
 
-def seen(scene: EvaluationScene, splits: Sequence[Split], longer_side: int) -> Seen:
-    """What the training photographs of each split show of its test views, by the true cameras."""
-    found = surfaces(scene, longer_side)
+def compute_visibility_by_split(scene: EvaluationScene, splits: Sequence[Split], longer_side: int) -> Seen:
+    """Counts which training images of each split show its test views, by the true cameras."""
+    found = compute_surfaces(scene, longer_side)
     counts = {}
     for split in splits:
         training = [found[name] for name in split.train if name in found]
-        counts[len(split.train)] = counts_of(split.test, found, training)
+        counts[len(split.train)] = count_visibility_by_name(split.test, found, training)
     return counts
 
 
-def done(job: Job, start: bytes | None, shown: bytes | None) -> Done:
+def run_and_score(job: Job, start: bytes | None, shown: bytes | None) -> RunResult:
     """Runs `job`, from the pickled `timed_start`, if there is one, and scores it; `shown` is the pickled `seen`."""
     begun: TimedStart | None = pickle.loads(start) if start else None
     counts: Mapping[str, Counts] = pickle.loads(shown)[len(job.split.train)] if shown else {}
     frames = job.scene.frames(job.split.train)
     work = partial(job.reconstruct, frames, job.method, job.seed, begun and begun.start)
-    outcome = run_to_its_end(work, job.checkpoints, begun.start.seconds if begun else 0.0)
+    outcome = run_to_end(work, job.checkpoints, begun.start.seconds if begun else 0.0)
     names = job.split.test[:: max(1, len(job.split.test) // _SHOWN)][:_SHOWN]
     renders = Renders(job.scene.name, len(job.split.train), job.method, job.seed, names)
     networks = job.scoring.networks()
@@ -104,7 +104,7 @@ def done(job: Job, start: bytes | None, shown: bytes | None) -> Done:
             moment.snapshot,
             job.scene,
             job.split,
-            _run(job, moment, begun),
+            _make_run(job, moment, begun),
             rasterize=job.scoring.rasterize,
             networks=networks if at_the_end else networks.quickest,
             settings=job.scoring.settings,
@@ -112,21 +112,21 @@ def done(job: Job, start: bytes | None, shown: bytes | None) -> Done:
             found=poses,
             shown=counts,
         )
-        rows.insert(0, _timed(row, job, moment, begun))
-    rows = rows if outcome.error is None else [*rows, failed_row(job, outcome.error)]
-    return Done(_finite(rows, job), renders.files)
+        rows.insert(0, _add_timing(row, job, moment, begun))
+    rows = rows if outcome.error is None else [*rows, make_failed_row(job, outcome.error)]
+    return RunResult(_truncate_at_non_finite(rows, job), renders.files)
 
 
-def _finite(rows: Sequence[Row], job: Job) -> list[Row]:
+def _truncate_at_non_finite(rows: Sequence[Row], job: Job) -> list[Row]:
     """The rows; up to the first one with a number that is not finite, as of a run that broke off there, if there is."""
     for index, row in enumerate(rows):
-        if measure := _not_finite(row):
+        if measure := _find_non_finite(row):
             when = "the end" if row.checkpoint is None else f"iteration {row.iterations}"
-            return [*rows[:index], failed_row(job, f"{measure} is not finite at {when}")]
+            return [*rows[:index], make_failed_row(job, f"{measure} is not finite at {when}")]
     return list(rows)
 
 
-def _not_finite(row: Row) -> str:
+def _find_non_finite(row: Row) -> str:
     """The first of the row's measures that no JSON file can hold; empty where there is none."""
     for name, value in asdict(row).items():
         try:
@@ -136,7 +136,7 @@ def _not_finite(row: Row) -> str:
     return ""
 
 
-def failed_row(job: Job, error: str) -> Row:
+def make_failed_row(job: Job, error: str) -> Row:
     return Row(
         scene=job.scene.name,
         views=len(job.split.train),
@@ -151,14 +151,14 @@ def failed_row(job: Job, error: str) -> Row:
     )
 
 
-def _run(job: Job, moment: Moment, begun: TimedStart | None) -> Run:
+def _make_run(job: Job, moment: RunMoment, begun: TimedStart | None) -> Run:
     peaks = [peak for peak in (moment.peak_rss_mb, begun and begun.start.peak_rss_mb) if peak is not None]
     return Run(job.method, job.seed, moment.checkpoint, moment.seconds, max(peaks, default=None))
 
 
-def _timed(row: Row, job: Job, moment: Moment, begun: TimedStart | None) -> Row:
-    """With what it was timed on; without seconds where it, or its start, did not have its cores alone."""
-    others = most_taken((moment.timed_on, begun and begun.timed_on))
+def _add_timing(row: Row, job: Job, moment: RunMoment, begun: TimedStart | None) -> Row:
+    """Adds what it was timed on; drops seconds where it, or its start, shared its cores with others."""
+    others = find_largest_share((moment.timed_on, begun and begun.timed_on))
     alone = job.timed and had_alone(others)
     return replace(
         row,

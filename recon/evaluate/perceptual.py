@@ -9,22 +9,22 @@ from splatnode.recon.networks.lpips import Lpips, load_lpips
 
 
 @dataclass(frozen=True, eq=False)
-class Networks:
+class PerceptualNetworks:
     """The perceptual metrics for which there are weights."""
 
     alex: Lpips | None
     vgg: Lpips | None
 
     @property
-    def quickest(self) -> Networks:
+    def quickest(self) -> PerceptualNetworks:
         """Without VGG, which takes twenty times as long as AlexNet, where the other serves."""
-        return self if self.alex is None else Networks(self.alex, None)
+        return self if self.alex is None else PerceptualNetworks(self.alex, None)
 
 
-def load_networks(weights_dir: Path | None = None) -> Networks:
-    return Networks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
+def load_networks(weights_dir: Path | None = None) -> PerceptualNetworks:
+    return PerceptualNetworks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
 
 
-def no_networks() -> Networks:
+def create_empty_networks() -> PerceptualNetworks:
     """For who measures nothing that needs them."""
-    return Networks(None, None)
+    return PerceptualNetworks(None, None)

@@ -11,20 +11,27 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
-from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
-from splatnode.recon.evaluate.held_out import held_out
-from splatnode.recon.evaluate.metrics import best_gains, psnr, ssim
-from splatnode.recon.evaluate.perceptual import Networks
-from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
-from splatnode.recon.evaluate.same_lens import counts_seen_by, mean_intrinsics, of_one_lens
+from splatnode.recon.evaluate.appearance import Appearance, Rasterize, make_appearance
+from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.recon.evaluate.held_out import load_held_out_views
+from splatnode.recon.evaluate.metrics import fit_gains, psnr, ssim
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
+from splatnode.recon.evaluate.regions import (
+    UNKNOWN,
+    Counts,
+    ErrorMaps,
+    RegionScore,
+    compute_error_maps,
+    compute_region_scores,
+)
+from splatnode.recon.evaluate.same_lens import average_intrinsics, select_one_lens, undistort_counts
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.start_pose import between_neighbours
+from splatnode.recon.evaluate.start_pose import interpolate_pose
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
-from splatnode.recon.scene.vignetting import light_at
+from splatnode.recon.scene.vignetting import relative_illumination
 
 STAGES = ("poses", "points", "optimise")
 FAILED = "FAILED"  # in place of a verdict's code
@@ -107,7 +114,7 @@ def evaluate(
     run: Run,
     *,
     rasterize: Rasterize,
-    networks: Networks,
+    networks: PerceptualNetworks,
     settings: Settings,
     show: Show = ignore_render,
     found: Poses | None = None,
@@ -124,10 +131,10 @@ def evaluate(
     the same, which tells whether the refusal was needed.
     """
     estimated = [camera for camera in snapshot.cameras if camera.name in scene.cameras]
-    errors = _camera_errors(estimated, scene)
-    appearance = appearance_of(snapshot, rasterize)
+    errors = _compare_cameras(estimated, scene)
+    appearance = make_appearance(snapshot, rasterize)
     found = {} if found is None else found
-    cameras = of_one_lens(snapshot.cameras)
+    cameras = select_one_lens(snapshot.cameras)
     falloff = snapshot.falloffs.get(cameras[0].name, 0.0) if cameras else 0.0
     seen = appearance, cameras, estimated, falloff
     views = _score_test_views(*seen, scene, split, networks, settings, show, found, shown or {})
@@ -139,11 +146,11 @@ def evaluate(
         checkpoint=run.checkpoint,
         final=run.checkpoint is None,
         iterations=snapshot.iterations,
-        psnr=mean([view.psnr for view in views]),
-        psnr_with_rim=mean([view.psnr_with_rim for view in views]),
-        ssim=mean([view.ssim for view in views]),
-        lpips_alex=mean([view.lpips_alex for view in views]),
-        lpips_vgg=mean([view.lpips_vgg for view in views]),
+        psnr=compute_mean([view.psnr for view in views]),
+        psnr_with_rim=compute_mean([view.psnr_with_rim for view in views]),
+        ssim=compute_mean([view.ssim for view in views]),
+        lpips_alex=compute_mean([view.lpips_alex for view in views]),
+        lpips_vgg=compute_mean([view.lpips_vgg for view in views]),
         rotation_error_deg=errors.rotation_deg,
         rotation_pair_error_deg=errors.rotation_pair_deg,
         centre_error_pct=errors.centre_pct,
@@ -154,7 +161,7 @@ def evaluate(
         num_gaussians=0 if appearance is None else appearance.num_gaussians,
         num_cameras=len(snapshot.cameras),
         scene_bytes=0 if appearance is None else appearance.num_bytes,
-        regions=region_scores([view.maps for view in views if view.maps is not None]),
+        regions=compute_region_scores([view.maps for view in views if view.maps is not None]),
         verdict=snapshot.verdict.code.value,
     )
 
@@ -176,7 +183,7 @@ def _score_test_views(
     falloff: float,
     scene: EvaluationScene,
     split: Split,
-    networks: Networks,
+    networks: PerceptualNetworks,
     settings: Settings,
     show: Show,
     found: Poses,
@@ -197,45 +204,45 @@ def _score_test_views(
     true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
     true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
     scores = []
-    for view in held_out(scene, split, cameras[0].lens, settings.longer_side):
+    for view in load_held_out_views(scene, split, cameras[0].lens, settings.longer_side):
         name, whole, used = view.name, view.photograph, view.used
         rows, columns = view.shown
         height, width = whole.shape[:2]
-        whole_K = mean_intrinsics(cameras, width, height)
+        whole_K = average_intrinsics(cameras, width, height)
         truth = whole[rows, columns]
-        light = torch.from_numpy(light_at(falloff, width, height))[..., None]
+        light = torch.from_numpy(relative_illumination(falloff, width, height))[..., None]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         if name in found:
             start, steps, levels, rate = found[name], settings.continued_steps, 1, _CONTINUED_RATE
         else:
             start = true_to_estimated.camera(scene.cameras[name].T_world_camera)
             if settings.start == "interpolated":
-                start = between_neighbours(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
+                start = interpolate_pose(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
             steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
         target = (truth / light[rows, columns]).clamp(0.0, 1.0)
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
-            target = target / best_gains(target, begun, used[rows, columns])
+            target = target / fit_gains(target, begun, used[rows, columns])
         T_world_camera = find_test_pose(
-            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.compared
+            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.comparison_mask
         ).T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
         if settings.best_gain:
-            with_rim = with_rim * best_gains(truth, with_rim[rows, columns], used[rows, columns])
+            with_rim = with_rim * fit_gains(truth, with_rim[rows, columns], used[rows, columns])
         with_rim = with_rim.clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
-        known = counts_seen_by(cameras[0].lens, counts[name]) if name in counts else None
-        scores.append(_view_score(with_rim, whole, used, view.shown, networks, known))
+        known = undistort_counts(cameras[0].lens, counts[name]) if name in counts else None
+        scores.append(_score_view(with_rim, whole, used, view.shown, networks, known))
     return scores
 
 
-def _view_score(
+def _score_view(
     with_rim: Tensor,
     whole: Tensor,
     used: Tensor,
     shown: tuple[slice, slice],
-    networks: Networks,
+    networks: PerceptualNetworks,
     counts: Counts | None,
 ) -> _ViewScore:
     """A render against a photograph, both (H, W, 3), where `used` (H, W) says so, within the rows and columns shown."""
@@ -244,7 +251,7 @@ def _view_score(
     maps = None
     if counts is not None:
         judged = np.where(used.numpy(), counts, np.uint8(UNKNOWN))[shown]
-        maps = error_maps(image, truth, judged, networks.alex)
+        maps = compute_error_maps(image, truth, judged, networks.alex)
     return _ViewScore(
         psnr=psnr(image, truth, used[shown]),
         psnr_with_rim=psnr(with_rim, whole, used),
@@ -255,9 +262,9 @@ def _view_score(
     )
 
 
-def _camera_errors(estimated: Sequence[CameraEstimate], scene: EvaluationScene) -> CameraErrors:
+def _compare_cameras(estimated: Sequence[CameraEstimate], scene: EvaluationScene) -> CameraErrors:
     true = [scene.cameras[camera.name] for camera in estimated]
-    return camera_errors(
+    return compare_cameras(
         np.array([camera.T_world_camera for camera in estimated]).reshape(-1, 4, 4),
         np.array([camera.T_world_camera for camera in true]).reshape(-1, 4, 4),
         np.array([camera.K_photographed for camera in estimated]).reshape(-1, 3, 3),
@@ -267,7 +274,7 @@ def _camera_errors(estimated: Sequence[CameraEstimate], scene: EvaluationScene) 
     )
 
 
-def mean(values: Sequence[float | None]) -> float | None:
-    """Of those that were measured; None where none was."""
+def compute_mean(values: Sequence[float | None]) -> float | None:
+    """Returns the mean of the values that were measured; None where none was."""
     measured = [value for value in values if value is not None]
     return float(np.mean(measured)) if measured else None

@@ -16,9 +16,9 @@ from splatnode.capture.process.printable import cell
 from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.protocol import FAILED, Row, Settings
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.timing import processor
+from splatnode.recon.evaluate.timing import describe_processor
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.report import versions
+from splatnode.recon.result.report import collect_versions
 
 
 class Bench(msgspec.Struct, frozen=True):
@@ -32,20 +32,20 @@ class Bench(msgspec.Struct, frozen=True):
     device: str | None = None
     splits: dict[str, Split] = {}  # by `set_name`
 
-    def ended(self) -> set[tuple[str, int, str, int]]:
+    def final_runs(self) -> set[tuple[str, int, str, int]]:
         """The runs (scene, views, method, seed) that have come to their end, or failed."""
-        return {run_of(row) for row in self.rows if row.final}
+        return {make_run_key(row) for row in self.rows if row.final}
 
-    def done(self) -> set[tuple[str, int, str, int]]:
+    def successful_runs(self) -> set[tuple[str, int, str, int]]:
         """Those that need not be run again: they have not failed."""
-        return {run_of(row) for row in self.rows if row.final and row.verdict != FAILED}
+        return {make_run_key(row) for row in self.rows if row.final and row.verdict != FAILED}
 
 
-def run_of(row: Row) -> tuple[str, int, str, int]:
+def make_run_key(row: Row) -> tuple[str, int, str, int]:
     return row.scene, row.views, row.method, row.seed
 
 
-def set_name(scene: str, views: int) -> str:
+def format_set_name(scene: str, views: int) -> str:
     return f"{scene}, {views} views"
 
 
@@ -54,7 +54,7 @@ def read_bench(path: Path) -> Bench:
     return read_json(path, Bench, "the bench.json of a benchmark")
 
 
-def merged(benches: Sequence[Bench]) -> Bench:
+def merge_benches(benches: Sequence[Bench]) -> Bench:
     """The runs of several benchmarks, each run as the last of them has it. Raises ValueError if they scored otherwise.
 
     Machine and command are all that were named.
@@ -62,8 +62,10 @@ def merged(benches: Sequence[Bench]) -> Bench:
     if len({bench.settings for bench in benches}) != 1:
         settings = [dataclasses.asdict(bench.settings) for bench in benches]
         raise ValueError(f"benchmarks can be put together if their views were scored alike, got settings {settings}")
-    last = {run: number for number, bench in enumerate(benches) for run in bench.ended()}
-    rows = tuple(row for number, bench in enumerate(benches) for row in bench.rows if last.get(run_of(row)) == number)
+    last = {run: number for number, bench in enumerate(benches) for run in bench.final_runs()}
+    rows = tuple(
+        row for number, bench in enumerate(benches) for row in bench.rows if last.get(make_run_key(row)) == number
+    )
     machine = {key: value for bench in benches for key, value in bench.machine.items()}
     commands = dict.fromkeys(bench.command for bench in benches)
     common: dict[str, Any] = {}
@@ -74,7 +76,7 @@ def merged(benches: Sequence[Bench]) -> Bench:
     return Bench(rows, benches[0].settings, machine, "; ".join(commands), **common, splits=splits)
 
 
-def bench_files(bench: Bench) -> dict[str, bytes]:
+def make_bench_files(bench: Bench) -> dict[str, bytes]:
     """bench.json and bench.csv."""
     rows = [dataclasses.asdict(row) for row in bench.rows]  # msgspec leaves out what an older file did not have
     content = {
@@ -87,16 +89,16 @@ def bench_files(bench: Bench) -> dict[str, bytes]:
         "device": bench.device,
         "splits": {key: dataclasses.asdict(split) for key, split in bench.splits.items()},
     }
-    return {"bench.json": json_bytes(content), "bench.csv": _csv(rows)}
+    return {"bench.json": json_bytes(content), "bench.csv": _format_csv(rows)}
 
 
-def this_machine() -> dict[str, Any]:
-    """What the seconds were measured on."""
+def describe_machine() -> dict[str, Any]:
+    """Describes the machine on which the seconds were measured."""
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": processor(), "threads": affinity, **versions()}
+    return {"processor": describe_processor(), "threads": affinity, **collect_versions()}
 
 
-def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
+def _format_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
     """The rows with their seconds and regions as columns of their own; empty where not measured."""
     flat = []
     for record in records:

@@ -45,8 +45,8 @@ class ErrorMaps:
     counts: Counts
 
 
-def error_maps(image: Tensor, truth: Tensor, counts: Counts, network: Lpips | None) -> ErrorMaps:
-    """Of a render and a photograph, (H, W, 3) in [0, 1]. Raises ValueError where `counts` has another size."""
+def compute_error_maps(image: Tensor, truth: Tensor, counts: Counts, network: Lpips | None) -> ErrorMaps:
+    """Maps the errors of a render, (H, W, 3) in [0, 1]. Raises ValueError if `counts` differs in size."""
     if counts.shape != tuple(truth.shape[:2]):
         raise ValueError(f"counts must be {tuple(truth.shape[:2])} like the photograph, got {counts.shape}")
     planes = image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)
@@ -58,19 +58,19 @@ def error_maps(image: Tensor, truth: Tensor, counts: Counts, network: Lpips | No
     )
 
 
-def region_scores(views: Sequence[ErrorMaps]) -> dict[str, RegionScore]:
+def compute_region_scores(views: Sequence[ErrorMaps]) -> dict[str, RegionScore]:
     """A score a region, over `views`; empty where there are none."""
-    return {region: _score(views, region) for region in REGIONS} if views else {}
+    return {region: _score_region(views, region) for region in REGIONS} if views else {}
 
 
-def within(counts: Counts, region: Region) -> npt.NDArray[np.bool_]:
+def mask_region(counts: Counts, region: Region) -> npt.NDArray[np.bool_]:
     """(H, W) the pixels of a region."""
     members: Mapping[Region, tuple[int, ...]] = {"shown": (1, 2), "two": (2,), "one": (1,), "none": (0,)}
     return np.isin(counts, members[region])
 
 
-def _score(views: Sequence[ErrorMaps], region: Region) -> RegionScore:
-    masks = [within(view.counts, region) for view in views]
+def _score_region(views: Sequence[ErrorMaps], region: Region) -> RegionScore:
+    masks = [mask_region(view.counts, region) for view in views]
     share = 100.0 * sum(int(mask.sum()) for mask in masks) / sum(mask.size for mask in masks)
     enough = [(view, torch.from_numpy(m)) for view, m in zip(views, masks, strict=True) if m.mean() >= _LEAST_SHARE]
     if not enough:

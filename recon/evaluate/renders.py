@@ -18,7 +18,7 @@ _QUALITY = 90
 
 @dataclass(frozen=True)
 class Renders:
-    """Of one run. The test views in `shown` are kept as files, by their paths in the folder of the benchmark."""
+    """The renders of one run. The test views in `shown` are files, by path in the benchmark's folder."""
 
     scene: str
     views: int
@@ -31,11 +31,11 @@ class Renders:
         """A `recon.evaluate.protocol.Show`."""
         if name in self.shown:
             folder = f"{FOLDER}/{self.scene}-{self.views}/{Path(name).stem}"
-            self.files[f"{folder}/{PHOTOGRAPH}"] = _jpeg(truth)
-            self.files[f"{folder}/{self.method}-{self.seed}.jpg"] = _jpeg(image)
+            self.files[f"{folder}/{PHOTOGRAPH}"] = _encode_jpeg(truth)
+            self.files[f"{folder}/{self.method}-{self.seed}.jpg"] = _encode_jpeg(image)
 
 
-def kept(out_dir: Path, row: Row) -> dict[str, Path]:
+def find_renders(out_dir: Path, row: Row) -> dict[str, Path]:
     """The render of each kept test view, by the view's name, for the run that `row` ends; none if nothing was kept.
 
     Nor are there any of a run that was not scored: what lies there is of an earlier run.
@@ -46,6 +46,6 @@ def kept(out_dir: Path, row: Row) -> dict[str, Path]:
     return {path.parent.name: path for path in sorted(found)}
 
 
-def _jpeg(image: Tensor) -> bytes:
+def _encode_jpeg(image: Tensor) -> bytes:
     pixels = np.rint(image.numpy() * 255).astype(np.uint8)
     return encode_jpeg(pixels, _QUALITY)

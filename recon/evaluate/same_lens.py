@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts
 from splatnode.recon.result.snapshot import CameraEstimate
 
@@ -16,24 +16,24 @@ Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 
-def of_one_lens(cameras: Sequence[CameraEstimate]) -> Sequence[CameraEstimate]:
+def select_one_lens(cameras: Sequence[CameraEstimate]) -> Sequence[CameraEstimate]:
     """Those whose photographs had a distortion taken out, if they are most; else those whose had none."""
     bent = [camera for camera in cameras if camera.lens is not None]
     return bent if 2 * len(bent) > len(cameras) else [camera for camera in cameras if camera.lens is None]
 
 
-def seen_by(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, Mask]:
+def undistort_view(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, Mask]:
     """A photograph (H, W, 3), and where it is used (H, W), without the distortion of `lens`; None: as they are.
 
     Raises ValueError where `lens` folds its picture over.
     """
     if lens is None:
         return image, mask
-    frame = undistorted(Frame(0, "photograph", 0, image, lens, mask=mask))
+    frame = undistort_frame(Frame(0, "photograph", 0, image, lens, mask=mask))
     return frame.image, np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask
 
 
-def counts_seen_by(lens: Intrinsics | None, counts: Counts) -> Counts | None:
+def undistort_counts(lens: Intrinsics | None, counts: Counts) -> Counts | None:
     """How many photographs show each pixel (H, W) of a photograph, without the distortion of `lens`.
 
     UNKNOWN where pixels that differ in it are mixed. None for a fisheye, whose picture gets another shape.
@@ -44,11 +44,11 @@ def counts_seen_by(lens: Intrinsics | None, counts: Counts) -> Counts | None:
         return None
     blank, straight = np.zeros((*counts.shape, 3), np.uint8), np.full_like(counts, UNKNOWN)
     for count in np.unique(counts):
-        straight[seen_by(lens, blank, counts == count)[1]] = count
+        straight[undistort_view(lens, blank, counts == count)[1]] = count
     return straight
 
 
-def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:
+def average_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:
     """(3, 3) K for an image `width` x `height`: mean focal lengths and principal point, relative to the image sizes."""
     longer = np.array([max(camera.width, camera.height) for camera in cameras])
     Ks = np.stack([camera.K for camera in cameras])

@@ -9,31 +9,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from splatnode.recon.jobs.call import Answer, Work, packed
+from splatnode.recon.jobs.call import Answer, Work, pack_call
 from splatnode.recon.jobs.calls import Engine, Task
 from splatnode.recon.jobs.child import Limits
 
 
 @dataclass(frozen=True)
-class Need:
-    """What runs need; those with the same `key` are one."""
+class Prerequisite:
+    """The prerequisite of runs; those with the same `key` are one."""
 
     key: Hashable
     work: Work
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedRun:
     """A run. `work` makes its call of what its needs returned, pickled, in their order."""
 
     about: Any
-    needs: tuple[Need, ...]
+    needs: tuple[Prerequisite, ...]
     work: Callable[..., Work]
 
 
-def ended(
-    runs: Sequence[Planned], engine: Engine, limits: Limits, folder: Path
-) -> Generator[tuple[Planned, Answer], None, None]:
+def run_schedule(
+    runs: Sequence[PlannedRun], engine: Engine, limits: Limits, folder: Path
+) -> Generator[tuple[PlannedRun, Answer], None, None]:
     """The runs as they come to their end, each with its answer; where a need has none, that is its answer, too.
 
     `folder` is for files that are there meanwhile.
@@ -41,16 +41,16 @@ def ended(
     schedule = _Schedule(runs, folder / "needs")
     answers = engine.answers(schedule.take, limits, folder / "calls")
     for about, answer in answers:
-        if isinstance(about, Planned):
+        if isinstance(about, PlannedRun):
             schedule.release(about)
             yield about, answer
         else:
-            for run in schedule.made(about, answer):
+            for run in schedule.store_result(about, answer):
                 yield run, answer
 
 
 class _Schedule:
-    def __init__(self, runs: Sequence[Planned], folder: Path) -> None:
+    def __init__(self, runs: Sequence[PlannedRun], folder: Path) -> None:
         self._waiting = deque(runs)
         self._folder, self._numbers = folder, itertools.count()
         self._begun: set[Hashable] = set()
@@ -62,13 +62,13 @@ class _Schedule:
         for run in self._waiting:
             if need := next((need for need in run.needs if need.key not in self._begun), None):
                 self._begun.add(need.key)
-                return Task(need, packed(need.work))
+                return Task(need, pack_call(need.work))
             if all(need.key in self._made for need in run.needs):
                 self._waiting.remove(run)
-                return Task(run, packed(run.work(*(self._made[need.key].read_bytes() for need in run.needs))))
+                return Task(run, pack_call(run.work(*(self._made[need.key].read_bytes() for need in run.needs))))
         return None
 
-    def made(self, need: Need, answer: Answer) -> list[Planned]:
+    def store_result(self, need: Prerequisite, answer: Answer) -> list[PlannedRun]:
         """Keeps what was made; where nothing was, the runs that will never be."""
         if answer.pickled is not None:
             self._folder.mkdir(parents=True, exist_ok=True)
@@ -81,7 +81,7 @@ class _Schedule:
             self.release(run)
         return lost
 
-    def release(self, run: Planned) -> None:
+    def release(self, run: PlannedRun) -> None:
         """Removes what no other run needs."""
         for need in run.needs:
             self._users[need.key] -= 1

@@ -18,8 +18,8 @@ import numpy.typing as npt
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts
 from splatnode.recon.evaluate.true_cameras import TrueCamera
 from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
-from splatnode.recon.geometry import project, to_camera
+from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.geometry import project, transform_to_camera
 from splatnode.recon.priors import stereo
 from splatnode.recon.priors.consistency import DepthMap
 
@@ -39,7 +39,7 @@ _RANGE_MARGIN = 2.0  # times what matched points reach, nearer and farther, is s
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What a photograph sees, by its true camera."""
+    """The surface that an image sees, by its true camera."""
 
     T_world_camera: Array  # (4, 4)
     K: Array  # (3, 3), of a photograph of this size
@@ -49,7 +49,7 @@ class Surface:
     def pixels(self, points: Array) -> tuple[Mask, Indices, Indices, Array]:
         """(M,) which points (M, 3) lie within the photograph; the row and column of each, 0 beyond it; its depth z."""
         height, width = self.depth.shape
-        in_camera = to_camera(points, self.T_world_camera)
+        in_camera = transform_to_camera(points, self.T_world_camera)
         z = in_camera[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = np.nan_to_num(project(in_camera, self.K), nan=-1.0, posinf=-1.0, neginf=-1.0).T
@@ -57,33 +57,35 @@ class Surface:
         return inside, np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), z
 
 
-def surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
+def compute_surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
     """The surfaces that the photographs with a true camera see, at `longer_side` pixels, by name."""
-    given = {name: scene.masked_image(name) for name in scene.cameras}
-    images = {name: modelled_image(image, longer_side) for name, (image, _) in given.items()}
+    given = {name: scene.load_masked_image(name) for name in scene.cameras}
+    images = {name: resize_image(image, longer_side) for name, (image, _) in given.items()}
     used = {
-        name: None if mask.all() else modelled_mask(mask, *images[name].shape[:2]) for name, (_, mask) in given.items()
+        name: None if mask.all() else resize_mask(mask, *images[name].shape[:2]) for name, (_, mask) in given.items()
     }
-    ranges = _depth_ranges(images, scene.cameras)
+    ranges = _estimate_depth_ranges(images, scene.cameras)
     views = {
         name: stereo.StereoView(image, _K(scene.cameras[name], image), scene.cameras[name].T_world_camera, ranges[name])
         for name, image in images.items()
         if name in ranges
     }
-    maps = stereo.depth_maps(list(views.values()), stereo.Config())
+    maps = stereo.estimate_depth_maps(list(views.values()), stereo.StereoConfig())
     return {
-        name: Surface(view.T_world_camera, view.K, _closed(_known(each, used[name])), used[name])
+        name: Surface(
+            view.T_world_camera, view.K, _fill_small_holes(_select_consistent_depth(each, used[name])), used[name]
+        )
         for (name, view), each in zip(views.items(), maps, strict=True)
     }
 
 
-def _known(found: DepthMap, used: Mask | None) -> npt.NDArray[np.float32]:
+def _select_consistent_depth(found: DepthMap, used: Mask | None) -> npt.NDArray[np.float32]:
     """(h, w) the depth that another photograph confirms, of what is used; 0 elsewhere."""
     sure = found.num_consistent >= _AGREEING
     return found.depth * (sure if used is None else sure & used)
 
 
-def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:
+def count_visibility(view: Surface, training: Sequence[Surface]) -> Counts:
     """(h, w) how many of the training photographs show each pixel of `view`: 0, 1, 2 for more; UNKNOWN."""
     rows, columns = np.nonzero(view.depth > 0)
     z = np.asarray(view.depth[rows, columns], np.float64)
@@ -91,18 +93,20 @@ def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:
     points = (rays * z[:, None]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
     shown = np.zeros(len(points), int)
     for each in training:
-        shown += _shows(each, points)
+        shown += _compute_visibility(each, points)
     counts = np.full(view.depth.shape, UNKNOWN, np.uint8)
     counts[rows, columns] = np.minimum(shown, 2)
     return counts
 
 
-def counts_of(names: Iterable[str], views: Mapping[str, Surface], training: Sequence[Surface]) -> dict[str, Counts]:
+def count_visibility_by_name(
+    names: Iterable[str], views: Mapping[str, Surface], training: Sequence[Surface]
+) -> dict[str, Counts]:
     """`shown_counts` of those photographs whose surface is known, by name."""
-    return {name: shown_counts(views[name], training) for name in names if name in views}
+    return {name: count_visibility(views[name], training) for name in names if name in views}
 
 
-def _shows(camera: Surface, points: Array) -> Mask:
+def _compute_visibility(camera: Surface, points: Array) -> Mask:
     """(M,) which points (M, 3) lie within a photograph and are not hidden there, by what stands before or by a mask."""
     inside, row, column, z = camera.pixels(points)
     before = camera.depth[row, column]
@@ -110,8 +114,8 @@ def _shows(camera: Surface, points: Array) -> Mask:
     return shows if camera.used is None else shows & camera.used[row, column]
 
 
-def _closed(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """With small holes filled by the nearest depth."""
+def _fill_small_holes(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Fills small holes with the nearest depth."""
     known = depth > 0
     if not known.any():
         return depth.astype(np.float32)
@@ -124,12 +128,14 @@ def _closed(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return np.where(away <= _REACH_PX, by_label[nearest], 0).astype(np.float32)
 
 
-def _depth_ranges(images: Mapping[str, Image], cameras: Mapping[str, TrueCamera]) -> dict[str, tuple[float, float]]:
+def _estimate_depth_ranges(
+    images: Mapping[str, Image], cameras: Mapping[str, TrueCamera]
+) -> dict[str, tuple[float, float]]:
     """Nearest and farthest depth to search in each photograph that shares enough points with others."""
     sift, matcher = cv2.SIFT.create(4000), cv2.BFMatcher(cv2.NORM_L2)
     found = {name: sift.detectAndCompute(image, None) for name, image in images.items()}
     depths: dict[str, list[Array]] = {name: [] for name in images}
-    for first, second in _pairs(cameras, list(images)):
+    for first, second in _select_pairs(cameras, list(images)):
         (points, codes), (others, other_codes) = found[first], found[second]
         if min(len(points), len(others)) < 2:
             continue
@@ -137,20 +143,20 @@ def _depth_ranges(images: Mapping[str, Image], cameras: Mapping[str, TrueCamera]
                  if best.distance < _RATIO * next_best.distance]  # fmt: skip
         a = np.array([points[match.queryIdx].pt for match in pairs]).reshape(-1, 2) + 0.5
         b = np.array([others[match.trainIdx].pt for match in pairs]).reshape(-1, 2) + 0.5
-        world = _triangulated(a, b, *(_projection(cameras[name], images[name]) for name in (first, second)))
+        world = _triangulate(a, b, *(_compute_projection(cameras[name], images[name]) for name in (first, second)))
         fits = np.ones(len(world), bool)
         for name, pixels in ((first, a), (second, b)):
-            in_camera = to_camera(world, cameras[name].T_world_camera)
+            in_camera = transform_to_camera(world, cameras[name].T_world_camera)
             with np.errstate(divide="ignore", invalid="ignore"):
                 off = np.linalg.norm(project(in_camera, _K(cameras[name], images[name])) - pixels, axis=1)
             fits &= (in_camera[:, 2] > 0) & (off < _EPIPOLAR_PX)
         for name in (first, second):
-            depths[name].append(to_camera(world[fits], cameras[name].T_world_camera)[:, 2])
+            depths[name].append(transform_to_camera(world[fits], cameras[name].T_world_camera)[:, 2])
     known = {name: np.concatenate(each) for name, each in depths.items() if each}
-    return {name: stereo.depth_range(z, _RANGE_MARGIN) for name, z in known.items() if len(z) >= 20}
+    return {name: stereo.estimate_depth_range(z, _RANGE_MARGIN) for name, z in known.items() if len(z) >= 20}
 
 
-def _pairs(cameras: Mapping[str, TrueCamera], names: Sequence[str]) -> list[tuple[str, str]]:
+def _select_pairs(cameras: Mapping[str, TrueCamera], names: Sequence[str]) -> list[tuple[str, str]]:
     """Each photograph with those that look most alike in direction, of which the nearest."""
     axes = np.stack([cameras[name].T_world_camera[:3, 2] for name in names])
     centres = np.stack([cameras[name].T_world_camera[:3, 3] for name in names])
@@ -161,7 +167,7 @@ def _pairs(cameras: Mapping[str, TrueCamera], names: Sequence[str]) -> list[tupl
     return [(names[i], names[j]) for i, j in combinations(range(len(names)), 2) if frozenset((i, j)) in chosen]
 
 
-def _triangulated(a: Array, b: Array, P: Array, Q: Array) -> Array:
+def _triangulate(a: Array, b: Array, P: Array, Q: Array) -> Array:
     """(M, 3) the points of pixels (M, 2) in two photographs with projections (3, 4)."""
     if not len(a):
         return np.zeros((0, 3))
@@ -170,7 +176,7 @@ def _triangulated(a: Array, b: Array, P: Array, Q: Array) -> Array:
         return np.nan_to_num((homogeneous[:3] / homogeneous[3]).T)
 
 
-def _projection(camera: TrueCamera, image: Image) -> Array:
+def _compute_projection(camera: TrueCamera, image: Image) -> Array:
     return _K(camera, image) @ np.linalg.inv(camera.T_world_camera)[:3]
 
 

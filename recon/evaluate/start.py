@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate
-from splatnode.recon.modelling import begin_scene
-from splatnode.recon.pipeline import estimate_frames, model
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.modelling import create_initial_scene
+from splatnode.recon.pipeline import estimate_frames, model_scene
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -19,20 +19,20 @@ from splatnode.recon.result.snapshot import Snapshot
 class Start:
     """Cameras and depth, no Gaussians yet; it is sent from process to process, and serves several reconstructions."""
 
-    estimate: Estimate
+    estimate: Reconstruction
     dropped: list[DroppedFrame]
     clock: Clock
     peak_rss_mb: float | None
 
     @property
     def seconds(self) -> float:
-        """That it took so far."""
+        """Returns the seconds that it took so far."""
         return self.clock.last - self.clock.started
 
 
-def foundation(config: Config) -> Config:
+def extract_start_config(config: ReconstructionConfig) -> ReconstructionConfig:
     """The part of a configuration that decides cameras and points; all else is at its defaults."""
-    return Config(
+    return ReconstructionConfig(
         size=config.size,
         prior=config.prior,
         matching=config.matching,
@@ -45,16 +45,16 @@ def foundation(config: Config) -> Config:
     )
 
 
-def find_start(frames: Sequence[Frame], config: Config) -> Start:
+def find_start(frames: Sequence[Frame], config: ReconstructionConfig) -> Start:
     """Cameras and depth as `config` finds them, or a verdict that forbids them."""
     clock = Clock()
     estimate, dropped = estimate_frames(frames, config, clock)
     return Start(estimate, dropped, clock, peak_rss_mb())
 
 
-def continued(start: Start, config: Config) -> Iterator[Snapshot]:
-    """What `reconstruct` gives from here on with `config`; the clock goes on where it stopped."""
+def continue_reconstruction(start: Start, config: ReconstructionConfig) -> Iterator[Snapshot]:
+    """Yields what `reconstruct` gives from here on with `config`; the clock resumes where it stopped."""
     clock = replace(start.clock, seconds=dict(start.clock.seconds))
     clock.resume()
-    begun = begin_scene(start.estimate, config)
-    yield from model(start.estimate.conclusion, begun, start.dropped, config, clock)
+    begun = create_initial_scene(start.estimate, config)
+    yield from model_scene(start.estimate.summary, begun, start.dropped, config, clock)

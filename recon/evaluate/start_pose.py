@@ -11,7 +11,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 
-def between_neighbours(name: str, order: Sequence[str], cameras: Mapping[str, Array]) -> Array:
+def interpolate_pose(name: str, order: Sequence[str], cameras: Mapping[str, Array]) -> Array:
     """(4, 4) T_world_camera between the estimated cameras of the photographs before and after `name` in `order`.
 
     The centre moves evenly along the line between the two, and the rotation evenly about one axis, by the place of

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from splatnode.recon.evaluate.protocol import Row, mean
+from splatnode.recon.evaluate.protocol import Row, compute_mean
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class MethodMean:
     peak_rss_mb: float | None
 
 
-def shared(rows: Sequence[Row]) -> list[Row]:
-    """Of each number of views the runs (scene, seed) that every method was put to; all, where there are none such.
+def select_shared_runs(rows: Sequence[Row]) -> list[Row]:
+    """Selects, for each number of views, the runs (scene, seed) that every method has; all if none are.
 
     Means over different scenes say more about the scenes than about the methods.
     """
@@ -43,7 +43,7 @@ def shared(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if not common[row.views] or (row.scene, row.seed) in common[row.views]]
 
 
-def method_means(rows: Sequence[Row]) -> list[MethodMean]:
+def compute_method_means(rows: Sequence[Row]) -> list[MethodMean]:
     """One MethodMean for each (views, method, checkpoint), in the order of the benchmark; ends come after checkpoints.
 
     A run that ended before a checkpoint counts there with its end: every point of a curve is over the same runs.
@@ -54,36 +54,36 @@ def method_means(rows: Sequence[Row]) -> list[MethodMean]:
         runs.setdefault((row.scene, row.seed), []).append(row)
     found = []
     for (views, method), runs in sorted(groups.items(), key=lambda item: item[0][0]):
-        for moment in sorted({_moment(row) for run in runs.values() for row in run}):
-            chosen = [_row_at(run, moment) for run in runs.values()]
-            found.append(_method_mean(views, method, None if moment == math.inf else int(moment), chosen))
+        for moment in sorted({_compute_moment(row) for run in runs.values() for row in run}):
+            chosen = [_select_row_at(run, moment) for run in runs.values()]
+            found.append(_compute_method_mean(views, method, None if moment == math.inf else int(moment), chosen))
     return found
 
 
-def _moment(row: Row) -> float:
+def _compute_moment(row: Row) -> float:
     """The checkpoint's iterations; infinite for the end of a run."""
     return math.inf if row.checkpoint is None else row.checkpoint
 
 
-def _row_at(run: Sequence[Row], moment: float) -> Row:
+def _select_row_at(run: Sequence[Row], moment: float) -> Row:
     """The run's first row at or beyond a moment; its latest where the run broke off before."""
-    beyond = [row for row in run if _moment(row) >= moment]
-    return min(beyond, key=_moment) if beyond else max(run, key=_moment)
+    beyond = [row for row in run if _compute_moment(row) >= moment]
+    return min(beyond, key=_compute_moment) if beyond else max(run, key=_compute_moment)
 
 
-def _alike(rows: Sequence[Row]) -> bool:
+def _is_same_hardware(rows: Sequence[Row]) -> bool:
     """Whether all ran on processors of one kind, on as many cores each: else a mean of their seconds says nothing."""
     return len({(row.processor, row.cores) for row in rows}) <= 1
 
 
-def _method_mean(views: int, method: str, checkpoint: int | None, rows: Sequence[Row]) -> MethodMean:
+def _compute_method_mean(views: int, method: str, checkpoint: int | None, rows: Sequence[Row]) -> MethodMean:
     """Seconds, Gaussians and bytes are those of the published runs, like the quality that they bought."""
     solved = [row for row in rows if row.psnr is not None]
 
-    def over_all(values: Sequence[float | None]) -> float | None:
-        return None if None in values else mean(values)
+    def average_all(values: Sequence[float | None]) -> float | None:
+        return None if None in values else compute_mean(values)
 
-    scene_bytes = over_all([row.scene_bytes for row in solved])
+    scene_bytes = average_all([row.scene_bytes for row in solved])
     names = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "num_gaussians", "peak_rss_mb")
     poses = ("rotation_error_deg", "centre_error_pct", "focal_error_pct")
     return MethodMean(
@@ -92,7 +92,7 @@ def _method_mean(views: int, method: str, checkpoint: int | None, rows: Sequence
         checkpoint,
         runs=len(rows),
         solved=len(solved),
-        seconds=over_all([row.seconds.get("total") for row in solved]) if _alike(solved) else None,
+        seconds=average_all([row.seconds.get("total") for row in solved]) if _is_same_hardware(solved) else None,
         scene_megabytes=None if scene_bytes is None else scene_bytes / 1e6,
-        **{name: over_all([getattr(row, name) for row in solved]) for name in (*names, *poses)},
+        **{name: average_all([getattr(row, name) for row in solved]) for name in (*names, *poses)},
     )

@@ -56,7 +56,7 @@ def find_test_pose(
     T, best_T, best_loss = start, start, math.inf
     for step in range(steps):
         level = step * levels // steps
-        reduced = _reduced(image, K, used, 2 ** (levels - 1 - level))
+        reduced = _downsample_inputs(image, K, used, 2 ** (levels - 1 - level))
         loss, gradient = _loss_and_gradient(scene, T, *reduced)
         if level == levels - 1 and loss < best_loss:
             best_T, best_loss = T, loss
@@ -84,18 +84,20 @@ def _loss_and_gradient(
     return float(loss.detach()), gradient.double()
 
 
-def _reduced(image: Tensor, K: Array, used: Tensor | None, factor: int) -> tuple[Tensor, Tensor, Tensor | None]:
+def _downsample_inputs(
+    image: Tensor, K: Array, used: Tensor | None, factor: int
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """The image area-resampled by 1 / `factor`, its K, and where it is compared."""
     height, width = image.shape[:2]
     size = max(1, round(height / factor)), max(1, round(width / factor))
     ratios = torch.tensor([size[1] / width, size[0] / height, 1.0], dtype=torch.float64)
     if size != (height, width):
         image = functional.interpolate(image.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
-        used = None if used is None else _reduced_mask(used, size)
+        used = None if used is None else _downsample_mask(used, size)
     return image, torch.from_numpy(K) * ratios[:, None], used
 
 
-def _reduced_mask(used: Tensor, size: tuple[int, int]) -> Tensor:
+def _downsample_mask(used: Tensor, size: tuple[int, int]) -> Tensor:
     """Pixels of which all is used; where there are none, those of which anything is."""
     share = functional.interpolate(used.float()[None, None], size=size, mode="area")[0, 0]
     whole = share > 0.999

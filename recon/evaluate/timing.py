@@ -18,13 +18,13 @@ class Timing:
     others: float | None  # the share of their time that others took while the clock ran; None: nobody can tell
 
     @property
-    def alone(self) -> bool:
+    def is_alone(self) -> bool:
         return had_alone(self.others)
 
 
-def timing(since: Moment) -> Timing:
-    """Of what this process has done since then."""
-    return Timing(len(since.cores), processor(), others_share(since, now()))
+def measure_timing(since: Moment) -> Timing:
+    """Measures the timing of this process since then."""
+    return Timing(len(since.cores), describe_processor(), others_share(since, now()))
 
 
 def had_alone(others: float | None) -> bool:
@@ -32,13 +32,13 @@ def had_alone(others: float | None) -> bool:
     return others is None or others <= ALONE
 
 
-def most_taken(timings: Iterable[Timing | None]) -> float | None:
+def find_largest_share(timings: Iterable[Timing | None]) -> float | None:
     """The largest share that others took in any of these; None: nobody can tell of any."""
     shares = [timed.others for timed in timings if timed is not None]
     return max((share for share in shares if share is not None), default=None)
 
 
-def untimed(others: Collection[float | None]) -> str:
+def explain_missing_seconds(others: Collection[float | None]) -> str:
     """A sentence for runs of which others took these shares of the cores; empty where all were alone."""
     disturbed = sum(not had_alone(share) for share in others)
     if not disturbed:
@@ -53,18 +53,18 @@ def check_same_cores(known: Collection[int], each: int, where: Path) -> None:
     """Raises ValueError where `where` holds runs on `known` numbers of cores and the next ones would have `each`."""
     if other := sorted(set(known) - {each}):
         raise ValueError(
-            f"{where} holds runs that had {_cores(other[0])} each, now each would have {_cores(each)}, and their "
+            f"{where} holds runs that had {_format_cores(other[0])} each, now each would have {_format_cores(each)}, and their "
             "seconds would be mixed: give the same --cores as before, or another --out"
         )
 
 
-def processor() -> str:
+def describe_processor() -> str:
     """The name of this machine's, with the instructions that the core uses: one name has several generations."""
     used = instruction_sets()[:1]
-    return ", ".join([_name(), *used])
+    return ", ".join([_read_processor_name(), *used])
 
 
-def _name() -> str:
+def _read_processor_name() -> str:
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -74,5 +74,5 @@ def _name() -> str:
     return platform.processor() or platform.machine()
 
 
-def _cores(number: int) -> str:
+def _format_cores(number: int) -> str:
     return f"{number} core{'s' * (number != 1)}"

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import LONGEST_TEXT, printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import LONGEST_TEXT, sanitize_text
 from splatnode.recon.evaluate.colmap_model import read_model
 from splatnode.recon.evaluate.json_file import EvaluationFileError, read_json
-from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.camera_check import find_camera_problem
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.cameras import Number, Row3, Row4
 from splatnode.recon.result.export.quaternions import matrices_from_quats
@@ -48,13 +48,13 @@ class TrueCamera:
         return self.K * np.array([width / self.width, height / self.height, 1.0])[:, None]
 
     def intrinsics_for(self, width: int, height: int) -> Intrinsics:
-        """What a reconstruction that is given the lens is told of the image resized to `width` x `height`."""
+        """Returns the given intrinsics of the image resized to `width` x `height`."""
         K = self.K_for(width, height)
         return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given")
 
 
-class _Photograph(msgspec.Struct, frozen=True):
-    """Of a recorded data set's cameras.json. Some have photographs whose camera nobody knows."""
+class _ImageRecord(msgspec.Struct, frozen=True):
+    """An image of a recorded data set's cameras.json; the camera of some is unknown."""
 
     name: Text
     R: tuple[Row3, Row3, Row3] | None = None  # of T_camera_world
@@ -66,11 +66,11 @@ class _Photograph(msgspec.Struct, frozen=True):
 
 class _CamerasJson(msgspec.Struct, frozen=True):
     cameras: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET  # ours
-    images: tuple[_Photograph, ...] | None = None
+    images: tuple[_ImageRecord, ...] | None = None
 
 
 class _Lens(msgspec.Struct, frozen=True):
-    """What transforms.json says of all photographs, or of one."""
+    """The lens that transforms.json gives for all images, or for one."""
 
     w: Number | None = None
     h: Number | None = None
@@ -86,34 +86,34 @@ class _Lens(msgspec.Struct, frozen=True):
     p2: Number | None = None
 
 
-class _View(_Lens, frozen=True, kw_only=True):
+class _TransformsFrame(_Lens, frozen=True, kw_only=True):
     file_path: Text
     transform_matrix: tuple[Row4, Row4, Row4, Row4] | None = None
 
 
 class _TransformsJson(_Lens, frozen=True, kw_only=True):
-    frames: tuple[_View, ...]
+    frames: tuple[_TransformsFrame, ...]
 
 
 def read_true_cameras(path: Path) -> dict[str, TrueCamera]:
-    """By the name of the photograph, without its folder; `path` is cameras.json, transforms.json or a model's folder.
+    """Reads cameras by image name; `path` is cameras.json, transforms.json or a model's folder.
 
     Raises EvaluationFileError or SceneFileError, which name the file, where it is something else, or where a camera is
     no rigid motion or no pinhole; OSError.
     """
-    readers = {"cameras.json": _cameras_json, "transforms.json": _transforms_json}
-    with foreign(EvaluationFileError, str(path)):
+    readers = {"cameras.json": _read_cameras_json, "transforms.json": _read_transforms_json}
+    with guard_untrusted(EvaluationFileError, str(path)):
         cameras: dict[str, TrueCamera] = {}
-        for name, camera in readers.get(path.name, _colmap)(path):
-            problem = camera_problem(camera.T_world_camera, camera.K, camera.width, camera.height)
+        for name, camera in readers.get(path.name, _read_colmap)(path):
+            problem = find_camera_problem(camera.T_world_camera, camera.K, camera.width, camera.height)
             problem = problem or ("there are two cameras of this name" if name in cameras else "")
             if problem:
-                raise EvaluationFileError(f"{path}, {printable(name, 100)}: {problem}")
+                raise EvaluationFileError(f"{path}, {sanitize_text(name, 100)}: {problem}")
             cameras[name] = camera
         return cameras
 
 
-def _cameras_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
+def _read_cameras_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
     content = read_json(path, _CamerasJson, "the cameras of a scene")
     if content.cameras is not msgspec.UNSET:
         for camera in read_cameras(path):
@@ -125,11 +125,11 @@ def _cameras_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
         if image.R is None:
             continue
         if image.t is None or image.K is None:
-            raise EvaluationFileError(f"{path} must give R, t and K for {printable(image.name)}")
+            raise EvaluationFileError(f"{path} must give R, t and K for {sanitize_text(image.name)}")
         yield (
             image.name,
-            _turned(
-                f"{path}, {printable(image.name, 100)}",
+            _make_true_camera(
+                f"{path}, {sanitize_text(image.name, 100)}",
                 np.array(image.R),
                 image.t,
                 np.array(image.K),
@@ -139,12 +139,12 @@ def _cameras_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
         )
 
 
-def _transforms_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
+def _read_transforms_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
     content = read_json(path, _TransformsJson, "a transforms.json of nerfstudio")
     for view in content.frames:
         told = {key: getattr(view, key) for key in _Lens.__struct_fields__}
         values = {key: getattr(content, key) if value is None else value for key, value in told.items()}
-        shown = printable(view.file_path)
+        shown = sanitize_text(view.file_path)
         missing = [key for key in ("w", "h", "fl_x") if values[key] is None]
         missing += ["transform_matrix"] if view.transform_matrix is None else []
         if missing:
@@ -160,21 +160,23 @@ def _transforms_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
         yield Path(view.file_path).name, TrueCamera(T_world_camera, K, width, height)
 
 
-def _colmap(path: Path) -> Iterable[tuple[str, TrueCamera]]:
+def _read_colmap(path: Path) -> Iterable[tuple[str, TrueCamera]]:
     for image in read_model(path):
         lens = image.camera
         K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
         with np.errstate(invalid="ignore"):  # a quaternion of zeros is no rotation, which is found below
             rotation = matrices_from_quats(image.quat)
-        where = f"{path}, {printable(image.name, 100)}"
-        yield Path(image.name).name, _turned(where, rotation, image.translation, K, lens.width, lens.height)
+        where = f"{path}, {sanitize_text(image.name, 100)}"
+        yield Path(image.name).name, _make_true_camera(where, rotation, image.translation, K, lens.width, lens.height)
 
 
-def _turned(where: str, rotation: Array, translation: Iterable[float], K: Array, width: int, height: int) -> TrueCamera:
+def _make_true_camera(
+    where: str, rotation: Array, translation: Iterable[float], K: Array, width: int, height: int
+) -> TrueCamera:
     """From the rotation and the translation of T_camera_world."""
     T_camera_world = np.eye(4)
     T_camera_world[:3, :3], T_camera_world[:3, 3] = rotation, tuple(translation)
-    problem = camera_problem(T_camera_world, K, width, height)
+    problem = find_camera_problem(T_camera_world, K, width, height)
     if problem:
         raise EvaluationFileError(f"{where}: {problem.replace('T_world_camera', 'T_camera_world')}")
     return TrueCamera(np.linalg.inv(T_camera_world).astype(np.float64), K, width, height)

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras.folder import frame_name, image_paths
 from splatnode.capture.frame import Frame
-from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file, upright_size
-from splatnode.capture.masks import all_masked, in_files
-from splatnode.capture.process.printable import printable
+from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_any_image, read_image_file, upright_size
+from splatnode.capture.masks import mask_frames, open_masks
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.true_cameras import TrueCamera, read_true_cameras
 
@@ -34,23 +34,23 @@ class EvaluationScene:
         """(H, W, 3) RGB. Raises EvaluationFileError where it is no image, or none of its true camera; OSError."""
         path = self.paths[name]
         try:
-            image = decode_photograph(read_image_file(path))[0]
+            image = decode_any_image(read_image_file(path))[0]
         except UnusableImage as error:
             raise EvaluationFileError(f"{path} must be an image: {error}") from error
         _check_size(path, self.cameras.get(name), (image.shape[1], image.shape[0]))
         return image
 
     def frames(self, names: Sequence[str]) -> list[Frame]:
-        """What a reconstruction gets: images in the given order, and nothing known about the camera.
+        """Loads what a reconstruction gets: images in the given order, nothing known about the camera.
 
         Without those of which a mask leaves hardly anything. Raises as `image`, and UnusableMask.
         """
         found = [Frame(i, name, i, self.image(name), None) for i, name in enumerate(names)]
         if self.masks is None:
             return found
-        return [each for each in all_masked(found, in_files(self.masks)) if isinstance(each, Frame)]
+        return [each for each in mask_frames(found, open_masks(self.masks)) if isinstance(each, Frame)]
 
-    def masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
+    def load_masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
         """(H, W, 3) RGB, filled where it is not used, and (H, W) where it is: nowhere, where hardly anything is.
 
         Raises as `image`, and UnusableMask.
@@ -75,7 +75,7 @@ def load_scene(folder: Path) -> EvaluationScene:
     file) where it cannot be what it should be, where all cameras are of other photographs, or a photograph has another
     shape than its true camera's pictures.
     """
-    place = scene_folder(folder)
+    place = find_scene_folder(folder)
     data = place / _CHOSEN if (place / _CHOSEN).is_dir() else place
     photographs = image_paths(data / "images") if (data / "images").is_dir() else []
     paths = {frame_name(path): path for path in photographs if path.suffix.lower() in SUFFIXES}
@@ -87,18 +87,18 @@ def load_scene(folder: Path) -> EvaluationScene:
             cameras = read_true_cameras(data / source)
             known = {name: cameras[path.name] for name, path in paths.items() if path.name in cameras}
             if cameras and not known:
-                example = f"such as {printable(min(cameras), 100)}, there is {next(iter(paths))}"
+                example = f"such as {sanitize_text(min(cameras), 100)}, there is {next(iter(paths))}"
                 raise EvaluationFileError(
                     f"no photograph in {data / 'images'} has a camera in {data / source}, {example}"
                 )
             for name, camera in known.items():
-                _check_size(paths[name], camera, _size(paths[name]))
+                _check_size(paths[name], camera, _read_size(paths[name]))
             masks = data / "masks" if (data / "masks").is_dir() else None
             return EvaluationScene(place.name, paths, known, masks)
     raise FileNotFoundError(f"{data} must hold the true cameras as one of {', '.join(sources)}; there is none")
 
 
-def _size(path: Path) -> tuple[int, int] | None:
+def _read_size(path: Path) -> tuple[int, int] | None:
     """Width and height of a photograph; None where its file does not tell: what is wrong with it, `image` says."""
     try:
         return upright_size(read_image_file(path))
@@ -112,11 +112,11 @@ def _check_size(path: Path, camera: TrueCamera | None, size: tuple[int, int] | N
         raise EvaluationFileError(f"{path}: {problem}")
 
 
-def check_named_apart(folders: Sequence[Path]) -> None:
+def check_distinct_names(folders: Sequence[Path]) -> None:
     """Raises ValueError where two of the folders hold scenes of one name, or are one: by it what is found is kept."""
     known: dict[str, tuple[Path, Path]] = {}
     for folder in folders:
-        place = scene_folder(Path(os.path.abspath(folder)))
+        place = find_scene_folder(Path(os.path.abspath(folder)))
         if place.name in known:
             other, before = known[place.name]
             why = "are one scene" if before == place else f"are both called {place.name!r}, which tells scenes apart"
@@ -124,6 +124,6 @@ def check_named_apart(folders: Sequence[Path]) -> None:
         known[place.name] = folder, place
 
 
-def scene_folder(folder: Path) -> Path:
+def find_scene_folder(folder: Path) -> Path:
     """The folder with the scene's name, where `folder` may be the one of its chosen frames."""
     return folder.parent if folder.name == _CHOSEN else folder

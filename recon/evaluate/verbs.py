@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.process.arguments import counts, names, positive, seconds
-from splatnode.capture.process.verb import Verb, lazily
+from splatnode.capture.process.verb import Verb, import_lazily
 from splatnode.recon.jobs.arguments import add_max_memory, add_ray
 from splatnode.recon.shared_arguments import add_device
 
@@ -87,7 +87,7 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_engine(parser: argparse.ArgumentParser, several: str, one: str, timeout_s: float) -> None:
-    """Where and how many at a time, and what ends `one` of `several`."""
+    """Adds where runs are made, how many at a time, and what ends `one` of `several`."""
     parser.add_argument(
         "--cores",
         type=positive,
@@ -106,12 +106,15 @@ def _add_engine(parser: argparse.ArgumentParser, several: str, one: str, timeout
 
 
 BENCH = Verb(
-    "bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("splatnode.recon.cli", "bench")
+    "bench",
+    "measure held-out quality, poses and seconds",
+    _bench_arguments,
+    import_lazily("splatnode.recon.cli", "bench"),
 )
 
 STABILITY = Verb(
     "stability",
     "measure how often the answer is wrong",
     _stability_arguments,
-    lazily("splatnode.recon.evaluate.stability.command", "stability"),
+    import_lazily("splatnode.recon.evaluate.stability.command", "stability"),
 )

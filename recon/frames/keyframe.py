@@ -31,8 +31,8 @@ class Features:
     # (D,) simulated tilt: by which the image's width was divided; below 1, its height was multiplied by it; 1 for none
     tilt: npt.NDArray[np.float64]
 
-    def of_tilt(self, tilt: float) -> Features:
-        """With the descriptors of this tilt alone, in their order: the strongest first."""
+    def select_tilt(self, tilt: float) -> Features:
+        """Returns the features with the descriptors of this tilt alone, in their order: the strongest first."""
         chosen = self.tilt == tilt
         return Features(self.points, self.descriptors[chosen], self.point_of[chosen], self.tilt[chosen])
 
@@ -52,7 +52,7 @@ class Keyframe:
 
     @property
     def name(self) -> str:
-        """Of the frame: what point maps, views and cameras of it are found by."""
+        """Returns the frame's name, by which its point maps, views and cameras are found."""
         return self.frame.name
 
     @property
@@ -65,7 +65,7 @@ class Keyframe:
         """(h, w) at modelled size, True where all that a pixel is made of is used; None: all pixels are."""
         if self.frame.mask is None:
             return None
-        return modelled_mask(self.frame.mask, *self.image.shape[:2])
+        return resize_mask(self.frame.mask, *self.image.shape[:2])
 
 
 def content_key(keyframe: Keyframe) -> bytes:
@@ -74,7 +74,7 @@ def content_key(keyframe: Keyframe) -> bytes:
 
 
 def longer_side(frame: Frame) -> int:
-    """Of the frame at full size, pixels."""
+    """Returns the longer side of the frame at full size, pixels."""
     return max(frame.width, frame.height)
 
 
@@ -85,20 +85,20 @@ def principal_point(frame: Frame) -> npt.NDArray[np.float64]:
     return np.array([frame.width / 2.0, frame.height / 2.0])
 
 
-def modelled_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
+def compute_model_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `longer_side`; images are never enlarged."""
     scale = min(1.0, longer_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def modelled_mask(mask: npt.NDArray[np.bool_], height: int, width: int) -> npt.NDArray[np.bool_]:
+def resize_mask(mask: npt.NDArray[np.bool_], height: int, width: int) -> npt.NDArray[np.bool_]:
     """(height, width) of a mask (H, W): True where all that a pixel is made of is used."""
     return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.999
 
 
-def modelled_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
+def resize_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
     """`image` (H, W, 3) area-resampled to its modelled size (h, w, 3); itself where it has that size."""
-    width, height = modelled_size(image.shape[1], image.shape[0], longer_side)
+    width, height = compute_model_size(image.shape[1], image.shape[0], longer_side)
     if (width, height) == (image.shape[1], image.shape[0]):
         return image
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)

@@ -18,13 +18,13 @@ from splatnode.recon.result.verdict import Code
 REMEMBERED_REJECTED = 100  # frames of a stream: more of them change no verdict
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ScreeningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limits: quality.Limits = quality.Limits()  # those of capture, which has screened live frames already
 
 
 @dataclass(frozen=True, eq=False)
 class FrameSummary:
-    """What the screening remembers of a frame."""
+    """The record of a frame that screening keeps."""
 
     name: str
     quality: quality.Quality
@@ -50,49 +50,49 @@ def summarise(frame: Frame) -> FrameSummary:
 
 
 @dataclass(frozen=True, eq=False)
-class Screened:
+class ScreeningState:
     """The frames of a stream that were kept so far, by name, and those that were rejected, the latest last."""
 
     summaries: Mapping[str, FrameSummary] = field(default_factory=dict)
     rejected: tuple[Rejected, ...] = ()
 
-    def with_frame(self, frame: Frame, config: Config) -> tuple[Screened, list[Rejected]]:
-        """With a further frame, and which frames are rejected now that there is this one too: it, or earlier ones."""
+    def add_frame(self, frame: Frame, config: ScreeningConfig) -> tuple[ScreeningState, list[Rejected]]:
+        """Adds a frame; also returns which frames are now rejected: it, or earlier ones."""
         summaries = {**self.summaries, frame.name: summarise(frame)}
         _, rejected = screen(list(summaries.values()), config)
         for each in rejected:
             del summaries[each.name]
-        return Screened(summaries, (*self.rejected, *rejected)[-REMEMBERED_REJECTED:]), rejected
+        return ScreeningState(summaries, (*self.rejected, *rejected)[-REMEMBERED_REJECTED:]), rejected
 
-    def with_known(self, frame: Frame) -> Screened:
-        """With a frame that was screened elsewhere."""
+    def add_known_frame(self, frame: Frame) -> ScreeningState:
+        """Adds a frame that was screened elsewhere."""
         return (
             self
             if frame.name in self.summaries
             else replace(self, summaries={**self.summaries, frame.name: summarise(frame)})
         )
 
-    def without(self, names: Collection[str]) -> Screened:
+    def remove_frames(self, names: Collection[str]) -> ScreeningState:
         """Without these frames, which are neither kept nor rejected."""
         return replace(self, summaries={name: summary for name, summary in self.summaries.items() if name not in names})
 
 
 def screen_all(
-    frames: Iterable[Frame | DroppedFrame], config: Config
+    frames: Iterable[Frame | DroppedFrame], config: ScreeningConfig
 ) -> tuple[list[Frame], list[DroppedFrame], tuple[Rejected, ...]]:
     """The frames that are worth working on; those that were left out, here or before; why, of those here."""
-    screened, kept, dropped = Screened(), dict[str, Frame](), list[DroppedFrame]()
+    screened, kept, dropped = ScreeningState(), dict[str, Frame](), list[DroppedFrame]()
     for frame in frames:
         if isinstance(frame, DroppedFrame):
             dropped.append(frame)
             continue
-        screened, rejected = screened.with_frame(frame, config)
+        screened, rejected = screened.add_frame(frame, config)
         dropped += [DroppedFrame(each.name, each.reason) for each in rejected]
         kept = {name: each for name, each in {**kept, frame.name: frame}.items() if name in screened.summaries}
     return list(kept.values()), dropped, screened.rejected
 
 
-def screen(summaries: Sequence[FrameSummary], config: Config) -> tuple[list[int], list[Rejected]]:
+def screen(summaries: Sequence[FrameSummary], config: ScreeningConfig) -> tuple[list[int], list[Rejected]]:
     """The positions of the frames that are worth working on, and the others with the reason.
 
     Of copies the first is kept. Blur is compared with the sharpest frame of the same size, so that the order does not

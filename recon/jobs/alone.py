@@ -20,7 +20,7 @@ _CPUS = Path("/sys/devices/system/cpu")
 
 @dataclass(frozen=True)
 class Moment:
-    """What was used by then."""
+    """The processor time that was used by a moment."""
 
     at_s: float  # of a clock that never goes back
     own_s: float  # processor time of this process and of those of its helpers that have ended
@@ -29,11 +29,11 @@ class Moment:
 
 
 def now() -> Moment:
-    """Of the cores that this process may use, and of those that share their circuits."""
+    """Returns the usage of this process's cores, and of those that share their circuits."""
     cores = usable_cores()
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     own_s = sum(each.ru_utime + each.ru_stime for each in used)
-    return Moment(time.monotonic(), own_s, _busy_s(with_siblings(cores)), cores)
+    return Moment(time.monotonic(), own_s, _busy_s(add_sibling_cores(cores)), cores)
 
 
 def others_share(since: Moment, until: Moment) -> float | None:
@@ -45,17 +45,17 @@ def others_share(since: Moment, until: Moment) -> float | None:
     return max(0.0, others_s - _SLACK_S) / max(passed_s, _SLACK_S)
 
 
-def with_siblings(cores: tuple[int, ...], cpus: Path = _CPUS) -> set[int]:
+def add_sibling_cores(cores: tuple[int, ...], cpus: Path = _CPUS) -> set[int]:
     """The cores, and those that are further threads of the same physical ones: what runs there slows them."""
     found = set(cores)
     for core in cores:
         with contextlib.suppress(OSError, ValueError):
-            found |= _listed((cpus / f"cpu{core}" / "topology" / "thread_siblings_list").read_text())
+            found |= _parse_cpu_list((cpus / f"cpu{core}" / "topology" / "thread_siblings_list").read_text())
     return found
 
 
-def _listed(text: str) -> set[int]:
-    """Of a list such as 0-3,8."""
+def _parse_cpu_list(text: str) -> set[int]:
+    """Parses a list such as 0-3,8."""
     bounds = (part.partition("-") for part in text.strip().split(",") if part)
     return {number for first, _, last in bounds for number in range(int(first), int(last or first) + 1)}
 

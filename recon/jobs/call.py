@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process import python
-from splatnode.capture.process.private import private_folder
+from splatnode.capture.process.private import make_owner_only_folder
 from splatnode.recon.jobs.child import Child, End
 
 CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder
@@ -22,35 +22,35 @@ Work = Callable[[], Any]  # that can be pickled: a functools.partial of a module
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of a call."""
+    """The answer of a call."""
 
     pickled: bytes | None  # what the function returned; None: nothing
     reason: str  # why it returned nothing: a sentence, or what it raised with its traceback; else empty
     end: End  # of its process
 
     def value(self) -> Any:
-        """What the function returned. Raises RuntimeError with the reason where it returned nothing."""
+        """Returns the function's result. Raises RuntimeError with the reason where there is none."""
         if self.pickled is None:
             raise RuntimeError(self.reason)
         return pickle.loads(self.pickled)
 
 
-def packed(work: Work) -> bytes:
+def pack_call(work: Work) -> bytes:
     """A call for any machine with this splatnode: where the function's module is found, its name, the function."""
     module = getattr(work, "func", work).__module__
     return b"".join(map(pickle.dumps, (python.place_of(module), module, work)))
 
 
-def laid_down(call: bytes, folder: Path) -> Path:
+def write_call(call: bytes, folder: Path) -> Path:
     """Makes the folder of a `packed` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
-    private_folder(folder, "--out or $TMPDIR", ours=True)
+    make_owner_only_folder(folder, "--out or $TMPDIR", ours=True)
     (folder / CALL).write_bytes(call)
     return folder
 
 
-def begun(folder: Path, cores: Sequence[int]) -> Child:
+def start_call(folder: Path, cores: Sequence[int]) -> Child:
     """A fresh process that makes the call of a folder on `cores`. Raises OSError."""
-    return Child.started(python.command("splatnode.recon.jobs.called", str(folder)), folder / LOG, cores)
+    return Child.start(python.command("splatnode.recon.jobs.called", str(folder)), folder / LOG, cores)
 
 
 def answer_of(folder: Path, end: End) -> Answer:

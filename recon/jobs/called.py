@@ -9,18 +9,18 @@ import traceback
 from pathlib import Path
 from typing import IO
 
-from splatnode.capture.process.private import check_only_ours
+from splatnode.capture.process.private import check_owner_only
 from splatnode.recon.jobs.call import ANSWER, CALL, ERROR
 
 RAISED = 1  # the exit code where the function raised
 
 
-def answered(folder: Path) -> int:
+def run_call(folder: Path) -> int:
     """Makes the call and leaves the answer, or what was raised; returns the exit code.
 
     Raises NotPrivate for a call that another user could have put there.
     """
-    check_only_ours(folder)
+    check_owner_only(folder)
     with (folder / CALL).open("rb") as call:
         module_of(call)
         try:
@@ -43,4 +43,4 @@ def module_of(call: IO[bytes]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(answered(Path(sys.argv[1])))
+    sys.exit(run_call(Path(sys.argv[1])))

@@ -11,12 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.process.private import NotPrivate, check_only_ours, private_folder, temporary_folder
-from splatnode.recon.jobs.call import Answer, answer_of, begun, laid_down
-from splatnode.recon.jobs.child import NOT_RUN, Limits, finished
-from splatnode.recon.jobs.copies import copying
+from splatnode.capture.process.private import NotOwnerOnly, check_owner_only, make_owner_only_folder, temporary_folder
+from splatnode.recon.jobs.call import Answer, answer_of, start_call, write_call
+from splatnode.recon.jobs.child import NOT_RUN, Limits, wait_for_end
+from splatnode.recon.jobs.copies import open_copies
 from splatnode.recon.jobs.cores import chosen_cores, free_core, usable_cores
-from splatnode.recon.jobs.engine import ends
+from splatnode.recon.jobs.engine import run_processes
 from splatnode.recon.jobs.version import other_version, own_version
 
 
@@ -32,7 +32,7 @@ Answers = Callable[[Take, Limits, Path], Generator[tuple[Any, Answer], None, Non
 
 @dataclass(frozen=True)
 class Engine:
-    """Where calls are made.
+    """The processes or the cluster that make calls.
 
     `answers(take, limits, folder)` gives what each task is about, with its answer, as they come. `take` is asked again
     after each end, and all is over when nothing runs any more. Calls that run on this machine lie in `folder` (of
@@ -53,23 +53,23 @@ def work_folder(out: Path) -> Iterator[Path]:
     folder = out / ".calls"
     shutil.rmtree(folder, ignore_errors=True)  # of a driver that was killed
     try:
-        check_only_ours(out)
-    except NotPrivate:
+        check_owner_only(out)
+    except NotOwnerOnly:
         with temporary_folder("splatnode-calls-") as instead:
             yield instead
         return
     if folder.is_symlink():
         folder.unlink()
-    private_folder(folder, "--out", ours=True)
+    make_owner_only_folder(folder, "--out", ours=True)
     try:
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def one_at_a_time() -> Engine:
+def make_serial_engine() -> Engine:
     """One call at a time, on all cores that this process may use."""
-    return _here([usable_cores()])
+    return _make_local_engine([usable_cores()])
 
 
 @contextlib.contextmanager
@@ -81,15 +81,15 @@ def engine(cores: int | None, ray: str | None) -> Iterator[Engine]:
     ray.
     """
     if ray is None:
-        yield one_at_a_time() if cores is None else _here([(core,) for core in chosen_cores(cores)])
+        yield make_serial_engine() if cores is None else _make_local_engine([(core,) for core in chosen_cores(cores)])
         return
     from splatnode.recon.jobs import ray as cluster  # takes a second, and is an extra
 
-    with cluster.joined(ray, None if ray else len(chosen_cores(cores))):
+    with cluster.join_cluster(ray, None if ray else len(chosen_cores(cores))):
         yield Engine(1, partial(_answers_on_ray, cores))
 
 
-def _here(places: Sequence[Sequence[int]]) -> Engine:
+def _make_local_engine(places: Sequence[Sequence[int]]) -> Engine:
     return Engine(len(places[0]), partial(_answers_here, places))
 
 
@@ -99,10 +99,10 @@ def _answers_here(
     numbers = itertools.count()
 
     def next_call() -> tuple[Any, Path] | None:
-        return (task := take()) and (task.about, laid_down(task.call, folder / str(next(numbers))))
+        return (task := take()) and (task.about, write_call(task.call, folder / str(next(numbers))))
 
-    with copying(places[0]) as copies:
-        running = ends(next_call, lambda item, cores: copies.begun(item[1], cores), places, limits)
+    with open_copies(places[0]) as copies:
+        running = run_processes(next_call, lambda item, cores: copies.start_call(item[1], cores), places, limits)
         with contextlib.closing(running):
             for (about, place), end in running:
                 answer = answer_of(place, end)
@@ -121,12 +121,12 @@ def _answers_on_ray(most: int | None, take: Take, limits: Limits, _: Path) -> Ge
         under_way[number := next(numbers)] = task.about  # which stays here
         return number, task.call
 
-    run = partial(_numbered, limits=limits, version=own_version())
-    for (number, _call), found in ray.mapped(next_call, run, most, limits.memory_mb):
-        yield under_way.pop(number), Answer(None, found.reason, NOT_RUN) if isinstance(found, ray.Lost) else found
+    run = partial(_run_numbered, limits=limits, version=own_version())
+    for (number, _call), found in ray.map_on_cluster(next_call, run, most, limits.memory_mb):
+        yield under_way.pop(number), Answer(None, found.reason, NOT_RUN) if isinstance(found, ray.LostCall) else found
 
 
-def _numbered(item: tuple[int, bytes], limits: Limits, version: str) -> Answer:
+def _run_numbered(item: tuple[int, bytes], limits: Limits, version: str) -> Answer:
     return run_here(item[1], limits, version)
 
 
@@ -138,5 +138,5 @@ def run_here(call: bytes, limits: Limits, version: str) -> Answer:
     if (other := other_version(version)) is not None:
         return Answer(None, other, NOT_RUN)
     with temporary_folder("splatnode-call-") as folder, free_core() as core:
-        place = laid_down(call, folder / "0")
-        return answer_of(place, finished(begun(place, (core,)), limits))
+        place = write_call(call, folder / "0")
+        return answer_of(place, wait_for_end(start_call(place, (core,)), limits))

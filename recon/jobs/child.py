@@ -25,7 +25,7 @@ _OURS = "splatnode: "  # before a sentence of the command line
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one process; None: none."""
+    """The limits of one process; None: none."""
 
     memory_mb: float | None = None  # 10^6 bytes of resident memory, with what its process has started
     timeout_s: float | None = None
@@ -45,7 +45,7 @@ NOT_RUN = End(None, "", 0.0, 0.0)  # of a process that was never begun
 
 
 class Process(Protocol):
-    """What a child needs of a process, which leads a group of its own. `Popen` is one."""
+    """A process as a child uses it, which leads a group of its own. `Popen` is one."""
 
     @property
     def pid(self) -> int: ...
@@ -68,11 +68,11 @@ class Child:
         self._looked_s = self._memory_mb = 0.0
 
     @classmethod
-    def started(cls, command: Sequence[str], log: Path, cores: Sequence[int]) -> Child:
+    def start(cls, command: Sequence[str], log: Path, cores: Sequence[int]) -> Child:
         """Starts it on `cores`; what it prints goes into `log`. Raises OSError."""
         with open_itself(log, "wb") as printed:
             process = subprocess.Popen(
-                launched(command, cores),
+                make_launch_command(command, cores),
                 stdin=subprocess.DEVNULL,
                 stdout=printed,
                 stderr=subprocess.STDOUT,
@@ -80,18 +80,20 @@ class Child:
             )
         return cls(process, log)
 
-    def ended(self, limits: Limits) -> End | None:
+    def check_end(self, limits: Limits) -> End | None:
         """How it ended; None while it runs. It is killed here where it exceeds `limits`."""
         code, now_s = self._process.poll(), time.monotonic()
         if code is not None:
             self.stop()  # what it has started and left
-            return self._end(code if code >= 0 else None, _said(self._log) if code >= 0 else _killed(-code))
+            return self._end(
+                code if code >= 0 else None, _read_last_message(self._log) if code >= 0 else _describe_signal(-code)
+            )
         if now_s >= self._looked_s + _LOOK_EVERY_S:
             self._looked_s, self._memory_mb = now_s, max(self._memory_mb, tree_mb(self._process.pid))
         if limits.memory_mb is not None and self._memory_mb > limits.memory_mb:
-            return self._ended_for(f"took {self._memory_mb:.0f} MB of memory; --max-memory allows {limits.memory_mb:g}")
+            return self._stop_for(f"took {self._memory_mb:.0f} MB of memory; --max-memory allows {limits.memory_mb:g}")
         if limits.timeout_s is not None and now_s - self._began_s > limits.timeout_s:
-            return self._ended_for(f"took longer than the {limits.timeout_s:g} s that --timeout-s allows")
+            return self._stop_for(f"took longer than the {limits.timeout_s:g} s that --timeout-s allows")
         return None
 
     def stop(self) -> None:
@@ -100,7 +102,7 @@ class Child:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
-    def _ended_for(self, reason: str) -> End:
+    def _stop_for(self, reason: str) -> End:
         self.stop()
         return self._end(None, reason)
 
@@ -108,30 +110,30 @@ class Child:
         return End(exit_code, reason, time.monotonic() - self._began_s, self._memory_mb)
 
 
-def launched(command: Sequence[str], cores: Sequence[int]) -> list[str]:
+def make_launch_command(command: Sequence[str], cores: Sequence[int]) -> list[str]:
     """The command that runs `command` on `cores` until this process ends: see `launch`."""
     told = [launch.__file__, str(os.getpid()), ",".join(map(str, cores))]
-    return python.isolated("-S", *told, *command)
+    return python.make_isolated_command("-S", *told, *command)
 
 
-def finished(child: Child, limits: Limits) -> End:
+def wait_for_end(child: Child, limits: Limits) -> End:
     """Waits for its end. It is ended where this is interrupted."""
     try:
-        while (end := child.ended(limits)) is None:
+        while (end := child.check_end(limits)) is None:
             time.sleep(_POLL_S)
         return end
     finally:
         child.stop()
 
 
-def _killed(number: int) -> str:
+def _describe_signal(number: int) -> str:
     name = signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
     if number == signal.SIGKILL:
         return f"was killed ({name}): mostly memory has run out, and fewer --cores, or --max-memory, leave more of it"
     return f"was ended by {name}"
 
 
-def _said(log: Path) -> str:
+def _read_last_message(log: Path) -> str:
     """The last sentence for the user in what was printed, or the last line."""
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _LARGEST_TAIL))

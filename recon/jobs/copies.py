@@ -11,8 +11,8 @@ from collections.abc import Generator, Sequence
 from pathlib import Path
 
 from splatnode.capture.process import python
-from splatnode.recon.jobs.call import LOG, begun
-from splatnode.recon.jobs.child import Child, launched
+from splatnode.recon.jobs.call import LOG, start_call
+from splatnode.recon.jobs.child import Child, make_launch_command
 
 
 class Copies:
@@ -22,15 +22,15 @@ class Copies:
         self._cores = cores
         self._template: _Template | None = None
 
-    def begun(self, folder: Path, cores: Sequence[int]) -> Child:
+    def start_call(self, folder: Path, cores: Sequence[int]) -> Child:
         """A process that makes the call of a folder on `cores`. Raises OSError."""
         for _ in range(2):  # where memory runs out, the system may have ended the template
             if self._template is None:
                 self._template = _Template(self._cores)
-            if (copy := self._template.copied(folder, cores)) is not None:
+            if (copy := self._template.fork_copy(folder, cores)) is not None:
                 return Child(copy, folder / LOG)
             self.close()
-        return begun(folder, cores)  # which tells why
+        return start_call(folder, cores)  # which tells why
 
     def close(self) -> None:
         if self._template is not None:
@@ -39,7 +39,7 @@ class Copies:
 
 
 @contextlib.contextmanager
-def copying(cores: Sequence[int]) -> Generator[Copies, None, None]:
+def open_copies(cores: Sequence[int]) -> Generator[Copies, None, None]:
     """`cores` are as many as each call will have: libraries set their threads by them as they are imported."""
     copies = Copies(cores)
     try:
@@ -53,7 +53,7 @@ class _Template:
 
     def __init__(self, cores: Sequence[int]) -> None:
         self._process = subprocess.Popen(
-            launched(python.command("splatnode.recon.jobs.template"), cores),
+            make_launch_command(python.command("splatnode.recon.jobs.template"), cores),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -65,7 +65,7 @@ class _Template:
         self._begun: list[int] = []  # processes that were told since the last call
         self._codes: dict[int, int] = {}  # of processes that have ended
 
-    def copied(self, folder: Path, cores: Sequence[int]) -> _Copy | None:
+    def fork_copy(self, folder: Path, cores: Sequence[int]) -> _Copy | None:
         """None where the template has ended."""
         assert self._process.stdin is not None
         try:

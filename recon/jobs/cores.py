@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatnode.capture.process.private import private_folder
+from splatnode.capture.process.private import make_owner_only_folder
 
 
 def usable_cores() -> tuple[int, ...]:
@@ -30,7 +30,7 @@ def free_core() -> Iterator[int]:
     """A core that no other work is on, of whatever worker of this user; where none is, the one with this turn."""
     cores = usable_cores()
     folder = Path(tempfile.gettempdir(), f"splatnode-cores-{os.getuid()}")
-    private_folder(folder, "$TMPDIR", ours=True)
+    make_owner_only_folder(folder, "$TMPDIR", ours=True)
     for core in cores:
         with (folder / str(core)).open("w") as lock:
             try:

@@ -13,13 +13,13 @@ T = TypeVar("T")
 _POLL_S = 0.02
 
 
-def ends(
+def run_processes(
     take: Callable[[], T | None],
     start: Callable[[T, Sequence[int]], Child],
     places: Sequence[Sequence[int]],
     limits: Limits,
 ) -> Generator[tuple[T, End], None, None]:
-    """What `take` gives, each with how its process ended, as they end; as many at a time as there are `places`.
+    """Yields what `take` gives, each with its process's end, as they end; as many at a time as `places`.
 
     A place is the numbers of the cores that a process may use. `take` gives None where there is nothing to begin now:
     it is asked again after each end, and all is over when nothing runs any more. What is running when the iterator is
@@ -33,7 +33,7 @@ def ends(
                 free.pop(0)
             if not running:
                 return
-            looks = [(each, each[2].ended(limits)) for each in running]
+            looks = [(each, each[2].check_end(limits)) for each in running]
             running = [each for each, end in looks if end is None]
             over = [(each, end) for each, end in looks if end is not None]
             for (task, place, _), end in over:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, TypeVar
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.terminal import beneath
 
 ray: Any = import_module("ray")  # by its name: where it is not installed, pyright takes this file for it
@@ -32,8 +32,8 @@ _ANSWER_S = 5.0  # in which a machine answers; Ray itself tries for two minutes
 
 
 @dataclass(frozen=True)
-class Lost:
-    """Of a call that gave nothing: why."""
+class LostCall:
+    """A call that gave nothing, and why."""
 
     reason: str
 
@@ -43,7 +43,7 @@ class NoCluster(ConnectionError):
 
 
 @contextlib.contextmanager
-def joined(address: str, cores: int | None) -> Iterator[None]:
+def join_cluster(address: str, cores: int | None) -> Iterator[None]:
     """This process as a driver of the cluster at `address`; "": of one begun here, with `cores`. Raises NoCluster.
 
     Ray's workers look for modules in the folder in which the driver is when it joins: not among the photographs, so.
@@ -59,11 +59,11 @@ def joined(address: str, cores: int | None) -> Iterator[None]:
         with (
             contextlib.redirect_stderr(beneath(sys.stderr)),
             contextlib.redirect_stdout(beneath(sys.stdout)),
-            _in_folder(_NO_MODULES),
+            _change_folder(_NO_MODULES),
         ):
             ray.init(**how, **quiet)  # which wants streams with descriptors
     except Exception as error:  # a node that does not come up in time is no more than that to Ray
-        where = printable(address or "this machine", 200)
+        where = sanitize_text(address or "this machine", 200)
         raise NoCluster(
             f"no Ray cluster can be reached at {where} ({_first_line(error)}). Start one with `ray start --head` and "
             "give the address that it prints, or give --ray without one"
@@ -74,10 +74,10 @@ def joined(address: str, cores: int | None) -> Iterator[None]:
         ray.shutdown()
 
 
-def mapped(
+def map_on_cluster(
     take: Callable[[], T | None], function: Callable[[T], R], most: int | None, memory_mb: float | None
-) -> Generator[tuple[T, R | Lost], None, None]:
-    """What `take` gives, each with what `function` makes of it on one core of a worker, as they come.
+) -> Generator[tuple[T, R | LostCall], None, None]:
+    """Yields what `take` gives, each with `function` of it from one core of a worker, as they come.
 
     At most `most` are under way at a time; None: as many as keep the cluster's cores busy. `take` gives None where
     there is nothing to begin now: it is asked again after each end, and all is over when nothing runs any more. A call
@@ -85,10 +85,10 @@ def mapped(
     for each.
     """
     memory = {} if memory_mb is None else {"memory": memory_mb * 1e6}
-    run = ray.remote(_applied).options(num_cpus=1, max_retries=_REPEATS, **memory)
+    run = ray.remote(_apply).options(num_cpus=1, max_retries=_REPEATS, **memory)
     running: dict[Any, T] = {}
     while True:
-        while len(running) < _at_a_time(most) and (item := take()) is not None:
+        while len(running) < _max_running(most) and (item := take()) is not None:
             running[run.remote(function, item, os.getcwd())] = item
         if not running:
             return
@@ -96,7 +96,7 @@ def mapped(
             yield running.pop(reference), _result(reference)
 
 
-def _applied(function: Callable[[T], R], item: T, folder: str) -> R:
+def _apply(function: Callable[[T], R], item: T, folder: str) -> R:
     """In the driver's `folder`, where this machine has it: a path may be relative to that."""
     with contextlib.suppress(OSError):
         os.chdir(folder)
@@ -104,7 +104,7 @@ def _applied(function: Callable[[T], R], item: T, folder: str) -> R:
 
 
 @contextlib.contextmanager
-def _in_folder(folder: str) -> Iterator[None]:
+def _change_folder(folder: str) -> Iterator[None]:
     before = os.getcwd()
     try:
         os.chdir(folder)
@@ -120,7 +120,7 @@ def _check_answers(address: str) -> None:
         socket.create_connection((host, int(port)), _ANSWER_S).close()
 
 
-def _at_a_time(most: int | None) -> int:
+def _max_running(most: int | None) -> int:
     """Machines may join and leave; until one is there, one call waits for it."""
     return most or max(1, _WAITING * int(ray.cluster_resources().get("CPU", 0)))
 
@@ -129,11 +129,11 @@ def _result(reference: Any) -> Any:
     try:
         return ray.get(reference)
     except _errors.RayTaskError as error:  # what the function raised, or why it could not be run
-        return Lost(f"its worker could not do it: {_first_line(error.cause or error)}")
+        return LostCall(f"its worker could not do it: {_first_line(error.cause or error)}")
     except _errors.RayError as error:
-        return Lost(f"its worker was lost {_REPEATS + 1} times: {_first_line(error)}")
+        return LostCall(f"its worker was lost {_REPEATS + 1} times: {_first_line(error)}")
 
 
 def _first_line(error: BaseException) -> str:
     lines = [line for line in str(error).splitlines() if line.strip()]
-    return printable(lines[0] if lines else type(error).__name__, 300)
+    return sanitize_text(lines[0] if lines else type(error).__name__, 300)

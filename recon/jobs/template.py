@@ -19,9 +19,9 @@ import traceback
 from pathlib import Path
 from typing import IO, NoReturn
 
-from splatnode.capture.process.private import check_only_ours
+from splatnode.capture.process.private import check_owner_only
 from splatnode.recon.jobs.call import CALL, LOG
-from splatnode.recon.jobs.called import RAISED, answered, module_of
+from splatnode.recon.jobs.called import RAISED, module_of, run_call
 from splatnode.recon.jobs.launch import end_with
 
 
@@ -57,7 +57,7 @@ def main() -> None:
 def _copy(folder: Path, cores: list[int]) -> int:
     """The number of the copy that makes the call of `folder` on `cores`."""
     with contextlib.suppress(Exception), (folder / CALL).open("rb") as call:  # the copy tells what fails
-        check_only_ours(folder)
+        check_owner_only(folder)
         importlib.import_module(module_of(call))
     me = os.getpid()
     if (pid := os.fork()) == 0:
@@ -79,7 +79,7 @@ def _become(folder: Path, cores: list[int], template: int) -> NoReturn:
         log, nothing = os.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), os.open(os.devnull, os.O_RDONLY)
         for descriptor, stream in ((nothing, 0), (log, 1), (log, 2)):
             os.dup2(descriptor, stream)
-        code = answered(folder)
+        code = run_call(folder)
         sys.stdout.flush()
         sys.stderr.flush()
     except BaseException:

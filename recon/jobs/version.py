@@ -28,7 +28,7 @@ def own_version() -> str:
 
 
 def other_version(begun_with: str) -> str | None:
-    """What to say where the splatnode of this machine is another one than work was begun with; None: it is the same."""
+    """Returns a message if this machine's splatnode is not the one that began the work; None if it is."""
     if (version := own_version()) == begun_with:
         return None
     there = f"the worker on {platform.node()} has splatnode {version}, the work was begun with {begun_with}"

@@ -15,14 +15,14 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.deadline import is_over
-from splatnode.recon.estimation import Estimate, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.ladder import learned, tilts
-from splatnode.recon.ladder.better import better
-from splatnode.recon.ladder.others import without_the_doubtful
-from splatnode.recon.ladder.rung import Means, Rung
+from splatnode.recon.ladder.better import choose_better_reconstruction
+from splatnode.recon.ladder.others import estimate_without_doubtful
+from splatnode.recon.ladder.rung import Fallback, FallbackState
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
 
@@ -35,14 +35,14 @@ LACKING_MATCHES = (Code.NO_OVERLAP, Code.SPLIT, Code.OK_PARTIAL, Code.AMBIGUOUS)
 UNCERTAIN = (Code.OK_ROUGH, Code.TOO_ROUGH, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY, Code.BASELINE_TOO_SMALL)
 
 
-def climbed(
-    estimate: Estimate,
+def run_fallbacks(
+    estimate: Reconstruction,
     rejected: Sequence[Rejected],
-    config: Config,
+    config: ReconstructionConfig,
     pause: Callable[[], None] = lambda: None,
-    rungs: Sequence[Rung] = RUNGS,
+    rungs: Sequence[Fallback] = RUNGS,
     until: float = math.inf,
-) -> Estimate:
+) -> Reconstruction:
     """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
 
     With `config.quick` it is `estimate`. `config.ladder` bounds the work that is added: what it comes to is looked at
@@ -52,11 +52,11 @@ def climbed(
     if config.quick:
         return estimate
     if _lacks_matches(estimate):
-        estimate = _with_more(estimate, rejected, config, pause, rungs, until)
-    return estimate if is_over(until) else without_the_doubtful(estimate, rejected, config, pause)
+        estimate = _try_fallbacks(estimate, rejected, config, pause, rungs, until)
+    return estimate if is_over(until) else estimate_without_doubtful(estimate, rejected, config, pause)
 
 
-def fallback_key(graph: ViewGraph, config: Config, rungs: Sequence[Rung] = RUNGS) -> str:
+def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, rungs: Sequence[Fallback] = RUNGS) -> str:
     """Identifies what the rungs start from: the keyframes, their matches, the budget, and which rungs are available.
 
     Rungs that gained nothing gain nothing from an equal start. The key is the same in another process.
@@ -73,73 +73,75 @@ def fallback_key(graph: ViewGraph, config: Config, rungs: Sequence[Rung] = RUNGS
     return digest.hexdigest()
 
 
-def _with_more(
-    estimate: Estimate,
+def _try_fallbacks(
+    estimate: Reconstruction,
     rejected: Sequence[Rejected],
-    config: Config,
+    config: ReconstructionConfig,
     pause: Callable[[], None],
-    rungs: Sequence[Rung],
+    rungs: Sequence[Fallback],
     until: float,
-) -> Estimate:
-    means, most_s = Means(estimate.graph, config), config.ladder.most_s
+) -> Reconstruction:
+    means, most_s = FallbackState(estimate.graph, config), config.ladder.most_s
     until = until if most_s is None else min(until, time.monotonic() + most_s)
     tried: list[str] = []
     not_tried: list[str] = []
     for rung in rungs:
-        doubtful = doubtful_keyframes(estimate)
-        if not doubtful or _ends(means, until):
+        doubtful = find_doubtful_keyframes(estimate)
+        if not doubtful or _is_exhausted(means, until):
             break
         obstacle = rung.obstacle()
         if obstacle:
             not_tried.append(f"{rung.name} ({obstacle})")
             continue
         before = means
-        means = _last(rung.climb(before, doubtful), before, until, pause)
+        means = _run_fallback(rung.climb(before, doubtful), before, until, pause)
         if means is before:
             continue
         other = estimate_cameras(means.graph, rejected, means.config, pause)
-        means = means.after(CAMERAS * len(means.graph.keyframes))
-        estimate = better(estimate, other)
+        means = means.add_work(CAMERAS * len(means.graph.keyframes))
+        estimate = choose_better_reconstruction(estimate, other)
         gained = "more photographs found their place" if estimate is other else "nothing gained"
         log.info("looked for more matches: %s: %s by %.1f of work", rung.name, gained, means.work - before.work)
         tried.append(rung.name)
-    return _telling(estimate, {"Also tried": tried, "Not tried": not_tried})
+    return _append_tried(estimate, {"Also tried": tried, "Not tried": not_tried})
 
 
-def _lacks_matches(estimate: Estimate) -> bool:
+def _lacks_matches(estimate: Reconstruction) -> bool:
     code = estimate.verdict.code
-    return code in LACKING_MATCHES or (code in UNCERTAIN and bool(without_cameras(estimate)))
+    return code in LACKING_MATCHES or (code in UNCERTAIN and bool(find_unplaced_keyframes(estimate)))
 
 
-def _last(climb: Iterator[Means], means: Means, until: float, pause: Callable[[], None]) -> Means:
+def _run_fallback(
+    climb: Iterator[FallbackState], means: FallbackState, until: float, pause: Callable[[], None]
+) -> FallbackState:
     """The means after the last piece of work that begins before the climb ends."""
     for further in climb:
         means = further
         pause()
-        if _ends(means, until):
+        if _is_exhausted(means, until):
             break
     return means
 
 
-def _ends(means: Means, until: float) -> bool:
+def _is_exhausted(means: FallbackState, until: float) -> bool:
     """Whether nothing further begins, for these means or from `until` on, a time of `time.monotonic()`."""
     return means.work >= means.config.ladder.work or is_over(until)
 
 
-def doubtful_keyframes(estimate: Estimate) -> frozenset[str]:
+def find_doubtful_keyframes(estimate: Reconstruction) -> frozenset[str]:
     """The names of those without a camera, and of those that the verdict is about; none where all are published."""
-    without = without_cameras(estimate)
+    without = find_unplaced_keyframes(estimate)
     return without if estimate.verdict.publishable else without.union(estimate.verdict.frames)
 
 
-def without_cameras(estimate: Estimate) -> frozenset[str]:
+def find_unplaced_keyframes(estimate: Reconstruction) -> frozenset[str]:
     """The names of the keyframes that have no camera."""
-    return frozenset(estimate.graph.names) - estimate.registered
+    return frozenset(estimate.graph.names) - estimate.camera_names
 
 
-def _telling(estimate: Estimate, rungs: Mapping[str, Sequence[str]]) -> Estimate:
-    """With the names of the rungs in the verdict's message, unless that has nothing left to explain."""
-    if not doubtful_keyframes(estimate):
+def _append_tried(estimate: Reconstruction, rungs: Mapping[str, Sequence[str]]) -> Reconstruction:
+    """Appends the fallbacks to the verdict's message, unless nothing is left to explain."""
+    if not find_doubtful_keyframes(estimate):
         return estimate
     sentences = [f"{what}: {', '.join(names)}." for what, names in rungs.items() if names]
     message = " ".join([estimate.verdict.message, *sentences])

@@ -7,8 +7,8 @@ from collections.abc import Collection, Iterator
 import numpy as np
 
 from splatnode.recon.frames.keyframe import PLAIN
-from splatnode.recon.ladder.rung import Means, Rung, with_matches
-from splatnode.recon.matching.features import searched_pixels
+from splatnode.recon.ladder.rung import Fallback, FallbackState, match_weak_pairs
+from splatnode.recon.matching.features import count_search_pixels
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 
 # Of the width, and below 1 of the height. The first matching has 1.6 of the width.
@@ -17,17 +17,17 @@ _PIXEL = 2.3e-7  # work of finding features of both tilts, for each pixel that p
 _COMPARISON = 2.8e-9  # work, for each two plain features: about 2.8 times as many of other tilts are compared
 
 
-def _climb(means: Means, doubtful: Collection[str]) -> Iterator[Means]:
-    return with_matches(means, doubtful, _work, _TILTS)
+def _match_affine(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
+    return match_weak_pairs(means, doubtful, _estimate_work, _TILTS)
 
 
-def _work(graph: ViewGraph, pair: Pair) -> float:
-    """Of tilting those photographs of the pair that have not been, and of comparing their features."""
+def _estimate_work(graph: ViewGraph, pair: Pair) -> float:
+    """Estimates the work of simulating tilts of the pair's images, and of comparing their features."""
     both = [graph.keyframes[index] for index in pair]
     untilted = [each for each in both if not np.isin(_TILTS, each.features.tilt).all()]
-    searched = sum(searched_pixels(each.frame.image, graph.config.features) for each in untilted)
+    searched = sum(count_search_pixels(each.frame.image, graph.config.features) for each in untilted)
     compared = np.prod([(each.features.tilt == PLAIN).sum() for each in both], dtype=float)
     return _PIXEL * searched + _COMPARISON * float(compared)
 
 
-RUNG = Rung("stronger tilts", _climb)
+RUNG = Fallback("stronger tilts", _match_affine)

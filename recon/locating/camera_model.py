@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.geometry import distortion
-from splatnode.recon.geometry import without_distortion as straight
+from splatnode.recon.geometry import undistort_rays as straight
 
 Array = npt.NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class Lens:
         half = 0.5 * self.log_aspect
         return self.focal * np.exp([half, -half])
 
-    def with_shape_of(self, other: Lens) -> Lens:
+    def copy_shape(self, other: Lens) -> Lens:
         """This lens with the radial coefficients and the aspect of `other`, known as well as these are."""
         return replace(
             self,
@@ -61,7 +61,7 @@ class Lens:
             log_aspect_sigma=other.log_aspect_sigma,
         )
 
-    def with_sigmas_of(self, other: Lens) -> Lens:
+    def copy_sigmas(self, other: Lens) -> Lens:
         """This lens, known as well as `other`."""
         return replace(
             self,
@@ -80,8 +80,8 @@ class CameraModel:
     translation: Array  # (3,)
     lens: Lens
 
-    def moved(self, step: Array) -> CameraModel:
-        """With the parameters changed by `step` (NUM_PARAMETERS,)."""
+    def apply_step(self, step: Array) -> CameraModel:
+        """Returns the camera with its parameters changed by `step` (NUM_PARAMETERS,)."""
         lens = self.lens
         return CameraModel(
             np.asarray(cv2.Rodrigues(step[:3])[0]) @ self.rotation,
@@ -115,7 +115,7 @@ class CameraModel:
         return self.lens.focals * bent[:, None] * rays + self.lens.shift, in_camera[:, 2]
 
     def derivatives(self, points: Array) -> tuple[Array, Array]:
-        """Of the pixels of points (M, 3): (M, 2, NUM_PARAMETERS) by the parameters, (M, 2, 3) by the points."""
+        """Differentiates pixels of points (M, 3): (M, 2, NUM_PARAMETERS) by parameters, (M, 2, 3) by points."""
         # A row of memory is a derivative of all points: so NumPy's loops are long ones.
         turned = np.ascontiguousarray((points @ self.rotation.T).T)
         z = _safe(turned[2] + self.translation[2])
@@ -138,7 +138,7 @@ class CameraModel:
         return by_parameters.transpose(2, 0, 1), (self.rotation.T @ by_camera).transpose(2, 0, 1)
 
 
-def without_distortion(pixels: Array, lens: Lens) -> Array:
+def undistort_pixels(pixels: Array, lens: Lens) -> Array:
     """(M, 2) where a pinhole of the same focal length sees what `lens` sees at `pixels` (M, 2)."""
     distorted = (pixels - lens.shift) / lens.focals
     return lens.focal * straight(distorted, np.array(lens.radial))

@@ -32,7 +32,7 @@ _TOLD_APART = 0.002  # log focals of a result's lenses that are tried one by one
 
 
 @dataclass(frozen=True, eq=False)
-class Assumed:
+class LensAssumption:
     """A lens that an image is assumed to have, until its points say otherwise."""
 
     lens: Lens  # with the sigmas by which the assumption is tested
@@ -44,27 +44,27 @@ class Assumed:
         return self.source is LensSource.GIVEN
 
 
-def given(intrinsics: Intrinsics) -> Lens | None:
+def make_trusted_lens(intrinsics: Intrinsics) -> Lens | None:
     """The lens of an image without distortion that came with trusted intrinsics; None where they are not."""
     return Lens(intrinsics.fx, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0) if intrinsics.source != "exif" else None
 
 
-def assume(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Assumed]:
-    """What may be assumed of an image's lens, the surest first; nothing where nothing is known.
+def assume_lenses(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[LensAssumption]:
+    """Returns the lenses that may be assumed of an image, the surest first; none where nothing is known.
 
     A lens that is given is all that is assumed. Otherwise the result's own lenses come first, then what EXIF states.
     """
     side = max(width, height)
-    if intrinsics is not None and (certain := given(intrinsics)) is not None:
+    if intrinsics is not None and (certain := make_trusted_lens(intrinsics)) is not None:
         sigmas = _GIVEN_SIGMA, _GIVEN_RADIAL_SIGMA, _GIVEN_SHIFT_SIGMA * side
         tested = Lens(certain.focal, PINHOLE, np.zeros(2), *sigmas, log_aspect_sigma=_ASPECT_SIGMA)
-        return [Assumed(tested, LensSource.GIVEN)]
-    found = [Assumed(lens, LensSource.SCENE) for lens in own(lenses, width, height, intrinsics)]
-    stated = [] if intrinsics is None else [Assumed(nominal(intrinsics, side), LensSource.EXIF)]
+        return [LensAssumption(tested, LensSource.GIVEN)]
+    found = [LensAssumption(lens, LensSource.SCENE) for lens in find_scene_lenses(lenses, width, height, intrinsics)]
+    stated = [] if intrinsics is None else [LensAssumption(make_exif_lens(intrinsics, side), LensSource.EXIF)]
     return found + stated
 
 
-def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Lens]:
+def find_scene_lenses(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Lens]:
     """Those of the result's own lenses that took images of this shape, upright or not."""
     side, found = max(width, height), list[Lens]()
     shape = height / width
@@ -84,7 +84,7 @@ def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | N
     return found
 
 
-def carry_over(before: Located, principal: Array, side: int) -> Assumed:
+def carry_over(before: Located, principal: Array, side: int) -> LensAssumption:
     """The lens that was found of the image before, of the same camera and size; `principal` is the nominal one."""
     focals = np.diag(before.K)[:2]
     log_sigma = math.log1p(before.claim.focal_percent / 100.0) / NORMAL_95
@@ -98,33 +98,33 @@ def carry_over(before: Located, principal: Array, side: int) -> Assumed:
         float(np.log(focals[0] / focals[1])),
         _ASPECT_SIGMA,
     )
-    return Assumed(lens, before.lens)
+    return LensAssumption(lens, before.lens)
 
 
-def nominal(intrinsics: Intrinsics, side: int) -> Lens:
+def make_exif_lens(intrinsics: Intrinsics, side: int) -> Lens:
     """The lens that EXIF tells, which is right to a few per cent."""
     sigmas = _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side
     return Lens(intrinsics.fx, PINHOLE, np.zeros(2), *sigmas, 0.0, _ASPECT_SIGMA)
 
 
-def usual(lens: Lens, side: int) -> Lens:
+def make_typical_lens(lens: Lens, side: int) -> Lens:
     """A lens of any focal length near that of `lens` with what most lenses have: little of all else."""
     sigmas = _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side
     return Lens(lens.focal, PINHOLE, np.zeros(2), *sigmas, 0.0, _ASPECT_SIGMA)
 
 
-def any_lens(side: int, assumed: Sequence[Assumed]) -> list[Lens]:
+def make_lens_grid(side: int, assumed: Sequence[LensAssumption]) -> list[Lens]:
     """Lenses from wide to long, each with what lies between it and the next, bent as the first that is assumed."""
     radial = assumed[0].lens.radial if assumed else PINHOLE
-    return [free(Lens(float(focal), radial, np.zeros(2), 0.0, 0.0, 0.0), side) for focal in side * _FOCALS]
+    return [free_lens(Lens(float(focal), radial, np.zeros(2), 0.0, 0.0, 0.0), side) for focal in side * _FOCALS]
 
 
-def stretched_lenses(side: int) -> list[Lens]:
+def make_non_square_lenses(side: int) -> list[Lens]:
     """As `any_lens`, of images whose pixels are not square."""
-    return [replace(lens, log_aspect=log_aspect) for log_aspect in _LOG_ASPECTS for lens in any_lens(side, ())]
+    return [replace(lens, log_aspect=log_aspect) for log_aspect in _LOG_ASPECTS for lens in make_lens_grid(side, ())]
 
 
-def free(lens: Lens, side: int) -> Lens:
+def free_lens(lens: Lens, side: int) -> Lens:
     """Any lens near this one, of an image that may be a part of what the camera saw, or stretched."""
     return replace(
         lens,
@@ -135,7 +135,7 @@ def free(lens: Lens, side: int) -> Lens:
     )
 
 
-def focals_apart(assumed: Sequence[Assumed], least: float) -> list[Lens]:
+def select_distinct_focals(assumed: Sequence[LensAssumption], least: float) -> list[Lens]:
     """Those of the lenses whose focal lengths differ by more than `least`, in logarithms."""
     found = list[Lens]()
     for each in assumed:

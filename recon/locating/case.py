@@ -14,7 +14,7 @@ from splatnode.recon.locating import posing
 from splatnode.recon.locating.camera_model import CameraModel, Lens
 from splatnode.recon.locating.correspondences import Correspondences
 from splatnode.recon.locating.outcome import LensSource
-from splatnode.recon.locating.posing import Posed
+from splatnode.recon.locating.posing import PoseEstimate
 from splatnode.recon.matching.two_view import log10_number_of_false_alarms
 
 Array = npt.NDArray[np.float64]
@@ -25,15 +25,15 @@ _SHUFFLES = 20  # of the landmarks among the pixels, which tell how often chance
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """What a camera of a photograph is judged by."""
+class QueryContext:
+    """The correspondences and settings by which a camera of a query image is judged."""
 
     known: Correspondences
     width: int  # of the photograph, pixels
     height: int
     reference_noise_px: float  # of an observation, pixels at REFERENCE_SIDE
     unit: float  # the median depth of the scene's points
-    settings: posing.Config
+    settings: posing.PoseSearchConfig
 
     @property
     def side(self) -> int:
@@ -47,49 +47,51 @@ class Judged:
 
     @property
     def noise_px(self) -> float:
-        """Of an observation, pixels of the photograph."""
+        """Returns the standard deviation of an observation, pixels of the query image."""
         return self.reference_noise_px * self.scale
 
-    def posed(self, *lenses: Lens) -> Posed | None:
+    def estimate_pose(self, *lenses: Lens) -> PoseEstimate | None:
         """The camera with that of the lenses on which most correspondences agree."""
-        return posing.posed(self.known, lenses, self.scale, self.noise_px, self.settings)
+        return posing.estimate_pose(self.known, lenses, self.scale, self.noise_px, self.settings)
 
-    def settled(self, camera: CameraModel, lens: Lens) -> Posed | None:
+    def refine_pose(self, camera: CameraModel, lens: Lens) -> PoseEstimate | None:
         """The camera refined, with its inliers found again."""
-        return posing.settled(camera, self.known, lens, self.scale, self.noise_px, self.settings)
+        return posing.refine_pose(camera, self.known, lens, self.scale, self.noise_px, self.settings)
 
-    def case(self, posed: Posed | None, source: LensSource = LensSource.FREE, rivals: Sequence[Posed] = ()) -> Case:
+    def make_hypothesis(
+        self, posed: PoseEstimate | None, source: LensSource = LensSource.FREE, rivals: Sequence[PoseEstimate] = ()
+    ) -> PoseHypothesis:
         limit_px = self.settings.max_error_px * self.scale
         log10_nfa = 0.0 if posed is None else _log10_nfa(self.known, posed, limit_px, self.width * self.height)
-        return Case(self, posed, log10_nfa, source, tuple(rivals))
+        return PoseHypothesis(self, posed, log10_nfa, source, tuple(rivals))
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class PoseHypothesis:
     """A camera for a photograph."""
 
-    by: Judged
-    posed: Posed | None  # None: there is none
+    by: QueryContext
+    posed: PoseEstimate | None  # None: there is none
     log10_nfa: float  # log10 of the expected number of cameras that chance gives so much agreement
     source: LensSource  # of the camera's lens
-    rivals: tuple[Posed, ...] = ()  # cameras with other lenses that were found, too
+    rivals: tuple[PoseEstimate, ...] = ()  # cameras with other lenses that were found, too
 
     @property
-    def known(self) -> Correspondences:
+    def correspondences(self) -> Correspondences:
         return self.by.known
 
     @property
     def num_independent(self) -> int:
         """How many spots of the photograph agree with the camera."""
-        return independent(self.agreeing.pixels, self.by.settings.max_error_px * self.by.scale)
+        return count_independent(self.inliers.pixels, self.by.settings.max_error_px * self.by.scale)
 
     @property
-    def agreeing(self) -> Correspondences:
-        """What agrees with the camera."""
-        return self.known.of(np.zeros(0, np.int64) if self.posed is None else self.posed.agreeing)
+    def inliers(self) -> Correspondences:
+        """Returns the correspondences that agree with the camera."""
+        return self.correspondences.select(np.zeros(0, np.int64) if self.posed is None else self.posed.agreeing)
 
 
-def _log10_nfa(known: Correspondences, posed: Posed, limit_px: float, area: int) -> float:
+def _log10_nfa(known: Correspondences, posed: PoseEstimate, limit_px: float, area: int) -> float:
     """log10 of the number of false alarms (Moisan and Stival, 2004), of unrelated pixels and landmarks.
 
     The chance of one agreement is that of landmarks dealt anew among the pixels, which are not spread evenly either,
@@ -105,11 +107,11 @@ def _log10_nfa(known: Correspondences, posed: Posed, limit_px: float, area: int)
     # A landmark that is dealt to its own pixel again is no chance; on average one an agreement and shuffle in M is.
     dealt_again = _SHUFFLES * own / max(len(seen), 1)
     chance = max((hits - dealt_again) / (_SHUFFLES * max(len(seen), 1)), math.pi * limit_px**2 / area)
-    apart, agreeing = (independent(pixels, limit_px) for pixels in (known.pixels, known.pixels[posed.agreeing]))
+    apart, agreeing = (count_independent(pixels, limit_px) for pixels in (known.pixels, known.pixels[posed.agreeing]))
     return log10_number_of_false_alarms(max(apart, agreeing), agreeing, _SAMPLE, min(chance, 1.0))
 
 
-def independent(pixels: Array, limit_px: float) -> int:
+def count_independent(pixels: Array, limit_px: float) -> int:
     """How many of the pixels (M, 2) say something of their own: those in one cell of the picture count as one.
 
     One spot of the picture has several features, and where one of them agrees by chance, the others do, too.

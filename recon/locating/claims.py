@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from splatnode.recon.locating.camera_model import POSE
 from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.outcome import NORMAL_95, Claim
-from splatnode.recon.locating.posing import Posed
+from splatnode.recon.locating.outcome import NORMAL_95, LocalizationBounds
+from splatnode.recon.locating.posing import PoseEstimate
 from splatnode.recon.locating.refinement import pose_covariance
-from splatnode.recon.result.bounds import length_95
+from splatnode.recon.result.bounds import compute_length_95
 from splatnode.recon.result.landmarks import Landmarks
 
 Array = npt.NDArray[np.float64]
@@ -21,7 +21,9 @@ _BALL_95 = 2.7955  # radius that holds 95 % of a normal distribution with sigma 
 _MOST_LOG_FOCAL = math.log(10.0)  # who knows the focal length no better knows nothing
 
 
-def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks, side: int) -> tuple[Claim, Array]:
+def compute_error_bounds(
+    posed: PoseEstimate, known: Correspondences, landmarks: Landmarks, side: int
+) -> tuple[LocalizationBounds, Array]:
     """The claim of an image whose longer side has `side` pixels.
 
     And the covariance (6, 6) of a small motion in the camera's frame: translation, then turn.
@@ -33,15 +35,15 @@ def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks, side: in
     turn = np.radians(np.sqrt(shares @ landmarks.rotation_bounds**2)) / _BALL_95
     move = np.sqrt(shares @ landmarks.centre_bounds**2) / _BALL_95
     covariance = pose_covariance(posed.fit.camera, posed.fit.covariance) + np.diag([move**2] * 3 + [turn**2] * 3)
-    centre = length_95(covariance[:3, :3])
+    centre = compute_length_95(covariance[:3, :3])
     of_scene = 0.0 if landmarks.focal_bounds is None else np.sqrt(shares @ (landmarks.focal_bounds / 100.0) ** 2)
     of_lens = posed.fit.covariance[POSE:, POSE:]
-    claim = Claim(
-        rotation_deg=math.degrees(length_95(covariance[3:, 3:])),
+    claim = LocalizationBounds(
+        rotation_deg=math.degrees(compute_length_95(covariance[3:, 3:])),
         centre=centre,
         centre_percent=100.0 * centre / landmarks.unit,
         focal_percent=100.0 * math.expm1(min(math.hypot(_log_focal_bound(of_lens), of_scene), _MOST_LOG_FOCAL)),
-        principal_percent=100.0 * length_95(of_lens[2:4, 2:4]) / side,
+        principal_percent=100.0 * compute_length_95(of_lens[2:4, 2:4]) / side,
     )
     return claim, covariance
 

@@ -9,9 +9,9 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say
-from splatnode.recon.locating.locate import described, located
+from splatnode.recon.locating.locate import localize_query, prepare_query_image
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.locating.photographs import assumed_lens, check_lens, photographs
+from splatnode.recon.locating.photographs import check_lens, choose_intrinsics, stream_query_frames
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.landmarks_file import read_landmarks
@@ -24,10 +24,10 @@ def locate(args: argparse.Namespace) -> int:
     landmarks = read_landmarks(args.result)
     given = None if args.calibration is None else read_lens(args.calibration)
     if given is not None:
-        check_lens(given, photographs(args.images, None))
+        check_lens(given, stream_query_frames(args.images, None))
     records, refused, of_other_lens = [], 0, 0
-    for frame in photographs(args.images, given):
-        found = frame if isinstance(frame, DroppedFrame) else _found(landmarks, frame, args.fov)
+    for frame in stream_query_frames(args.images, given):
+        found = frame if isinstance(frame, DroppedFrame) else _localize_frame(landmarks, frame, args.fov)
         say(f"{frame.name}: {f'left out: {found.reason}' if isinstance(found, DroppedFrame) else found.sentence}")
         records.append({"name": frame.name, **_record(found, frame)})
         refused += not isinstance(found, Located)
@@ -43,13 +43,13 @@ def locate(args: argparse.Namespace) -> int:
     return EXIT_REFUSED if refused else EXIT_GOOD
 
 
-def _found(landmarks: Landmarks, frame: Frame, fov_deg: float | None) -> Located | NotLocated | DroppedFrame:
-    """Where it was taken; left out where its lens cannot be undone, which costs no other photograph."""
+def _localize_frame(landmarks: Landmarks, frame: Frame, fov_deg: float | None) -> Located | NotLocated | DroppedFrame:
+    """Localizes a frame; drops one whose lens cannot be undistorted, which costs no other image."""
     try:
-        photograph = described(frame.image, assumed_lens(frame, fov_deg), name=frame.name)
+        photograph = prepare_query_image(frame.image, choose_intrinsics(frame, fov_deg), name=frame.name)
     except ValueError as error:
         return DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: "))
-    return located(landmarks, photograph)
+    return localize_query(landmarks, photograph)
 
 
 def _record(found: Located | NotLocated | DroppedFrame, frame: Frame | DroppedFrame) -> dict[str, object]:

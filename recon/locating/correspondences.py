@@ -11,7 +11,7 @@ from splatnode.recon.frames.keyframe import PLAIN, Features
 from splatnode.recon.locating.camera_model import CameraModel
 from splatnode.recon.matching import nearest_neighbours
 from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.verification.reflection import Config, mirrored_descriptors
+from splatnode.recon.verification.reflection import ReflectionConfig, mirror_descriptors
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -38,7 +38,7 @@ class Correspondences:
     def __len__(self) -> int:
         return len(self.pixels)
 
-    def of(self, chosen: Flags | Index) -> Correspondences:
+    def select(self, chosen: Flags | Index) -> Correspondences:
         """The chosen ones."""
         return Correspondences(
             *(getattr(self, name)[chosen] for name in Correspondences.__dataclass_fields__),
@@ -46,20 +46,20 @@ class Correspondences:
 
 
 @dataclass(frozen=True, eq=False)
-class Near:
-    """Where the camera is nearly known to be."""
+class PosePrior:
+    """A prior on the camera's pose."""
 
     camera: CameraModel
     size: tuple[int, int]  # (width, height) of its picture, pixels
     reach_px: float | None = None  # a landmark is at most so far from where the camera sees it; None: anywhere
 
 
-def correspondences(
+def match_landmarks(
     features: Features,
     principal: Array,
     landmarks: Landmarks,
-    config: nearest_neighbours.Config,
-    near: Near | None = None,
+    config: nearest_neighbours.NearestNeighbourConfig,
+    near: PosePrior | None = None,
 ) -> Correspondences:
     """The matches of the plain `features` with the descriptors of each known photograph by itself.
 
@@ -69,7 +69,7 @@ def correspondences(
     """
     count = len(landmarks.Ts_world_camera)
     photographs = range(count) if near is None else _nearest(landmarks, near.camera.T_world_camera)
-    in_view, shown = (None, None) if near is None else _in_view(landmarks, principal, near)
+    in_view, shown = (None, None) if near is None else _find_visible(landmarks, principal, near)
     at = features.points[features.point_of]
     ours, theirs = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for photograph in photographs:
@@ -87,23 +87,23 @@ def correspondences(
     return _each_once(np.concatenate(ours), np.concatenate(theirs), features.points - principal, landmarks)
 
 
-def measure_mirror_gain(features: Features, landmarks: Landmarks, config: Config) -> float:
+def measure_mirror_gain(features: Features, landmarks: Landmarks, config: ReflectionConfig) -> float:
     """How much better the plain `features` match the scene when the image is turned left to right.
 
     It is the logarithm of the matches mirrored over those as it is (recon/verification/reflection.py), each with those
     images of the scene with which it has most. In a symmetric place these are not the same.
     """
-    plain = features.of_tilt(PLAIN).descriptors[: config.num_features]
+    plain = features.select_tilt(PLAIN).descriptors[: config.num_features]
     counts = np.zeros((len(landmarks.names), 2))  # as it is, and mirrored
     for photograph in range(len(counts)):
         theirs = landmarks.descriptors[landmarks.photograph_of == photograph]
-        for way, ours in enumerate((plain, mirrored_descriptors(plain))):
+        for way, ours in enumerate((plain, mirror_descriptors(plain))):
             counts[photograph, way] = len(nearest_neighbours.match(theirs, ours, config.nearest_neighbours))
     as_it_is, mirrored = np.sort(counts, axis=0)[-config.partners :].mean(0) + config.by_chance
     return float(np.log(mirrored / as_it_is))
 
 
-def _in_view(landmarks: Landmarks, principal: Array, near: Near) -> tuple[Flags, Array]:
+def _find_visible(landmarks: Landmarks, principal: Array, near: PosePrior) -> tuple[Flags, Array]:
     """(D,) which descriptors are of points that the camera sees as they were seen; (P, 2) where it sees each point."""
     shown, depth = near.camera.project(landmarks.points)
     shown, margin = shown + principal, near.reach_px or _MARGIN * max(near.size)

@@ -26,17 +26,17 @@ _SAME_PX = 1e-6  # between an observation and the feature that it is of
 _LEAST_CURVATURE = 1e-9  # of a point's information, relative to the largest: what is flatter is not known
 
 
-def gathered(graph: ViewGraph, registration: Registration, bounds: Mapping[str, Bounds]) -> Landmarks:
+def collect_landmarks(graph: ViewGraph, registration: Registration, bounds: Mapping[str, Bounds]) -> Landmarks:
     """The points that all matches and the registered cameras agree on, those first that most cameras see.
 
     Every camera keeps some: about DESCRIPTORS_A_PHOTOGRAPH descriptors a photograph are kept, over all photographs.
     """
-    problem, centred = _triangulated(graph, registration)
+    problem, centred = _triangulate_points(graph, registration)
     keyframes = [graph.keyframes[camera.index] for camera in registration.cameras]
     noise_px = _noise_px(problem, _scales(graph))
     covariances = _covariances(problem, noise_px * _scales(graph))
-    camera_of, point_of, descriptors = _described(problem, graph, centred)
-    kept = _chosen(camera_of, point_of, len(problem.points), len(keyframes))
+    camera_of, point_of, descriptors = _collect_descriptors(problem, graph, centred)
+    kept = _select_descriptors(camera_of, point_of, len(problem.points), len(keyframes))
     numbers, point_of = np.unique(point_of[kept], return_inverse=True)
     position = np.full(len(graph.keyframes), -1)
     position[[camera.index for camera in registration.cameras]] = np.arange(len(keyframes))
@@ -62,7 +62,7 @@ def _scales(graph: ViewGraph) -> Array:
     return np.array([longer_side(keyframe.frame) / REFERENCE_SIDE for keyframe in graph.keyframes])
 
 
-def _triangulated(graph: ViewGraph, registration: Registration) -> tuple[bundle.Problem, list[Array]]:
+def _triangulate_points(graph: ViewGraph, registration: Registration) -> tuple[bundle.Problem, list[Array]]:
     """All points on which matches and cameras agree, and the keyframes' features relative to the principal points."""
     count = len(graph.keyframes)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
@@ -73,19 +73,19 @@ def _triangulated(graph: ViewGraph, registration: Registration) -> tuple[bundle.
         log_focals[camera.index], radials[camera.index] = np.log(camera.focal), camera.radial
         principals[camera.index] = camera.principal
     shifts = np.zeros((count, 2))
-    problem = bundle.without_points(rotations, translations, np.arange(count), log_focals, radials, shifts)
+    problem = bundle.make_empty_problem(rotations, translations, np.arange(count), log_focals, radials, shifts)
     aspects = {camera.index: camera.aspect for camera in registration.cameras}
     problem = replace(problem, log_aspects=np.log([aspects.get(index, 1.0) for index in range(count)]))
     centred = [keyframe.features.points - principals[i] for i, keyframe in enumerate(graph.keyframes)]
     registered = [camera.index for camera in registration.cameras]
     every = tracks.build(centred, graph.pairs)
     problem, _ = triangulation.retriangulate(
-        problem, every, registered, _scales(graph), triangulation.Config(), tolerance=1.0
+        problem, every, registered, _scales(graph), triangulation.TriangulationConfig(), tolerance=1.0
     )
     return problem, centred
 
 
-def _described(
+def _collect_descriptors(
     problem: bundle.Problem, graph: ViewGraph, centred: Sequence[Array]
 ) -> tuple[Index, Index, npt.NDArray[np.uint8]]:
     """Cameras (D,), points (D,) and descriptors (D, 128) of the observations whose features have a plain one.
@@ -134,7 +134,7 @@ def _derivatives(problem: bundle.Problem) -> Array:
     return np.exp(problem.log_focals)[problem.camera_of, None, None] * rows @ rotations
 
 
-def _chosen(camera_of: Index, point_of: Index, num_points: int, num_cameras: int) -> npt.NDArray[np.bool_]:
+def _select_descriptors(camera_of: Index, point_of: Index, num_points: int, num_cameras: int) -> npt.NDArray[np.bool_]:
     """(D,) which descriptors are kept: those of the points that rank first in one of their cameras.
 
     In a camera points rank by how many cameras see them, then by a fixed random order, which spreads them.

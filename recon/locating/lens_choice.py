@@ -16,11 +16,11 @@ import numpy.typing as npt
 
 from splatnode.recon.locating import candidates, posing
 from splatnode.recon.locating.camera_model import POSE, CameraModel, Lens
-from splatnode.recon.locating.candidates import Assumed
-from splatnode.recon.locating.case import Judged
+from splatnode.recon.locating.candidates import LensAssumption
+from splatnode.recon.locating.case import QueryContext
 from splatnode.recon.locating.outcome import LensSource
-from splatnode.recon.locating.posing import Posed
-from splatnode.recon.locating.refinement import refined
+from splatnode.recon.locating.posing import PoseEstimate
+from splatnode.recon.locating.refinement import optimize_camera
 
 Array = npt.NDArray[np.float64]
 
@@ -41,37 +41,39 @@ _FOCAL, _RADIAL, _SHIFT, _ASPECT = POSE, POSE + 1, slice(POSE + 2, POSE + 4), PO
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class LensChoice:
     """A camera, and where its lens is from."""
 
-    posed: Posed
+    posed: PoseEstimate
     source: LensSource
     as_assumed: bool  # whether the lens is one of those that were assumed
-    rivals: tuple[Posed, ...] = ()  # the other cameras that were refined, each with a free lens
+    rivals: tuple[PoseEstimate, ...] = ()  # the other cameras that were refined, each with a free lens
 
 
-def search(judged: Judged, assumed: Sequence[Assumed], others: Sequence[Lens]) -> list[CameraModel]:
+def search_cameras(
+    judged: QueryContext, assumed: Sequence[LensAssumption], others: Sequence[Lens]
+) -> list[CameraModel]:
     """Cameras with the assumed lenses, and by a part of the correspondences with the `others`.
 
     The first is that on which most correspondences agree.
     """
     known, scale, settings = judged.known, judged.scale, judged.settings
-    tried = candidates.focals_apart(assumed, _TRIED_APART)
-    found = [posing.searched(known, lens, scale, settings) for lens in tried]
-    few = known.of(np.random.default_rng(0).permutation(len(known))[:_SUBSET])
+    tried = candidates.select_distinct_focals(assumed, _TRIED_APART)
+    found = [posing.search_pose(known, lens, scale, settings) for lens in tried]
+    few = known.select(np.random.default_rng(0).permutation(len(known))[:_SUBSET])
     most = min(settings.iterations, _SUBSET_ITERATIONS)
-    found += [posing.searched(few, lens, scale, settings, most) for lens in others]
+    found += [posing.search_pose(few, lens, scale, settings, most) for lens in others]
     return _best_first(judged, found, len(tried))
 
 
-def search_longer(judged: Judged, lenses: Sequence[Lens]) -> list[CameraModel]:
+def search_cameras_longer(judged: QueryContext, lenses: Sequence[Lens]) -> list[CameraModel]:
     """As `search`, with each of the `lenses` by all correspondences, which finds more where inliers are few."""
     most = min(judged.settings.iterations, _LONGER_ITERATIONS)
-    found = [posing.searched(judged.known, lens, judged.scale, judged.settings, most) for lens in lenses]
+    found = [posing.search_pose(judged.known, lens, judged.scale, judged.settings, most) for lens in lenses]
     return _best_first(judged, found)
 
 
-def _best_first(judged: Judged, found: Sequence[CameraModel | None], preferred: int = 0) -> list[CameraModel]:
+def _best_first(judged: QueryContext, found: Sequence[CameraModel | None], preferred: int = 0) -> list[CameraModel]:
     """Those that there are, by how many correspondences agree; the first `preferred` ones before equals."""
     limit_px, ranked = judged.settings.search_px * judged.scale, list[tuple[float, CameraModel]]()
     for number, camera in enumerate(found):
@@ -81,14 +83,18 @@ def _best_first(judged: Judged, found: Sequence[CameraModel | None], preferred: 
     return [camera for _, camera in sorted(ranked, key=lambda each: -each[0])]
 
 
-def choose_lens(judged: Judged, cameras: Sequence[CameraModel], assumed: Sequence[Assumed]) -> Chosen | None:
+def choose_lens(
+    judged: QueryContext, cameras: Sequence[CameraModel], assumed: Sequence[LensAssumption]
+) -> LensChoice | None:
     """The camera on which most correspondences agree, with its lens; None where there is none.
 
     `cameras` are where to start from, the best first. Of the `assumed` lenses the first is taken that the image does
     not contradict, else a free one.
     """
     side = judged.side
-    found = [(camera, judged.settled(camera, candidates.free(camera.lens, side))) for camera in cameras[:_REFINED]]
+    found = [
+        (camera, judged.refine_pose(camera, candidates.free_lens(camera.lens, side))) for camera in cameras[:_REFINED]
+    ]
     starts = [(int(wide.agreeing.sum()), camera, wide) for camera, wide in found if wide is not None]
     if not starts:
         return None
@@ -96,37 +102,37 @@ def choose_lens(judged: Judged, cameras: Sequence[CameraModel], assumed: Sequenc
     for start in starts[1:]:
         if start[0] > _CLEARLY_MORE * count:
             count, camera, wide = start
-    shaped, usual = _test_shape(wide, _nearest(assumed, wide) or candidates.usual(camera.lens, side), side)
-    prior = replace(candidates.free(camera.lens, side).with_shape_of(shaped), shift=np.zeros(2))
-    free = judged.settled(camera if usual else wide.fit.camera, prior)
+    shaped, usual = _test_shape(wide, _nearest(assumed, wide) or candidates.make_typical_lens(camera.lens, side), side)
+    prior = replace(candidates.free_lens(camera.lens, side).copy_shape(shaped), shift=np.zeros(2))
+    free = judged.refine_pose(camera if usual else wide.fit.camera, prior)
     if free is None:
         return None
     rivals = tuple(each for _, _, each in starts if each is not wide)
     order = sorted(assumed, key=lambda each: (each.source is not LensSource.SCENE, _log_focal_apart(each.lens, free)))
     for each in order if usual else ():
         kept = _keep(each, free, shaped, side)
-        chosen = None if kept is None else _settle_with(judged, free, each, kept)
+        chosen = None if kept is None else _refine_with_assumption(judged, free, each, kept)
         if chosen is not None and chosen.posed.agreeing.sum() >= _MIN_AGREEMENT * free.agreeing.sum():
             return replace(chosen, rivals=rivals)
-    chosen = _settle_freely(judged, free, prior)
+    chosen = _refine_with_free_lens(judged, free, prior)
     return None if chosen is None else replace(chosen, rivals=rivals)
 
 
-def _log_focal_apart(lens: Lens, posed: Posed) -> float:
+def _log_focal_apart(lens: Lens, posed: PoseEstimate) -> float:
     return abs(float(np.log(posed.fit.camera.lens.focal / lens.focal)))
 
 
-def _nearest(assumed: Sequence[Assumed], posed: Posed) -> Lens | None:
+def _nearest(assumed: Sequence[LensAssumption], posed: PoseEstimate) -> Lens | None:
     return min((each.lens for each in assumed), key=lambda lens: _log_focal_apart(lens, posed), default=None)
 
 
-def _test_shape(wide: Posed, expected: Lens, side: int) -> tuple[Lens, bool]:
+def _test_shape(wide: PoseEstimate, expected: Lens, side: int) -> tuple[Lens, bool]:
     """The radial coefficients and the aspect, of `expected` where the free lens `wide` does not refute them.
 
     Whether it does not is the second value.
     """
     lens, sigmas = wide.fit.camera.lens, _sigmas(wide)
-    limits, free = _REFUTED_SHAPE_SIGMAS, candidates.free(lens, side)
+    limits, free = _REFUTED_SHAPE_SIGMAS, candidates.free_lens(lens, side)
     bent = not abs(lens.radial[0] - expected.radial[0]) <= limits * np.hypot(sigmas[1], expected.radial_sigma)
     stretched = not abs(lens.log_aspect - expected.log_aspect) <= limits * np.hypot(
         sigmas[4], expected.log_aspect_sigma
@@ -143,7 +149,7 @@ def _test_shape(wide: Posed, expected: Lens, side: int) -> tuple[Lens, bool]:
     return shaped, not (bent or stretched)
 
 
-def _sigmas(posed: Posed) -> Array:
+def _sigmas(posed: PoseEstimate) -> Array:
     """(5,) of the lens, as its points leave it open; infinite where that is not known."""
     variances = np.diag(posed.fit.covariance)[POSE:]
     return np.sqrt(np.where(np.isfinite(variances), np.maximum(variances, 0.0), np.inf))
@@ -154,7 +160,7 @@ def _widen(sigma: float, open_sigma: float, most: float) -> float:
     return float(min(max(sigma, _SHARE_OPEN * open_sigma), max(sigma, most)))
 
 
-def _keep(each: Assumed, free: Posed, shaped: Lens, side: int) -> Lens | None:
+def _keep(each: LensAssumption, free: PoseEstimate, shaped: Lens, side: int) -> Lens | None:
     """The assumed lens with the sigmas that the image leaves to it; None where the free lens refutes it."""
     lens, found, sigmas = each.lens, free.fit.camera.lens, _sigmas(free)
     apart = np.array([np.log(found.focal / lens.focal), *(found.shift - lens.shift)])
@@ -165,31 +171,33 @@ def _keep(each: Assumed, free: Posed, shaped: Lens, side: int) -> Lens | None:
     if each.exact:
         most = _MOST_GIVEN_LOG, _MOST_GIVEN_SHIFT * side
     return replace(
-        lens.with_shape_of(shaped),
+        lens.copy_shape(shaped),
         radial=lens.radial,
         log_focal_sigma=_widen(lens.log_focal_sigma, sigmas[0], most[0]),
         shift_sigma=_widen(lens.shift_sigma, float(sigmas[2:4].max()), most[1]),
     )
 
 
-def _settle_with(judged: Judged, free: Posed, each: Assumed, kept: Lens) -> Chosen | None:
+def _refine_with_assumption(
+    judged: QueryContext, free: PoseEstimate, each: LensAssumption, kept: Lens
+) -> LensChoice | None:
     """The camera with an assumed lens. One that is exact stays, and what it may be wrong by is in the covariance."""
     if not each.exact:
-        posed = judged.settled(free.fit.camera, kept)
-        return None if posed is None else Chosen(posed, each.source, True)
+        posed = judged.refine_pose(free.fit.camera, kept)
+        return None if posed is None else LensChoice(posed, each.source, True)
     exact = replace(kept, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0, log_aspect_sigma=0.0)
-    posed = judged.settled(free.fit.camera, exact)
+    posed = judged.refine_pose(free.fit.camera, exact)
     if posed is None:
         return None
-    loose = refined(posed.fit.camera, kept, judged.known.of(posed.agreeing), judged.noise_px)
-    return Chosen(replace(posed, fit=replace(posed.fit, covariance=loose.covariance)), each.source, True)
+    loose = optimize_camera(posed.fit.camera, kept, judged.known.select(posed.agreeing), judged.noise_px)
+    return LensChoice(replace(posed, fit=replace(posed.fit, covariance=loose.covariance)), each.source, True)
 
 
-def _settle_freely(judged: Judged, free: Posed, prior: Lens) -> Chosen | None:
+def _refine_with_free_lens(judged: QueryContext, free: PoseEstimate, prior: Lens) -> LensChoice | None:
     """The camera with a lens of its own, whose principal point is in the middle where the image does not refute it."""
-    lens, sigmas, usual = free.fit.camera.lens, _sigmas(free)[2:4], candidates.usual(prior, judged.side)
+    lens, sigmas, usual = free.fit.camera.lens, _sigmas(free)[2:4], candidates.make_typical_lens(prior, judged.side)
     if not (np.abs(lens.shift) <= _REFUTED_SIGMAS * np.hypot(sigmas, usual.shift_sigma)).all():
-        return Chosen(free, LensSource.FREE, False)
+        return LensChoice(free, LensSource.FREE, False)
     sigma = _widen(usual.shift_sigma, float(sigmas.max()), prior.shift_sigma)
-    posed = judged.settled(free.fit.camera, replace(prior, shift=np.zeros(2), shift_sigma=sigma))
-    return None if posed is None else Chosen(posed, LensSource.FREE, False)
+    posed = judged.refine_pose(free.fit.camera, replace(prior, shift=np.zeros(2), shift_sigma=sigma))
+    return None if posed is None else LensChoice(posed, LensSource.FREE, False)

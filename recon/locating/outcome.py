@@ -35,7 +35,7 @@ class LensSource(str, Enum):
 
 
 @dataclass(frozen=True)
-class Claim:
+class LocalizationBounds:
     """How wrong a placed camera may be: each bound holds for 95 % of them, in the world of the result."""
 
     rotation_deg: float  # degrees
@@ -52,7 +52,7 @@ class Located:
     T_world_camera: Array  # (4, 4): p_world = T_world_camera @ p_camera
     K: Array  # (3, 3) for the photograph at full size, centre of the top-left pixel at (0.5, 0.5)
     covariance: Array  # (6, 6) of a small motion in the camera's frame: shift (result's unit), then turn (radians)
-    claim: Claim  # how wrong it may be
+    claim: LocalizationBounds  # how wrong it may be
     num_points: int  # of the scene that agree with it
     metric: bool  # lengths are metres
     lens: LensSource = LensSource.SCENE  # with which it was placed
@@ -60,7 +60,7 @@ class Located:
 
     @property
     def sentence(self) -> str:
-        """Where, and how sure, in one line."""
+        """Returns where the camera is, and how sure that is, in one line."""
         x, y, z = self.T_world_camera[:3, 3]
         unit, claim = " m" if self.metric else "", self.claim
         length = f"{claim.centre:.2g} m" if self.metric else f"{claim.centre_percent:.2g} % of the distance"

@@ -9,17 +9,17 @@ from pathlib import Path
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_lens import check_fits, same_aspect, seen_through
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.given_lens import assign_lens, check_fits, same_aspect
+from splatnode.capture.lenses.undistort import undistort_frame
 
 
-def photographs(paths: Sequence[Path], given: Intrinsics | None) -> Iterator[Frame | DroppedFrame]:
+def stream_query_frames(paths: Sequence[Path], given: Intrinsics | None) -> Iterator[Frame | DroppedFrame]:
     """The photographs that the paths name, each a file or a folder, in their order.
 
     `given` is the lens of those that have its aspect ratio. Raises FileNotFoundError for a path that is not there.
     """
-    for frame in _named(paths):
-        yield frame if given is None else seen_through(frame, given)
+    for frame in _stream_paths(paths):
+        yield frame if given is None else assign_lens(frame, given)
 
 
 def check_lens(given: Intrinsics, frames: Iterable[Frame | DroppedFrame]) -> None:
@@ -30,14 +30,14 @@ def check_lens(given: Intrinsics, frames: Iterable[Frame | DroppedFrame]) -> Non
     others: set[tuple[int, int]] = set()
     for frame in frames:
         if isinstance(frame, Frame) and same_aspect(given, frame.width, frame.height):
-            undistorted(replace(frame, intrinsics=given, right=None))
+            undistort_frame(replace(frame, intrinsics=given, right=None))
             return
         if isinstance(frame, Frame):
             others.add((frame.width, frame.height))
     check_fits(given, others)
 
 
-def _named(paths: Sequence[Path]) -> Iterator[Frame | DroppedFrame]:
+def _stream_paths(paths: Sequence[Path]) -> Iterator[Frame | DroppedFrame]:
     for path in paths:
         if path.is_dir():
             yield from folder.stream(folder.Config(folder=path))
@@ -47,8 +47,8 @@ def _named(paths: Sequence[Path]) -> Iterator[Frame | DroppedFrame]:
             raise FileNotFoundError(f"{str(path)!r} is not there; give photographs, or folders that hold some")
 
 
-def assumed_lens(frame: Frame, fov_deg: float | None) -> Intrinsics | None:
-    """What is known of the photograph's lens; an angle of view, across the longer side, is right to a few per cent."""
+def choose_intrinsics(frame: Frame, fov_deg: float | None) -> Intrinsics | None:
+    """Returns the image's intrinsics; an angle of view, across the longer side, holds to a few per cent."""
     if fov_deg is None:
         return frame.intrinsics
     focal = max(frame.width, frame.height) / 2.0 / math.tan(math.radians(fov_deg) / 2.0)

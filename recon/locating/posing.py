@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon import poselib
-from splatnode.recon.locating.camera_model import CameraModel, Lens, without_distortion
+from splatnode.recon.locating.camera_model import CameraModel, Lens, undistort_pixels
 from splatnode.recon.locating.correspondences import LEAST_COSINE, Correspondences
-from splatnode.recon.locating.refinement import Fit, refined
+from splatnode.recon.locating.refinement import CameraFit, optimize_camera
 from splatnode.recon.registration import epipolar
 
 Array = npt.NDArray[np.float64]
@@ -23,7 +23,7 @@ _ITERATIONS_OF_MANY = 3_000  # of RANSAC, where lenses are tried: they do for 13
 _MIN_LENGTH = 1e-12
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PoseSearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     search_px: float = 6.0  # reprojection error of an inlier while the lens is not exact, pixels at REFERENCE_SIDE
     max_error_px: float = 3.0  # of an inlier in the end
     iterations: int = 10_000  # of RANSAC, at most: they do for 9 % inliers
@@ -31,38 +31,38 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Posed:
+class PoseEstimate:
     """A camera, and the correspondences that agree with it."""
 
-    fit: Fit
+    fit: CameraFit
     prior: Lens  # that it was refined with
     agreeing: Flags  # (M,) of those that were given; at most one of a pixel, and of a landmark
 
 
-def posed(
-    known: Correspondences, lenses: Sequence[Lens], scale: float, noise_px: float, config: Config
-) -> Posed | None:
+def estimate_pose(
+    known: Correspondences, lenses: Sequence[Lens], scale: float, noise_px: float, config: PoseSearchConfig
+) -> PoseEstimate | None:
     """The camera that most correspondences agree with, of one of the `lenses`, refined; None where not a sample does.
 
     `scale` is pixels of the photograph for one at REFERENCE_SIDE; `noise_px` is of an observation, in its pixels.
     """
     most = config.iterations if len(lenses) == 1 else min(config.iterations, _ITERATIONS_OF_MANY)
-    found = [(camera, lens) for lens in lenses if (camera := searched(known, lens, scale, config, most)) is not None]
+    found = [(camera, lens) for lens in lenses if (camera := search_pose(known, lens, scale, config, most)) is not None]
     if not found:
         return None
     limit_px = config.search_px * scale
     camera, lens = max(found, key=lambda each: int(agreement(each[0], known, limit_px).sum()))
-    return settled(camera, known, lens, scale, noise_px, config)
+    return refine_pose(camera, known, lens, scale, noise_px, config)
 
 
-def searched(
-    known: Correspondences, lens: Lens, scale: float, config: Config, most_iterations: int | None = None
+def search_pose(
+    known: Correspondences, lens: Lens, scale: float, config: PoseSearchConfig, most_iterations: int | None = None
 ) -> CameraModel | None:
     """The camera by random samples, with the lens as it is given; None where there are too few correspondences."""
     if len(known) <= _SAMPLE:
         return None
     pose, info = poselib.estimate_absolute_pose(
-        without_distortion(known.pixels, lens),
+        undistort_pixels(known.pixels, lens),
         known.points,
         epipolar.pinhole(lens.focal),
         {
@@ -77,19 +77,21 @@ def searched(
     return CameraModel(np.asarray(pose.R), np.asarray(pose.t), lens)
 
 
-def settled(
-    camera: CameraModel, known: Correspondences, lens: Lens, scale: float, noise_px: float, config: Config
-) -> Posed | None:
+def refine_pose(
+    camera: CameraModel, known: Correspondences, lens: Lens, scale: float, noise_px: float, config: PoseSearchConfig
+) -> PoseEstimate | None:
     """The camera refined by its inliers, which are found again, until both have settled."""
     fit, agreeing = None, np.zeros(len(known), bool)
     for limit_px in np.linspace(config.search_px, config.max_error_px, config.rounds):
         agreeing = agreement(camera, known, limit_px * scale)
         if agreeing.sum() <= _SAMPLE:
             return None
-        fit = refined(replace(camera, lens=camera.lens.with_sigmas_of(lens)), lens, known.of(agreeing), noise_px)
+        fit = optimize_camera(
+            replace(camera, lens=camera.lens.copy_sigmas(lens)), lens, known.select(agreeing), noise_px
+        )
         camera = fit.camera
     assert fit is not None
-    return Posed(fit, lens, agreement(camera, known, config.max_error_px * scale))
+    return PoseEstimate(fit, lens, agreement(camera, known, config.max_error_px * scale))
 
 
 def agreement(camera: CameraModel, known: Correspondences, limit_px: float) -> Flags:

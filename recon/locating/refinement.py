@@ -25,7 +25,7 @@ _FIXED = 1e-9  # stands for a sigma of 0
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class CameraFit:
     """A camera with what its correspondences say of it."""
 
     camera: CameraModel
@@ -33,7 +33,7 @@ class Fit:
     spread: float  # of the residuals, over what is expected of them: 1 where all is as it should be
 
 
-def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: float) -> Fit:
+def optimize_camera(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: float) -> CameraFit:
     """The camera with the least robust cost, from `camera` on.
 
     `noise_px` is the standard deviation of a pixel's coordinate; the points' own uncertainty counts beside it. The
@@ -44,7 +44,7 @@ def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: 
     covariance = np.full((NUM_PARAMETERS, NUM_PARAMETERS), np.nan)
     covariances = np.ascontiguousarray(known.covariances.transpose(1, 2, 0))
     for _ in range(_STEPS):
-        rows, residuals = _whitened(camera, known, covariances, noise_px)
+        rows, residuals = _whiten_residuals(camera, known, covariances, noise_px)
         lengths = np.hypot(*residuals)
         spread = max(_median(lengths) / _RAYLEIGH_MEDIAN, 1.0)
         weights = 1.0 / (1.0 + (lengths / (_ROBUST * spread)) ** 2) / spread**2
@@ -57,17 +57,17 @@ def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: 
         gradient[lens] += CORRELATED * information_of_prior * (prior.values - camera.lens.values)
         inverse = _inverse(information)
         if inverse is None:
-            return Fit(camera, np.full_like(covariance, np.nan), spread)
+            return CameraFit(camera, np.full_like(covariance, np.nan), spread)
         step = inverse @ gradient
         if not np.isfinite(step).all():
-            return Fit(camera, np.full_like(covariance, np.nan), spread)
-        camera, covariance = camera.moved(step), CORRELATED * inverse
+            return CameraFit(camera, np.full_like(covariance, np.nan), spread)
+        camera, covariance = camera.apply_step(step), CORRELATED * inverse
         if step @ information @ step < _CONVERGED:
             break
-    return Fit(camera, covariance, spread)
+    return CameraFit(camera, covariance, spread)
 
 
-def _whitened(
+def _whiten_residuals(
     camera: CameraModel,
     known: Correspondences,
     covariances: Array,  # (3, 3, M) of the points

@@ -14,60 +14,60 @@ from typing import Any
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.process.progress import Step, telling, times
+from splatnode.capture.process.progress import ProgressStep, format_times, show_progress
 from splatnode.capture.process.records import record_in
-from splatnode.capture.process.terminal import in_place, progress, say
-from splatnode.recon.config import Config
+from splatnode.capture.process.terminal import is_interactive, progress, say
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.mapping.scenes import (
     KEYFRAME_BYTES,
-    Progress,
-    check_begun,
+    MapProgress,
+    check_incomplete,
+    make_node_config,
     make_scenes,
-    node_config,
     remove_checkpoint,
 )
-from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, most, write_maps
-from splatnode.recon.replay_source import IMAGES, Recording, Request, recording
+from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps
+from splatnode.recon.replay_source import IMAGES, ReplayRecording, Request, load_recording
 from splatnode.recon.result.export import read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.whole import FILE
 
 _OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
 
 
-def replay_map(args: argparse.Namespace, request: Request, config: Config) -> int:
+def replay_map(args: argparse.Namespace, request: Request, config: ReconstructionConfig) -> int:
     """Writes the scenes, their places.json, a merged result for each map, and a report.json about all."""
     given = [f"--{name.replace('_', '-')}" for name in _OF_ONE_SCENE if getattr(args, name)]
     if given:
         raise ValueError(f"--map makes many scenes and does not go with what is about one: {', '.join(given)}")
-    check_begun(args.out)
-    with telling(quiet=args.json) as tell:
-        source = recording(request, tell)
+    check_incomplete(args.out)
+    with show_progress(quiet=args.json) as tell:
+        source = load_recording(request, tell)
         tell(str(source.choice))
     began_s = time.monotonic()
-    with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
+    with hold_result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         remove_result(args.out)  # of one scene, beside which nobody would find the map's
-        frames = _kept(source, args.out) if source.is_film else source.frames()
-        told = _ToldOfMap(args.json, len(source.choice.names))
-        with _only_warnings():
-            make_scenes(frames, source.identity(config), node_config(config, args.out), told)
+        frames = _write_frames(source, args.out) if source.is_film else source.frames()
+        told = _ProgressPrinter(args.json, len(source.choice.names))
+        with _limit_log_level():
+            make_scenes(frames, source.identity(config), make_node_config(config, args.out), told)
         progress("")
-        reports = write_maps(args.out, args.out, partial(most, args), quiet=args.json)
-        report = _report(source, args.out, reports, time.monotonic() - began_s)
+        reports = write_maps(args.out, args.out, partial(compute_gaussian_limit, args), quiet=args.json)
+        report = _make_report(source, args.out, reports, time.monotonic() - began_s)
         write_files(args.out, {"report.json": json_bytes(report)})
         remove_checkpoint(args.out)
     if args.json:
         print(json.dumps(report))
     else:
-        _tell(report, args.out)
+        _print_report(report, args.out)
     return EXIT_GOOD if reports else EXIT_REFUSED
 
 
 @contextlib.contextmanager
-def _only_warnings() -> Iterator[None]:
-    """What is logged of each step of each scene would be too much."""
+def _limit_log_level() -> Iterator[None]:
+    """Limits the log to warnings: each step of each scene would be too much."""
     log = logging.getLogger("splatnode")
     before = log.level
     log.setLevel(logging.WARNING)
@@ -77,25 +77,25 @@ def _only_warnings() -> Iterator[None]:
         log.setLevel(before)
 
 
-class _ToldOfMap:
+class _ProgressPrinter:
     """Says how far the work is: on a terminal again and again, else whenever a scene is judged or made."""
 
     def __init__(self, quiet: bool, keyframes: int) -> None:
         self._quiet, self._keyframes, self._last = quiet, keyframes, (0, 0, 0)
         self._began_s = time.monotonic()
 
-    def __call__(self, now: Progress) -> None:
+    def __call__(self, now: MapProgress) -> None:
         if self._quiet:
             return
-        step = Step("making scenes", now.taken, self._keyframes, "keyframe")
+        step = ProgressStep("making scenes", now.taken, self._keyframes, "keyframe")
         line = f"{step}; {now}"
-        progress(f"{line} ({times(step, time.monotonic() - self._began_s)})")
-        if not in_place() and (now.judged, now.unfinished, now.maps) != self._last:
+        progress(f"{line} ({format_times(step, time.monotonic() - self._began_s)})")
+        if not is_interactive() and (now.judged, now.unfinished, now.maps) != self._last:
             self._last = now.judged, now.unfinished, now.maps
             say(line)
 
 
-def _kept(source: Recording, out: Path) -> Iterator[Frame | DroppedFrame]:
+def _write_frames(source: ReplayRecording, out: Path) -> Iterator[Frame | DroppedFrame]:
     """The frames of a film, each of which is written into out/images, too."""
     for frame in source.frames():
         path = out / IMAGES / frame.name
@@ -104,7 +104,7 @@ def _kept(source: Recording, out: Path) -> Iterator[Frame | DroppedFrame]:
         yield frame
 
 
-def _report(source: Recording, out: Path, reports: Reports, seconds: float) -> dict[str, object]:
+def _make_report(source: ReplayRecording, out: Path, reports: Reports, seconds: float) -> dict[str, object]:
     places = record_in(read_json_file(out / FILE), dict[str, Any])["places"]
     why = {each["name"]: each["reason"] for place in places for each in place["frames_dropped"]}
     why |= {name: f"{place['scene_id']}: {place['message']}" for place in places for name in place["frames_used"]}
@@ -124,7 +124,7 @@ def _report(source: Recording, out: Path, reports: Reports, seconds: float) -> d
     }
 
 
-def _tell(report: dict[str, Any], out: Path) -> None:
+def _print_report(report: dict[str, Any], out: Path) -> None:
     for each in report["left_out"]:
         say(f"left out: {each['name']}: {each['reason']}")
     say(f"{report['keyframes_in_a_map']} of {report['selection']['keyframes']} keyframes are in a map")

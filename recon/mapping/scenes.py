@@ -17,10 +17,10 @@ from pathlib import Path
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.process.memory_shortage import is_shortage
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.inbox import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.preparation import prepare
 from splatnode.recon.result.whole import FILE
@@ -34,7 +34,7 @@ LOOK_S = 0.5  # between looks at how far the work is
 
 
 @dataclass(frozen=True)
-class Progress:
+class MapProgress:
     """How far the map is."""
 
     taken: int  # keyframes
@@ -49,19 +49,22 @@ class Progress:
         return f"scenes: {self.judged}{work}, maps: {self.maps}{loops}"
 
 
-def check_begun(out: Path) -> None:
+def check_incomplete(out: Path) -> None:
     """Raises ValueError where the folder holds a map that is complete."""
     if (out / FILE).exists() and not (out / CHECKPOINT).exists():
         raise ValueError(f"{out} holds the scenes of a map already; give another --out")
 
 
-def node_config(config: Config, out: Path) -> daemon.Config:
-    """Of a node that makes scenes as `config` says, and writes only into `out`."""
-    return daemon.Config(reconstruction=config, checkpoint=out / CHECKPOINT, out=out, export_every_s=NEVER_S)
+def make_node_config(config: ReconstructionConfig, out: Path) -> daemon.DaemonConfig:
+    """Makes the configuration of a node that reconstructs as `config` says, and writes only into `out`."""
+    return daemon.DaemonConfig(reconstruction=config, checkpoint=out / CHECKPOINT, out=out, export_every_s=NEVER_S)
 
 
 def make_scenes(
-    frames: Iterable[Frame | DroppedFrame], identity: str, node: daemon.Config, show: Callable[[Progress], None]
+    frames: Iterable[Frame | DroppedFrame],
+    identity: str,
+    node: daemon.DaemonConfig,
+    show: Callable[[MapProgress], None],
 ) -> None:
     """Writes the final scenes of all keyframes, and their places.json.
 
@@ -71,20 +74,20 @@ def make_scenes(
     stopping = threading.Event()
     assert node.checkpoint is not None
     with contextlib.closing(Store(node.checkpoint)) as store:
-        if {session for session, _ in store.seen} - {identity}:
+        if {session for session, _ in store.frame_keys} - {identity}:
             raise ValueError(f"{store.directory} is that of another recording; remove it, or give another --out")
-        taken = max((sequence for _, sequence in store.seen), default=-1) + 1
+        taken = max((sequence for _, sequence in store.frame_keys), default=-1) + 1
         inbox = Inbox()
         worker = Worker(node, store, inbox, lambda _: None, stopping)
 
         def tell(taken: int) -> None:
-            show(Progress(taken, worker.known[0], worker.unfinished, *worker.known[1:]))
+            show(MapProgress(taken, worker.map_counts[0], worker.num_unfinished, *worker.map_counts[1:]))
 
-        with _working(worker, stopping) as check:
+        with _run_worker(worker, stopping) as check:
             for sequence, frame in enumerate(frames):
                 if sequence >= taken:
                     received = ReceivedFrame(identity, sequence, frame)
-                    _take_in(received, node.reconstruction, store, inbox, stopping, check)
+                    _enqueue_frame(received, node.reconstruction, store, inbox, stopping, check)
                     taken = sequence + 1
                     tell(taken)
             rests = worker.rests
@@ -101,7 +104,7 @@ def remove_checkpoint(out: Path) -> None:
 
 
 @contextlib.contextmanager
-def _working(worker: Worker, stopping: threading.Event) -> Iterator[Callable[[], None]]:
+def _run_worker(worker: Worker, stopping: threading.Event) -> Iterator[Callable[[], None]]:
     """The worker in a thread of its own, which is stopped at the end; yields what raises the error that it ended by."""
     errors: list[BaseException] = []
 
@@ -125,12 +128,12 @@ def _working(worker: Worker, stopping: threading.Event) -> Iterator[Callable[[],
         thread.join()
 
 
-def _take_in(
-    received: ReceivedFrame, config: Config, store: Store, inbox: Inbox, stopping: threading.Event,
+def _enqueue_frame(
+    received: ReceivedFrame, config: ReconstructionConfig, store: Store, inbox: Inbox, stopping: threading.Event,
     check: Callable[[], None],
 ) -> None:  # fmt: skip
     """Waits while the worker has enough to do. A frame that cannot be used is recorded with the reason."""
-    stored = store.put(received)
+    stored = store.add_frame(received)
     if stored is None:
         return
     name = stored.frame.name
@@ -141,6 +144,6 @@ def _take_in(
             raise
         log.warning("%s cannot be used: %s", name, error)
         store.forget(name, f"cannot be used: {error}")
-        inbox.put(LeftOut(name), stopping, check)
+        inbox.enqueue(RemovedFrame(name), stopping, check)
         return
-    inbox.put(Arrived(keyframe, time.monotonic()), stopping, check)
+    inbox.enqueue(ArrivedKeyframe(keyframe, time.monotonic()), stopping, check)

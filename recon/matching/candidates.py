@@ -15,13 +15,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.matching.components import connected_components
+from splatnode.recon.matching.components import find_components
 from splatnode.recon.matching.image_code import Code, similarities
 
 Pair = tuple[int, int]
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PairSelectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     exhaustive: int = 12  # keyframes up to which all pairs are matched
     partners: int = 8  # with which a keyframe is matched first: with 8 of 29, real sets were as exact as with all
     short_list: int = 24  # keyframes with similar codes that are matched at a glance, to choose the partners
@@ -29,7 +29,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     enough_firm: int = 3  # partners with firm matches that make a keyframe firmly connected
 
 
-def to_glance_at(codes: Sequence[Code], config: Config) -> set[Pair]:
+def select_short_list_pairs(codes: Sequence[Code], config: PairSelectionConfig) -> set[Pair]:
     """The pairs (i < j) of which either keyframe has the other on its short list."""
     if len(codes) <= config.exhaustive:
         return set()
@@ -39,12 +39,12 @@ def to_glance_at(codes: Sequence[Code], config: Config) -> set[Pair]:
     return _union([_best(alike[index], index)[: config.short_list] for index in range(len(codes))])
 
 
-def worth_matching(
+def select_pairs_worth_matching(
     num_keyframes: int,
     glanced: Mapping[Pair, int],
     is_known: Callable[[Pair], bool],
     is_firm: Callable[[Pair], bool],
-    config: Config,
+    config: PairSelectionConfig,
 ) -> set[Pair]:
     """The pairs (i < j) that are to be matched, as far as that can be said from those that are.
 
@@ -63,7 +63,7 @@ def worth_matching(
         chosen = _union([ranked[index][: depth[index]] for index in everyone])
         if not all(map(is_known, chosen)):
             return chosen
-        loose = _loose(everyone, set(filter(is_firm, chosen)), config)
+        loose = _find_weakly_connected(everyone, set(filter(is_firm, chosen)), config)
         loose = [index for index in loose if depth[index] < num_keyframes]
         if not loose:
             return chosen
@@ -81,8 +81,8 @@ def _union(partners: Sequence[Sequence[int]]) -> set[Pair]:
     return {(min(index, other), max(index, other)) for index, those in enumerate(partners) for other in those}
 
 
-def _loose(everyone: Collection[int], firm: Collection[Pair], config: Config) -> list[int]:
+def _find_weakly_connected(everyone: Collection[int], firm: Collection[Pair], config: PairSelectionConfig) -> list[int]:
     """The keyframes with few firm partners, or outside of the largest group that firm pairs connect."""
-    (largest, *_) = connected_components(everyone, firm)
+    (largest, *_) = find_components(everyone, firm)
     counts = np.bincount(np.array(sorted(firm), np.int64).ravel(), minlength=len(everyone))
     return [index for index in everyone if counts[index] < config.enough_firm or index not in largest]

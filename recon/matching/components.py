@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 
-def connected_components(nodes: Iterable[int], edges: Iterable[tuple[int, int]]) -> list[list[int]]:
+def find_components(nodes: Iterable[int], edges: Iterable[tuple[int, int]]) -> list[list[int]]:
     """The connected components of the undirected graph, the largest first; equally large ones by their first nodes."""
     label = {node: node for node in nodes}
     for i, j in edges:

@@ -22,7 +22,7 @@ MASK_MARGIN = 0.008  # of the longer side: nearer to what a mask hides, a featur
 _NO_BLUR = 0.01  # sigma, pixels, along the other side: OpenCV takes 0 for "as along the width"
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_features: int = 8000  # of an image, at most: the strongest
     contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
     max_longer_side: int = 1600  # larger images are shrunk before features are found, pixels
@@ -31,13 +31,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     snap_px: float = 1.5
 
 
-def extract(image: Image, config: Config) -> Features:
+def extract(image: Image, config: FeatureConfig) -> Features:
     """Features of `image` (H, W, 3) RGB, the strongest first, with one descriptor a point."""
     points, descriptors = _detect(image, 1.0, config)
     return Features(points, descriptors, np.arange(len(points)), np.ones(len(points)))
 
 
-def used(features: Features, mask: npt.NDArray[np.bool_] | None) -> Features:
+def apply_mask(features: Features, mask: npt.NDArray[np.bool_] | None) -> Features:
     """Those that lie well inside of what `mask` (H, W) of their image uses; None: all."""
     if mask is None:
         return features
@@ -59,7 +59,7 @@ def well_inside(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     return cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
-def add_tilted(features: Features, image: Image, tilts: Sequence[float], config: Config) -> Features:
+def add_affine_features(features: Features, image: Image, tilts: Sequence[float], config: FeatureConfig) -> Features:
     """Adds to the `features` of `image` (H, W, 3) RGB those of the image with its width divided by each of `tilts`.
 
     Narrowing simulates that a frontal surface is seen from the side; a tilt below 1 multiplies the height instead, as
@@ -87,22 +87,22 @@ def add_tilted(features: Features, image: Image, tilts: Sequence[float], config:
     return features
 
 
-def searched_pixels(image: Image, config: Config) -> float:
+def count_search_pixels(image: Image, config: FeatureConfig) -> float:
     """In how many pixels the features of `image` (H, W, 3) are looked for."""
-    return image.shape[0] * image.shape[1] * _scale(image, config) ** 2
+    return image.shape[0] * image.shape[1] * _search_scale(image, config) ** 2
 
 
-def _scale(image: Image, config: Config) -> float:
-    """By which `image` is enlarged or shrunk before its features are looked for."""
+def _search_scale(image: Image, config: FeatureConfig) -> float:
+    """Returns the factor by which `image` is resized before its features are detected."""
     longer = max(image.shape[:2])
     return float(np.clip(1.0, config.min_longer_side / longer, config.max_longer_side / longer))
 
 
-def _detect(image: Image, tilt: float, config: Config) -> tuple[Array, npt.NDArray[np.uint8]]:
+def _detect(image: Image, tilt: float, config: FeatureConfig) -> tuple[Array, npt.NDArray[np.uint8]]:
     """Points (M, 2) in pixels of `image`, the strongest first, and their descriptors (M, 128)."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
-    scale = _scale(image, config)
+    scale = _search_scale(image, config)
     size = max(1, round(width * scale / max(tilt, 1.0))), max(1, round(height * scale * min(tilt, 1.0)))
     if tilt != 1.0:
         blur = _TILT_BLUR * float(np.sqrt(max(tilt, 1.0 / tilt) ** 2 - 1))

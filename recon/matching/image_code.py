@@ -21,9 +21,9 @@ _WORDS = 64
 _MIN_NORM = 1e-9
 
 
-def image_code(features: Features) -> Code:
+def compute_global_descriptor(features: Features) -> Code:
     """(64 * 128,) the code of the plain features, of unit length; zeros where there are none."""
-    descriptors = features.of_tilt(PLAIN).descriptors.astype(np.float32) / QUANTISED_NORM
+    descriptors = features.select_tilt(PLAIN).descriptors.astype(np.float32) / QUANTISED_NORM
     code = np.zeros((_WORDS, DESCRIPTOR_SIZE), np.float32)
     if not len(descriptors):
         return code.ravel()

@@ -18,20 +18,20 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.masks import masked
+from splatnode.capture.masks import apply_mask
 from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.frames.keyframe import (
     LIBRARY_ERRORS,
     REFERENCE_SIDE,
     Keyframe,
     longer_side,
-    modelled_image,
     principal_point,
+    resize_image,
 )
 from splatnode.recon.matching import features, two_view
-from splatnode.recon.matching.match import Matcher, completed
+from splatnode.recon.matching.match import Matcher, match_pending
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
-from splatnode.recon.workers import each
+from splatnode.recon.workers import map_parallel
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class _Group:
     moves: bool  # whether it is the smaller patch beyond doubt
 
 
-def without_moving(
+def mask_moving_objects(
     graph: ViewGraph, matcher: Matcher | None, until: float = math.inf, pause: Callable[[], None] = lambda: None
 ) -> ViewGraph:
     """The complete view graph without what moved between the photographs: matched again where there is such a thing.
@@ -78,26 +78,26 @@ def without_moving(
     pause()
     masks = moving_masks(graph)
     shown = [keyframe for keyframe in graph.keyframes if keyframe.name in masks]
-    hidden = [_without(keyframe, masks[keyframe.name]) for keyframe in shown]
+    hidden = [_apply_moving_mask(keyframe, masks[keyframe.name]) for keyframe in shown]
     changed = [after for before, after in zip(shown, hidden, strict=True) if after is not before]
     pause()
-    for further in completed(graph.with_changed(changed), matcher, until) if changed else ():
+    for further in match_pending(graph.replace_keyframes(changed), matcher, until) if changed else ():
         graph = further
         pause()
     return graph
 
 
-def _without(keyframe: Keyframe, mask: Mask) -> Keyframe:
+def _apply_moving_mask(keyframe: Keyframe, mask: Mask) -> Keyframe:
     """The keyframe without what the mask (H, W) hides; itself where hardly anything would remain."""
-    frame = masked(keyframe.frame, mask)
+    frame = apply_mask(keyframe.frame, mask)
     if isinstance(frame, DroppedFrame) or frame is keyframe.frame or frame.mask is None:
         return keyframe
     before = 1.0 if keyframe.frame.mask is None else float(keyframe.frame.mask.mean())
     return replace(
         keyframe,
         frame=frame,
-        image=modelled_image(frame.image, max(keyframe.image.shape[:2])),
-        features=features.used(keyframe.features, frame.mask),
+        image=resize_image(frame.image, max(keyframe.image.shape[:2])),
+        features=features.apply_mask(keyframe.features, frame.mask),
         moving=before - float(frame.mask.mean()),
     )
 
@@ -122,13 +122,13 @@ def moving_points(graph: ViewGraph) -> list[Mask]:
     needed = min(VOTES, len(matches))
     for _ in range(ROUNDS):
         asked = [(graph, pair, found) for pair, found in matches.items()]
-        groups = [group for found in each(lambda one: _find_groups(*one), asked) for group in found]
+        groups = [group for found in map_parallel(lambda one: _find_groups(*one), asked) for group in found]
         votes = [np.zeros(len(points), int) for points in moving]
         for group in groups:
             if group.moves:
                 for side, index in enumerate(group.pair):
                     votes[index][group.matches[:, side]] += 1
-        new = _not_at_rest(_spread([own >= needed for own in votes], groups), graph)
+        new = _not_at_rest(_propagate_moving([own >= needed for own in votes], groups), graph)
         if sum(own.sum() >= _MIN_POINTS for own in new) < min(MIN_SHOWN, len(new)):
             break
         moving = [before | own for before, own in zip(moving, new, strict=True)]
@@ -207,8 +207,8 @@ def _patch(points: Array, keyframe: Keyframe) -> float:
     return cv2.contourArea(hull) / (keyframe.frame.width * keyframe.frame.height)
 
 
-def _spread(moving: Sequence[Mask], groups: Sequence[_Group]) -> list[Mask]:
-    """With the points of every group of which one photograph knows that it moves, until nothing is added."""
+def _propagate_moving(moving: Sequence[Mask], groups: Sequence[_Group]) -> list[Mask]:
+    """Adds the points of every group that one image knows to move, until nothing is added."""
     moving = [own.copy() for own in moving]
     waiting = list(groups)
     while True:

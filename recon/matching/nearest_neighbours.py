@@ -23,7 +23,7 @@ _MAX_DESCRIPTORS = 65535  # that recon/core/match.cpp is written for
 _SCORE_OFFSET = 16320  # `kOffset` of recon/core/match.cpp: keeps scores positive
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class NearestNeighbourConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ratio: float = 0.85  # largest ratio of nearest to second-nearest distance; loose, because geometry decides later
 
 
@@ -32,7 +32,7 @@ def quantise(descriptors: npt.NDArray[np.float32]) -> Bytes:
     return np.minimum(np.rint(descriptors * QUANTISED_NORM), _MAX_BYTE).astype(np.uint8)
 
 
-def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
+def match(descriptors1: Bytes, descriptors2: Bytes, config: NearestNeighbourConfig) -> Index:
     """(M, 2) indices into both sets: each is the other's nearest neighbour, and clearly nearer than the second nearest.
 
     The most distinct match comes first: the one with the lowest ratio of distances. Raises ValueError unless both are
@@ -60,7 +60,7 @@ def match_near(
     descriptors2: Bytes,
     points2: npt.NDArray[np.float64],  # (N, 2)
     reach: float,
-    config: Config,
+    config: NearestNeighbourConfig,
 ) -> Index:
     """As `match`, among pairs whose points are nearer than `reach` alone; what has one such neighbour is distinct.
 
@@ -95,7 +95,7 @@ def _check(*sets: Bytes) -> None:
 
 
 def _distinct(
-    first: Bytes, nearest: Index32, score: Index32, second_score: Index32, back: Index32, config: Config
+    first: Bytes, nearest: Index32, score: Index32, second_score: Index32, back: Index32, config: NearestNeighbourConfig
 ) -> Index:
     """The pairs that are each other's nearest and pass the ratio test, the most distinct first."""
     (there,) = np.nonzero(nearest >= 0)

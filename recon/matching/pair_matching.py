@@ -28,9 +28,9 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
-    two_view: two_view.Config = two_view.Config()
+class PairMatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    nearest_neighbours: nearest_neighbours.NearestNeighbourConfig = nearest_neighbours.NearestNeighbourConfig()
+    two_view: two_view.TwoViewConfig = two_view.TwoViewConfig()
     max_static_px: float = 1.0  # median motion below which matches may show the robot itself, pixels at REFERENCE_SIDE
     min_moving: int = 60  # matches that move by more, for a geometry of these alone
 
@@ -44,20 +44,22 @@ class MatchedPair:
     log10_nfa: float  # log10 of the number of false alarms, also without geometry: below 0 it hints at an overlap
 
 
-def glance(keyframe1: Keyframe, keyframe2: Keyframe, num_features: int, config: Config) -> int:
+def glance(keyframe1: Keyframe, keyframe2: Keyframe, num_features: int, config: PairMatchingConfig) -> int:
     """The number of descriptor matches of the strongest plain features of both images: a hint at an overlap."""
-    first, second = (keyframe.features.of_tilt(PLAIN).descriptors[:num_features] for keyframe in (keyframe1, keyframe2))
+    first, second = (
+        keyframe.features.select_tilt(PLAIN).descriptors[:num_features] for keyframe in (keyframe1, keyframe2)
+    )
     return len(nearest_neighbours.match(first, second, config.nearest_neighbours))
 
 
-def match_plain(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> MatchedPair:
+def match_plain(keyframe1: Keyframe, keyframe2: Keyframe, config: PairMatchingConfig) -> MatchedPair:
     """Matches the features of both images as they are."""
     matches = _match(keyframe1.features, keyframe2.features, (PLAIN, PLAIN), config.nearest_neighbours)
-    return _verified(keyframe1, keyframe2, matches, config)
+    return _verify_matches(keyframe1, keyframe2, matches, config)
 
 
-def match_tilted(
-    keyframe1: Keyframe, keyframe2: Keyframe, known: MatchedPair, tilts: Sequence[float], config: Config
+def match_affine(
+    keyframe1: Keyframe, keyframe2: Keyframe, known: MatchedPair, tilts: Sequence[float], config: PairMatchingConfig
 ) -> MatchedPair:
     """Adds matches of features with the simulated `tilts` to those that are `known`.
 
@@ -66,11 +68,11 @@ def match_tilted(
     both_ways = sorted({(PLAIN, tilt) for tilt in tilts} | {(tilt, PLAIN) for tilt in tilts})
     found = [known.matches]
     found += [_match(keyframe1.features, keyframe2.features, both, config.nearest_neighbours) for both in both_ways]
-    return _verified(keyframe1, keyframe2, _merged(found), config)
+    return _verify_matches(keyframe1, keyframe2, _merge_matches(found), config)
 
 
 def add_proposed(
-    keyframe1: Keyframe, keyframe2: Keyframe, known: MatchedPair, proposed: Index, config: Config
+    keyframe1: Keyframe, keyframe2: Keyframe, known: MatchedPair, proposed: Index, config: PairMatchingConfig
 ) -> MatchedPair:
     """Adds the matches that a prior proposes, (M, 2) point numbers, the most distinct first.
 
@@ -78,16 +80,16 @@ def add_proposed(
     """
     if not appearance_check.matches_look_alike(keyframe1, keyframe2, proposed):
         return known
-    return _verified(keyframe1, keyframe2, _merged([known.matches, proposed]), config)
+    return _verify_matches(keyframe1, keyframe2, _merge_matches([known.matches, proposed]), config)
 
 
 def median_motion_px(pair: TwoView, longer_side1: int, longer_side2: int) -> float:
     """Median motion of the pair's matches, pixels at REFERENCE_SIDE; each frame is scaled to that longer side."""
-    scaled = pair.scaled(longer_side2 / longer_side1, 1.0)
+    scaled = pair.rescale(longer_side2 / longer_side1, 1.0)
     return float(np.median(two_view.motion_px(scaled.points1, scaled.points2, longer_side2)))
 
 
-def _merged(found: Sequence[Index]) -> Index:
+def _merge_matches(found: Sequence[Index]) -> Index:
     """(M, 2) the matches of several sets, the most distinct of each first; a point keeps its most distinct match."""
     rank = np.concatenate([np.arange(len(matches)) / max(1, len(matches)) for matches in found])
     merged = np.concatenate(found)[np.argsort(rank, kind="stable")]
@@ -98,15 +100,20 @@ def _merged(found: Sequence[Index]) -> Index:
 
 
 def _match(
-    features1: Features, features2: Features, tilts: tuple[float, float], config: nearest_neighbours.Config
+    features1: Features,
+    features2: Features,
+    tilts: tuple[float, float],
+    config: nearest_neighbours.NearestNeighbourConfig,
 ) -> Index:
     """(M, 2) point numbers that match by the descriptors of these tilts, the most distinct match first."""
-    first, second = (features.of_tilt(tilt) for features, tilt in zip((features1, features2), tilts, strict=True))
+    first, second = (features.select_tilt(tilt) for features, tilt in zip((features1, features2), tilts, strict=True))
     match = nearest_neighbours.match(first.descriptors, second.descriptors, config)
     return np.stack([first.point_of[match[:, 0]], second.point_of[match[:, 1]]], 1)
 
 
-def _verified(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> MatchedPair:
+def _verify_matches(
+    keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: PairMatchingConfig
+) -> MatchedPair:
     """The matches with their two-view geometry; without one, and a line in the log, where a library fails on them."""
     try:
         return _estimate_geometry(keyframe1, keyframe2, matches, config)
@@ -116,7 +123,9 @@ def _verified(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: 
         return MatchedPair(matches, None, 0.0)
 
 
-def _estimate_geometry(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> MatchedPair:
+def _estimate_geometry(
+    keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: PairMatchingConfig
+) -> MatchedPair:
     """The matches with their two-view geometry. Raises LIBRARY_ERRORS.
 
     The first frame is scaled to the longer side of the second: one focal length in pixels may then hold for both.
@@ -133,4 +142,4 @@ def _estimate_geometry(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index,
         if len(moving) >= config.min_moving:
             again = two_view.estimate(points1[moving], points2[moving], matches[moving], size, config.two_view)
             geometry, log10_nfa = again if again[0] is not None else (geometry, log10_nfa)
-    return MatchedPair(matches, geometry.scaled(1.0 / scale, 1.0) if geometry else None, log10_nfa)
+    return MatchedPair(matches, geometry.rescale(1.0 / scale, 1.0) if geometry else None, log10_nfa)

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import msgspec
 
-from splatnode.recon.matching.components import connected_components
+from splatnode.recon.matching.components import find_components
 from splatnode.recon.matching.pair_matching import MatchedPair
 from splatnode.recon.matching.two_view import TwoView
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AffineSimulationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tilts: tuple[float, ...] = (
         1.6,
     )  # by which the image's width is divided; below 1, its height multiplied; none: no pair is matched again
@@ -22,13 +22,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hint_log10_nfa: float = -1.0
 
 
-def is_firm(geometry: TwoView | None, config: Config) -> bool:
+def is_strong_pair(geometry: TwoView | None, config: AffineSimulationConfig) -> bool:
     """Whether a pair has so many verified matches that nothing need be done to find more."""
     return geometry is not None and len(geometry.matches) >= config.firm_matches
 
 
-def pairs_to_tilt(
-    plain: Mapping[tuple[int, int], MatchedPair], num_keyframes: int, config: Config
+def select_weak_pairs(
+    plain: Mapping[tuple[int, int], MatchedPair], num_keyframes: int, config: AffineSimulationConfig
 ) -> set[tuple[int, int]]:
     """The pairs that are worth matching with tilted features, given what the `plain` features say of all pairs.
 
@@ -37,10 +37,10 @@ def pairs_to_tilt(
     """
     if not config.tilts:
         return set()
-    firm = {pair for pair, matched in plain.items() if is_firm(matched.geometry, config)}
+    firm = {pair for pair, matched in plain.items() if is_strong_pair(matched.geometry, config)}
     everyone = range(num_keyframes)
     partners = [{i + j - index for i, j in firm if index in (i, j)} for index in everyone]
-    components = connected_components(everyone, firm)
+    components = find_components(everyone, firm)
     component_of = {index: number for number, component in enumerate(components) for index in component}
 
     def may_overlap(i: int, j: int) -> bool:

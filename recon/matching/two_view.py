@@ -36,7 +36,7 @@ _FIRST_QUANTILE = 0.7  # of the errors of the fit to all matches: its threshold 
 _MIN_DEPTH = 1e-3  # of a turned unit ray: what is beside or behind the camera projects far outside the image
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TwoViewConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     epipolar_px: float = 1.5  # inlier threshold of the fundamental matrix, pixels at REFERENCE_SIDE
     homography_px: float = 2.5  # inlier threshold of a homography and of a pure rotation, pixels at REFERENCE_SIDE
     # Log10 of the largest number of false alarms of a verified pair: unrelated images agree no more often
@@ -64,11 +64,11 @@ class TwoView:
         """Whether a pure rotation explains nearly all inliers, so that no translation is needed."""
         return self.num_rotation >= _PURE_ROTATION_RATIO * len(self.matches)
 
-    def swapped(self) -> TwoView:
+    def swap(self) -> TwoView:
         """The geometry with the second frame first."""
         return replace(self, matches=self.matches[:, ::-1], points1=self.points2, points2=self.points1)
 
-    def scaled(self, scale1: float, scale2: float) -> TwoView:
+    def rescale(self, scale1: float, scale2: float) -> TwoView:
         """The geometry of the same frames resized by these factors."""
         return replace(self, points1=scale1 * self.points1, points2=scale2 * self.points2)
 
@@ -79,7 +79,7 @@ def motion_px(points1: Array, points2: Array, longer_side: int) -> Array:
 
 
 def estimate(
-    points1: Array, points2: Array, matches: npt.NDArray[np.int64], size: tuple[int, int], config: Config
+    points1: Array, points2: Array, matches: npt.NDArray[np.int64], size: tuple[int, int], config: TwoViewConfig
 ) -> tuple[TwoView | None, float]:
     """The pair's geometry, or None when chance explains the agreement, and log10 of the number of false alarms.
 
@@ -114,7 +114,7 @@ def estimate(
         log10_nfa=log10_nfa,
         num_homography=0 if plane is None else int(plane.sum()),
         num_rotation=rotation_inliers,
-        focal_ratio=_shared_focal(points1, points2, threshold) / longer_side,
+        focal_ratio=_estimate_shared_focal(points1, points2, threshold) / longer_side,
         rotation_focal_ratio=rotation_focal / longer_side,
     )
     return geometry, log10_nfa
@@ -194,7 +194,7 @@ def _unit_rays(points: Array, focals: Array) -> Array:
     return rays / np.linalg.norm(rays, axis=2, keepdims=True)
 
 
-def _shared_focal(points1: Array, points2: Array, threshold: float) -> float:
+def _estimate_shared_focal(points1: Array, points2: Array, threshold: float) -> float:
     """The focal length in pixels, equal in both views, that the six-point solver finds (Kukelova et al., 2008)."""
     pair, _ = poselib.estimate_shared_focal_relative_pose(
         points1, points2, np.zeros(2), {"max_epipolar_error": threshold, **_FOCAL_ITERATIONS}

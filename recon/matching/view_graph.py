@@ -11,12 +11,12 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from splatnode.recon.frames.keyframe import Keyframe, content_key
-from splatnode.recon.matching.candidates import worth_matching
-from splatnode.recon.matching.components import connected_components
-from splatnode.recon.matching.config import Config
+from splatnode.recon.matching.candidates import select_pairs_worth_matching
+from splatnode.recon.matching.components import find_components
+from splatnode.recon.matching.config import MatchingConfig
 from splatnode.recon.matching.image_code import Code
 from splatnode.recon.matching.pair_matching import MatchedPair
-from splatnode.recon.matching.tilting import is_firm, pairs_to_tilt
+from splatnode.recon.matching.tilting import is_strong_pair, select_weak_pairs
 from splatnode.recon.matching.two_view import TwoView
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ class ViewGraph:
     this process has not matched, stay as they are.
     """
 
-    config: Config
+    config: MatchingConfig
     keyframes: tuple[Keyframe, ...] = ()
     pairs: Mapping[Pair, TwoView] = field(default_factory=dict)  # verified
     pending: frozenset[Pair] = frozenset()  # (i < j) that have not been matched; not all of them are worth it
@@ -44,16 +44,16 @@ class ViewGraph:
 
     @property
     def names(self) -> list[str]:
-        """Of the keyframes, in their order."""
+        """Returns the names of the keyframes, in their order."""
         return [keyframe.name for keyframe in self.keyframes]
 
-    def with_keyframe(self, keyframe: Keyframe) -> ViewGraph:
-        """With a further keyframe at the end, which is matched with none yet."""
+    def add_keyframe(self, keyframe: Keyframe) -> ViewGraph:
+        """Adds a keyframe at the end, which is matched with none yet."""
         new = len(self.keyframes)
         pending = self.pending.union((index, new) for index in range(new))
         return replace(self, keyframes=(*self.keyframes, keyframe), pending=pending)
 
-    def without(self, names: Collection[str]) -> ViewGraph:
+    def remove_keyframes(self, names: Collection[str]) -> ViewGraph:
         """The view graph of the other keyframes, with what is known of their pairs."""
         kept = [index for index, keyframe in enumerate(self.keyframes) if keyframe.name not in names]
         position = {index: place for place, index in enumerate(kept)}
@@ -71,9 +71,9 @@ class ViewGraph:
             remaining(self.glanced),
             {name: code for name, code in self.codes.items() if name not in names},
         )
-        return rest if rest.to_match() else rest.chosen()
+        return rest if rest.select_pairs_to_match() else rest.select_geometries()
 
-    def without_pairs_of(self, names: Collection[str]) -> ViewGraph:
+    def forget_pairs(self, names: Collection[str]) -> ViewGraph:
         """The same keyframes; nothing is known of the pairs of these, and nothing pending."""
         gone = {index for index, keyframe in enumerate(self.keyframes) if keyframe.name in names}
 
@@ -89,11 +89,11 @@ class ViewGraph:
             glanced=remaining(self.glanced),
         )
 
-    def with_changed(self, keyframes: Collection[Keyframe]) -> ViewGraph:
-        """With these in place of those of the same names; all pairs of theirs are pending."""
+    def replace_keyframes(self, keyframes: Collection[Keyframe]) -> ViewGraph:
+        """Replaces the keyframes of the same names; all their pairs are pending."""
         names, by_name = self.names, {keyframe.name: keyframe for keyframe in keyframes}
         changed = {index for index, name in enumerate(names) if name in by_name}
-        rest = self.without_pairs_of(by_name)
+        rest = self.forget_pairs(by_name)
         pairs = itertools.combinations(range(len(names)), 2)
         return replace(
             rest,
@@ -102,7 +102,7 @@ class ViewGraph:
             codes={name: code for name, code in self.codes.items() if name not in by_name},
         )
 
-    def joined(self, other: ViewGraph) -> ViewGraph:
+    def merge(self, other: ViewGraph) -> ViewGraph:
         """The view graph of the keyframes of both, by frame id, with the pairs that either has matched.
 
         Where both have a pair, this graph's counts. Pairs that neither has matched are pending.
@@ -113,17 +113,17 @@ class ViewGraph:
         everything = frozenset(itertools.combinations(range(len(keyframes)), 2))
         both = ViewGraph(self.config, tuple(keyframes), pending=everything)
         for graph in (other, self):
-            both = both._with_knowledge_of(graph, [position[name] for name in graph.names])
+            both = both._merge_pairs(graph, [position[name] for name in graph.names])
         return both
 
-    def _with_knowledge_of(self, graph: ViewGraph, number: Sequence[int]) -> ViewGraph:
-        """With what `graph` knows, whose keyframe i is keyframe `number[i]` here."""
+    def _merge_pairs(self, graph: ViewGraph, number: Sequence[int]) -> ViewGraph:
+        """Merges what `graph` knows, whose keyframe i is keyframe `number[i]` here."""
         keyframes, pairs = list(self.keyframes), dict(self.pairs)
         for index, keyframe in zip(number, graph.keyframes, strict=True):
             if len(keyframe.features.points) > len(keyframes[index].features.points):  # with tilted ones
                 keyframes[index] = keyframe
         for (i, j), pair in graph.pairs.items():
-            pairs[_ascending(number[i], number[j])] = pair if number[i] < number[j] else pair.swapped()
+            pairs[_ascending(number[i], number[j])] = pair if number[i] < number[j] else pair.swap()
         known = set(itertools.combinations(range(len(number)), 2)) - graph.pending
         return replace(
             self,
@@ -136,7 +136,7 @@ class ViewGraph:
             codes={**self.codes, **graph.codes},
         )
 
-    def in_order_of_content(self, *indices: int) -> tuple[int, ...]:
+    def sort_by_content(self, *indices: int) -> tuple[int, ...]:
         return tuple(sorted(indices, key=lambda index: content_key(self.keyframes[index])))
 
     def partners(self, index: int) -> dict[int, int]:
@@ -145,13 +145,17 @@ class ViewGraph:
 
     def components(self) -> list[list[int]]:
         """Positions of the keyframes that verified pairs connect, the largest component first."""
-        return connected_components(range(len(self.keyframes)), self.pairs)
+        return find_components(range(len(self.keyframes)), self.pairs)
 
-    def worth_matching(self) -> set[Pair]:
+    def select_pairs_worth_matching(self) -> set[Pair]:
         """The pairs (i < j), matched or not, that are worth it (`candidates.worth_matching`)."""
-        firm = {_ascending(i, j) for (i, j), pair in self.plain.items() if is_firm(pair.geometry, self.config.tilting)}
-        firm |= {pair for pair, geometry in self.pairs.items() if is_firm(geometry, self.config.tilting)}
-        return worth_matching(
+        firm = {
+            _ascending(i, j)
+            for (i, j), pair in self.plain.items()
+            if is_strong_pair(pair.geometry, self.config.tilting)
+        }
+        firm |= {pair for pair, geometry in self.pairs.items() if is_strong_pair(geometry, self.config.tilting)}
+        return select_pairs_worth_matching(
             len(self.keyframes),
             self.glanced,
             lambda pair: pair not in self.pending,
@@ -159,31 +163,31 @@ class ViewGraph:
             self.config.candidates,
         )
 
-    def to_match(self) -> set[Pair]:
+    def select_pairs_to_match(self) -> set[Pair]:
         """The pending pairs that are worth matching; once they are matched, others may follow."""
-        return self.worth_matching() & self.pending
+        return self.select_pairs_worth_matching() & self.pending
 
-    def to_tilt(self) -> set[Pair]:
+    def select_weak_pairs(self) -> set[Pair]:
         """The pairs that tilted features are worth their time for, by what the plain ones say of all pairs."""
-        return self._to_tilt_of(self.worth_matching())
+        return self._select_weak_pairs_among(self.select_pairs_worth_matching())
 
-    def _to_tilt_of(self, worth: set[Pair]) -> set[Pair]:
+    def _select_weak_pairs_among(self, worth: set[Pair]) -> set[Pair]:
         plain = {pair: found for pair, found in self.plain.items() if _ascending(*pair) in worth}
-        return pairs_to_tilt(plain, len(self.keyframes), self.config.tilting)
+        return select_weak_pairs(plain, len(self.keyframes), self.config.tilting)
 
-    def chosen(self) -> ViewGraph:
-        """With the geometry of tilted features for the pairs that need them, and of plain ones for the others.
+    def select_geometries(self) -> ViewGraph:
+        """Selects the geometry of tilted features for pairs that need them, and of plain ones for the others.
 
         Pairs that were matched and turned out not to be worth it do not count.
         """
-        worth, pairs = self.worth_matching(), dict(self.pairs)
-        to_tilt = self._to_tilt_of(worth)
+        worth, pairs = self.select_pairs_worth_matching(), dict(self.pairs)
+        to_tilt = self._select_weak_pairs_among(worth)
         for (first, second), plain in self.plain.items():
             tilted = self.tilted.get((first, second)) if (first, second) in to_tilt else None
             geometry = (tilted.geometry if tilted else None) or plain.geometry
             pairs.pop(_ascending(first, second), None)
             if geometry is not None and _ascending(first, second) in worth:
-                pairs[_ascending(first, second)] = geometry if first < second else geometry.swapped()
+                pairs[_ascending(first, second)] = geometry if first < second else geometry.swap()
         return replace(self, pairs=pairs)
 
 

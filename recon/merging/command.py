@@ -8,28 +8,28 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from splatnode.capture.process.progress import waiting
+from splatnode.capture.process.progress import show_waiting
 from splatnode.capture.process.terminal import say
-from splatnode.recon.merging.merge import Merged, merged
+from splatnode.recon.merging.merge import MergedScene, merge_submaps
 from splatnode.recon.merging.submap import Submap, Submaps, load_submaps
 from splatnode.recon.merging.unit import scale_and_up
-from splatnode.recon.result.coarser import Level, levels
+from splatnode.recon.result.coarser import DetailLevel, make_detail_levels
 from splatnode.recon.result.depth_file import DEPTHS, encode_depths
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.export.formats.ply import encode_ply, most_in_ply
-from splatnode.recon.result.export.prepare import take, viewer_safe
+from splatnode.recon.result.export.formats.ply import compute_max_gaussians, encode_ply
+from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.folder import result_folder
-from splatnode.recon.result.levels_file import LEVELS_FILE, levels_record
-from splatnode.recon.result.pieces import SHELL_PIECE, merged_folder, piece_name
-from splatnode.recon.result.preview import contact_sheet
+from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.levels_file import LEVELS_FILE, make_levels_record
+from splatnode.recon.result.pieces import SHELL_PIECE, make_merged_path, make_piece_name
+from splatnode.recon.result.preview import make_contact_sheet
 from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.scale import Scale
-from splatnode.recon.result.size import result_bytes
+from splatnode.recon.result.size import estimate_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.up import Up
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.result.whole import Whole, WholeMap, read_whole
+from splatnode.recon.result.whole import JoinedMap, MapSet, read_map_set
 from splatnode.recon.scene.background import SHELL
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -39,7 +39,7 @@ _LEVELS_BYTES = 0.5  # of a result, for its coarser levels
 
 def merge(args: argparse.Namespace) -> int:
     """Writes map-NAME for each map of the node's results; what cannot be merged is told."""
-    reports = write_maps(args.folder, args.out or args.folder, partial(most, args), quiet=args.json)
+    reports = write_maps(args.folder, args.out or args.folder, partial(compute_gaussian_limit, args), quiet=args.json)
     if args.json:
         print(json.dumps(reports))
     return EXIT_GOOD if reports else EXIT_REFUSED
@@ -51,44 +51,52 @@ def write_maps(folder: Path, out: Path, most: Callable[[Sequence[Submap]], int |
     `most` says how many Gaussians the map of these submaps may have. Raises FileNotFoundError, SceneFileError,
     ResultWriteError.
     """
-    whole = read_whole(folder)
+    whole = read_map_set(folder)
     reports = {}
     for each in whole.maps:
-        with waiting(f"reading the scenes of {each.name}"):
+        with show_waiting(f"reading the scenes of {each.name}"):
             found = load_submaps(whole, each)
         if not found.used:
             reasons = "; ".join(f"{scene_id}: {why}" for scene_id, why in found.left_out.items())
             if not quiet:
                 say(f"{each.name}: nothing to merge ({reasons})")
             continue
-        merged_into = merged_folder(out, each)
-        with waiting(f"merging {len(found.used)} scenes into {merged_into.name}"):
+        merged_into = make_merged_path(out, each)
+        with show_waiting(f"merging {len(found.used)} scenes into {merged_into.name}"):
             reports[merged_into.name] = write_map(whole, each, found, merged_into, most(found.used))
         if not quiet:
-            _tell(reports[merged_into.name], merged_into)
+            _print_report(reports[merged_into.name], merged_into)
     return reports
 
 
-def write_map(whole: Whole, of: WholeMap, found: Submaps, folder: Path, most: int | None) -> dict[str, object]:
+def write_map(whole: MapSet, of: JoinedMap, found: Submaps, folder: Path, most: int | None) -> dict[str, object]:
     """Writes the merged result of one map, whole or not at all; returns its report. Raises ResultWriteError."""
     given = sum(len(each.gaussians) for each in found.used)
-    with result_folder(folder, round((1 + _LEVELS_BYTES) * result_bytes(given if most is None else min(given, most)))):
-        one = merged(found.used, most)
+    with hold_result_folder(
+        folder, round((1 + _LEVELS_BYTES) * estimate_result_bytes(given if most is None else min(given, most)))
+    ):
+        one = merge_submaps(found.used, most)
         snapshot = _snapshot(one, found, *scale_and_up(whole, of, [each.scene_id for each in found.used]))
-        coarse = levels(one.gaussians)
+        coarse = make_detail_levels(one.gaussians)
         report = _report(snapshot, one, found, coarse, given)
-        write_result(snapshot, folder, report, preview=contact_sheet(snapshot), further=_further(snapshot, one, coarse))
+        write_result(
+            snapshot,
+            folder,
+            report,
+            preview=make_contact_sheet(snapshot),
+            further=_encode_extra_files(snapshot, one, coarse),
+        )
     return report
 
 
-def most(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
+def compute_gaussian_limit(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
     """How many Gaussians a merged scene may have by both limits; None: there is none."""
     bases = max(each.gaussians.sh.shape[1] for each in submaps)
-    by_size = None if args.max_mb is None else most_in_ply(round(args.max_mb * 1e6), bases)
+    by_size = None if args.max_mb is None else compute_max_gaussians(round(args.max_mb * 1e6), bases)
     return min((limit for limit in (args.max_gaussians, by_size) if limit is not None), default=None)
 
 
-def _snapshot(one: Merged, found: Submaps, scale: Scale, up: Up | None) -> Snapshot:
+def _snapshot(one: MergedScene, found: Submaps, scale: Scale, up: Up | None) -> Snapshot:
     rough = [each.verdict for each in found.used if each.verdict != Code.OK.value]
     names = ", ".join(each.scene_id for each in found.used)
     message = f"One scene of {len(found.used)}: {names}."
@@ -99,31 +107,35 @@ def _snapshot(one: Merged, found: Submaps, scale: Scale, up: Up | None) -> Snaps
     return Snapshot(0, verdict, one.cameras, one.gaussians, {}, (), 0, seconds, final=True, scale=scale, up=up)
 
 
-def _report(snapshot: Snapshot, one: Merged, found: Submaps, coarse: Sequence[Level], given: int) -> dict[str, object]:
+def _report(
+    snapshot: Snapshot, one: MergedScene, found: Submaps, coarse: Sequence[DetailLevel], given: int
+) -> dict[str, object]:
     report = build_report(snapshot, seed=0, preset="merge", peak_rss_mb=peak_rss_mb())
     return report | {
         "scenes": [share.record() for share in one.shares],
         "scenes_left_out": [{"scene": scene_id, "reason": why} for scene_id, why in found.left_out.items()],
         "gaussians_given": given,
         "far_shell": one.shell,
-        **levels_record(coarse, snapshot.cameras),
+        **make_levels_record(coarse, snapshot.cameras),
     }
 
 
-def _further(snapshot: Snapshot, one: Merged, coarse: Sequence[Level]) -> dict[str, bytes]:
+def _encode_extra_files(snapshot: Snapshot, one: MergedScene, coarse: Sequence[DetailLevel]) -> dict[str, bytes]:
     """levels/1.ply and so on, levels.json (from how far away each suffices), each submap's piece, and depth.npz."""
-    parts = {f"levels/{number}.ply": viewer_safe(each.gaussians) for number, each in enumerate(coarse, 1)}
+    parts = {f"levels/{number}.ply": sanitize_gaussians(each.gaussians) for number, each in enumerate(coarse, 1)}
     source = one.gaussians.source_frame
     numbers = {each.scene_id: number for number, each in enumerate(one.shares)} | {SHELL_PIECE: SHELL}
-    parts |= {piece_name(each): take(one.gaussians, source == number) for each, number in numbers.items()}
-    levels_file = json_bytes(snapshot.scale.record() | levels_record(coarse, snapshot.cameras))
+    parts |= {
+        make_piece_name(each): select_gaussians(one.gaussians, source == number) for each, number in numbers.items()
+    }
+    levels_file = json_bytes(snapshot.scale.record() | make_levels_record(coarse, snapshot.cameras))
     depths = {DEPTHS: encode_depths(one.depths)} if one.depths else {}
     return (
         {name: encode_ply(part, snapshot.scale) for name, part in parts.items()} | {LEVELS_FILE: levels_file} | depths
     )
 
 
-def _tell(report: dict[str, object], folder: Path) -> None:
+def _print_report(report: dict[str, object], folder: Path) -> None:
     verdict, scenes = report["verdict"], report["scenes"]
     assert isinstance(verdict, dict) and isinstance(scenes, list)
     say(f"{verdict['code']}: {verdict['message']}")

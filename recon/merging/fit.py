@@ -34,21 +34,21 @@ SHELL_SHARE = 0.1  # of a limit on the Gaussians, at most, for the far shells
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitResult:
     """The Gaussians of a map, each with the number of its submap as source frame, or SHELL; and all its cameras."""
 
     gaussians: GaussianArrays
     cameras: tuple[tuple[CameraEstimate, ...], ...]  # of each submap, where they see what that submap showed
 
 
-def fitted(
+def fit_gaussians(
     submaps: Sequence[Submap],
     gaussians: GaussianArrays,
     *,
     most: int | None = None,
     passes: int = PASSES,
     seed: int = 0,
-) -> Fitted:
+) -> FitResult:
     """The `gaussians` of the `submaps`, whose median depth must be about 1, at most `most` of them.
 
     Their source frames are as `Fitted` has them.
@@ -56,8 +56,8 @@ def fitted(
     views = [_view(each.gaussians, camera) for each in submaps for camera in each.cameras]
     begun = _tensors(gaussians)
     if most is not None:
-        begun = _with_few_shells(begun, [_camera(view) for view in views], most, seed)
-    config = refinement.Config(
+        begun = _limit_shells(begun, [_camera(view) for view in views], most, seed)
+    config = refinement.RefinementConfig(
         iterations=passes * len(views),
         checkpoints=(),
         first_opacity=None,
@@ -70,17 +70,17 @@ def fitted(
         tuple(replace(camera, T_world_camera=_rigid(next(found).T_world_camera)) for camera in each.cameras)
         for each in submaps
     )
-    return Fitted(scene.arrays(), cameras)
+    return FitResult(scene.arrays(), cameras)
 
 
-def _rates() -> refinement.Rates:
+def _rates() -> refinement.LearningRates:
     whole = refinement.CAUTIOUS
     slower = {name: RATE * getattr(whole, name) for name in ("means", "quats", "log_scales", "sh")}
     return msgspec.structs.replace(whole, **slower)
 
 
 def _view(gaussians: GaussianArrays, camera: CameraEstimate) -> TrainingView:
-    """What the submap shows to its own camera, as if it were a photograph."""
+    """Renders the submap in its own camera, as the image to fit."""
     return TrainingView(
         camera.name,
         camera.frame_id,
@@ -94,13 +94,13 @@ def _camera(view: TrainingView) -> Camera:
     return Camera(view.T_world_camera, view.K, view.width, view.height)
 
 
-def _with_few_shells(gaussians: Gaussians, cameras: Sequence[Camera], most: int, seed: int) -> Gaussians:
+def _limit_shells(gaussians: Gaussians, cameras: Sequence[Camera], most: int, seed: int) -> Gaussians:
     """Without the shells' Gaussians that are missed least, where a limit left too little beside all of them."""
     shell = (gaussians.source_frame == SHELL).nonzero()[:, 0]
     room = int(SHELL_SHARE * most)
     if len(shell) <= room:
         return gaussians
-    worth = prune.changes_without(gaussians, cameras, 1, torch.Generator().manual_seed(seed))
+    worth = prune.estimate_removal_changes(gaussians, cameras, 1, torch.Generator().manual_seed(seed))
     keep = gaussians.source_frame != SHELL
     keep[shell[worth[shell].topk(room).indices]] = True
     return gaussians.subset(keep)

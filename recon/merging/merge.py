@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.merging.fit import fitted
-from splatnode.recon.merging.seams import kept
+from splatnode.recon.merging.fit import fit_gaussians
+from splatnode.recon.merging.seams import resolve_seams
 from splatnode.recon.merging.submap import Submap
-from splatnode.recon.result.coarser import joined
-from splatnode.recon.result.export.prepare import take, viewer_safe
+from splatnode.recon.result.coarser import concatenate_gaussians
+from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
@@ -23,8 +23,8 @@ _LOOKS = 24  # cameras whose median depth tells the unit
 
 
 @dataclass(frozen=True)
-class Share:
-    """What became of one submap's Gaussians."""
+class SubmapShare:
+    """The counts of one submap's Gaussians through the merge."""
 
     scene_id: str
     given: int
@@ -44,18 +44,18 @@ class Share:
 
 
 @dataclass(frozen=True, eq=False)
-class Merged:
+class MergedScene:
     """One scene in the world and unit of its map. A photograph that several submaps have is one camera."""
 
     gaussians: GaussianArrays  # the source frame is the number of the submap, SHELL in the far shells
     cameras: tuple[CameraEstimate, ...]  # without bounds: those of a submap do not hold across a map
-    shares: tuple[Share, ...]
+    shares: tuple[SubmapShare, ...]
     shell: int  # Gaussians of the far shells among those that are kept
     depths: Mapping[str, npt.NDArray[np.float16]]  # confirmed z by camera, of the submap that the camera is of
     seconds: Mapping[str, float]
 
 
-def merged(submaps: Sequence[Submap], most: int | None = None) -> Merged:
+def merge_submaps(submaps: Sequence[Submap], most: int | None = None) -> MergedScene:
     """The submaps as one scene, of at most so many Gaussians. A single one without a limit is as it was.
 
     Raises ValueError without submaps.
@@ -65,40 +65,42 @@ def merged(submaps: Sequence[Submap], most: int | None = None) -> Merged:
     began = time.perf_counter()
     unit = _depth(submaps)
     smaller = Placement(1.0 / unit, np.eye(3), np.zeros(3))
-    scaled = [_placed(each, smaller) for each in submaps]
-    stays = kept(scaled)
-    parts = [_of_submap(each, number, mask) for number, (each, mask) in enumerate(zip(scaled, stays, strict=True))]
-    together, cameras = joined(parts), tuple(each.cameras for each in scaled)
+    scaled = [_transform_submap(each, smaller) for each in submaps]
+    stays = resolve_seams(scaled)
+    parts = [_keep_gaussians(each, number, mask) for number, (each, mask) in enumerate(zip(scaled, stays, strict=True))]
+    together, cameras = concatenate_gaussians(parts), tuple(each.cameras for each in scaled)
     seamed = time.perf_counter()
     if len(submaps) > 1 or (most is not None and len(together) > most):
-        found = fitted(scaled, together, most=most)
+        found = fit_gaussians(scaled, together, most=most)
         together, cameras = found.gaussians, found.cameras
     source = together.source_frame
     shares = tuple(
-        Share(each.scene_id, len(each.gaussians), int(mask.sum()), int((source == number).sum()), len(each.cameras))
+        SubmapShare(
+            each.scene_id, len(each.gaussians), int(mask.sum()), int((source == number).sum()), len(each.cameras)
+        )
         for number, (each, mask) in enumerate(zip(scaled, stays, strict=True))
     )
     larger = smaller.inverse()
-    gaussians = viewer_safe(larger.gaussians(together))
+    gaussians = sanitize_gaussians(larger.transform_gaussians(together))
     seconds = {"seams": seamed - began, "fit": time.perf_counter() - seamed}
     shell = int((source == SHELL).sum())
-    return Merged(gaussians, _once(cameras, larger), shares, shell, _depths(submaps), seconds)
+    return MergedScene(gaussians, _deduplicate_cameras(cameras, larger), shares, shell, _depths(submaps), seconds)
 
 
-def _of_submap(submap: Submap, number: int, mask: npt.NDArray[np.bool_]) -> GaussianArrays:
+def _keep_gaussians(submap: Submap, number: int, mask: npt.NDArray[np.bool_]) -> GaussianArrays:
     """The Gaussians that stay, with the submap's number, or SHELL, as source frame."""
     source = np.where(submap.shell, SHELL, number).astype(np.int32)
-    return take(replace(submap.gaussians, source_frame=source), mask)
+    return select_gaussians(replace(submap.gaussians, source_frame=source), mask)
 
 
-def _placed(submap: Submap, placement: Placement) -> Submap:
-    moved = tuple(placement.camera(camera) for camera in submap.cameras)
-    return replace(submap, gaussians=placement.gaussians(submap.gaussians), cameras=moved)
+def _transform_submap(submap: Submap, placement: Placement) -> Submap:
+    moved = tuple(placement.transform_camera(camera) for camera in submap.cameras)
+    return replace(submap, gaussians=placement.transform_gaussians(submap.gaussians), cameras=moved)
 
 
 def _depth(submaps: Sequence[Submap]) -> float:
     """The median depth of what the cameras see, in the map's unit; 1 where they see nothing."""
-    pairs = [(take(each.gaussians, ~each.shell), camera) for each in submaps for camera in each.cameras]
+    pairs = [(select_gaussians(each.gaussians, ~each.shell), camera) for each in submaps for camera in each.cameras]
     chosen = np.linspace(0, len(pairs) - 1, min(_LOOKS, len(pairs))).round().astype(int)
     depths = []
     for gaussians, camera in (pairs[index] for index in chosen):
@@ -108,11 +110,13 @@ def _depth(submaps: Sequence[Submap]) -> float:
     return float(np.median(depths)) if depths else 1.0
 
 
-def _once(cameras: Sequence[Sequence[CameraEstimate]], placement: Placement) -> tuple[CameraEstimate, ...]:
+def _deduplicate_cameras(
+    cameras: Sequence[Sequence[CameraEstimate]], placement: Placement
+) -> tuple[CameraEstimate, ...]:
     """Every photograph's camera once, as its first submap has it, in the order of their frames."""
     found: dict[str, CameraEstimate] = {}
     for camera in (camera for each in cameras for camera in each):
-        found.setdefault(camera.name, replace(placement.camera(camera), bounds=None))
+        found.setdefault(camera.name, replace(placement.transform_camera(camera), bounds=None))
     return tuple(sorted(found.values(), key=lambda camera: camera.frame_id))
 
 

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.merging.regions import NOBODY, owners, regions
-from splatnode.recon.merging.sight import DepthView, Sight, depth_views, sight, surface_views
+from splatnode.recon.merging.sight import DepthView, PointVisibility, depth_views, measure_visibility, surface_views
 from splatnode.recon.merging.submap import Submap
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.export.quaternions import matrices_from_quats
 from splatnode.recon.result.snapshot import GaussianArrays
 
@@ -25,27 +25,29 @@ _BODY = (-1.5, 0.0, 1.5)  # standard deviations at which a Gaussian of a far she
 _WITNESSES = 2  # cameras of another submap that must look through a Gaussian before it counts as a veil
 
 
-def kept(submaps: Sequence[Submap]) -> tuple[Mask, ...]:
+def resolve_seams(submaps: Sequence[Submap]) -> tuple[Mask, ...]:
     """(N,) for each submap, which of its Gaussians stay."""
     if len(submaps) < 2:
         return tuple(np.ones(len(each.gaussians), bool) for each in submaps)
     views = [surface_views(each.gaussians, each.shell, each.cameras) for each in submaps]
     points = np.concatenate([each.gaussians.means for each in submaps])
-    seen = [sight(each, points) for each in views]
+    seen = [measure_visibility(each, points) for each in views]
     shell = np.concatenate([each.shell for each in submaps])
     mine = np.repeat(np.arange(len(submaps)), [len(each.gaussians) for each in submaps])
-    stays = shell | ~(_better_elsewhere(points, mine, seen))
-    stays &= ~_veils(mine, seen)
+    stays = shell | ~(_find_better_elsewhere(points, mine, seen))
+    stays &= ~_find_occluders(mine, seen)
     ends = np.cumsum([len(each.gaussians) for each in submaps])[:-1]
     left = np.split(stays, ends)
     for number, each in enumerate(submaps):
         for other, its_views in enumerate(views):
             if other != number:
-                left[number] &= ~_hanging(each.gaussians, each.shell & left[number], its_views)
-    return _without_near_shells(submaps, left)
+                left[number] &= ~_find_floaters(each.gaussians, each.shell & left[number], its_views)
+    return _remove_near_shells(submaps, left)
 
 
-def _better_elsewhere(points: npt.NDArray[np.floating], mine: npt.NDArray[np.intp], seen: Sequence[Sight]) -> Mask:
+def _find_better_elsewhere(
+    points: npt.NDArray[np.floating], mine: npt.NDArray[np.intp], seen: Sequence[PointVisibility]
+) -> Mask:
     """(M,) whether the region's owner is another submap, and has a surface at the point."""
     quality = np.stack([each.quality for each in seen], 1)
     owner = owners(regions(points, np.stack([each.resolution for each in seen], 1).max(1)), quality)
@@ -53,7 +55,7 @@ def _better_elsewhere(points: npt.NDArray[np.floating], mine: npt.NDArray[np.int
     return (owner != NOBODY) & (owner != mine) & (on[np.arange(len(points)), owner] > 0)
 
 
-def _veils(mine: npt.NDArray[np.intp], seen: Sequence[Sight]) -> Mask:
+def _find_occluders(mine: npt.NDArray[np.intp], seen: Sequence[PointVisibility]) -> Mask:
     """(M,) whether a Gaussian hangs before a surface of another submap which is better seen than it is itself."""
     own_on = np.stack([each.on for each in seen], 1)[np.arange(len(mine)), mine]
     own_quality = np.stack([each.quality for each in seen], 1)[np.arange(len(mine)), mine]
@@ -66,23 +68,25 @@ def _veils(mine: npt.NDArray[np.intp], seen: Sequence[Sight]) -> Mask:
     return found
 
 
-def _hanging(gaussians: GaussianArrays, which: Mask, views: Sequence[DepthView]) -> Mask:
+def _find_floaters(gaussians: GaussianArrays, which: Mask, views: Sequence[DepthView]) -> Mask:
     """(N,) whether a Gaussian of `which` (N,) hangs with any part before what one of the `views` has as its surface.
 
     It is for a far shell: that is large, and nobody has seen it, so one camera that looks through it is enough.
     """
     chosen = np.flatnonzero(which)
-    part = take(gaussians, chosen)
+    part = select_gaussians(gaussians, chosen)
     axes = matrices_from_quats(part.quats) * part.scales[:, None]  # (M, 3, 3), columns
     steps = np.array([[a, b, 0.0] for a in _BODY for b in _BODY])
     steps = np.take_along_axis(steps[None], np.argsort(np.argsort(-part.scales, 1), 1)[:, None], 2)  # (M, 9, 3)
     body = part.means[:, None] + steps @ axes.transpose(0, 2, 1)
     found = np.zeros(len(gaussians), bool)
-    found[chosen] = (sight(views, body.reshape(-1, 3)).before > 0).reshape(len(chosen), len(_BODY) ** 2).any(1)
+    found[chosen] = (
+        (measure_visibility(views, body.reshape(-1, 3)).before > 0).reshape(len(chosen), len(_BODY) ** 2).any(1)
+    )
     return found
 
 
-def _without_near_shells(submaps: Sequence[Submap], stays: Sequence[Mask]) -> tuple[Mask, ...]:
+def _remove_near_shells(submaps: Sequence[Submap], stays: Sequence[Mask]) -> tuple[Mask, ...]:
     """The masks without the shells' Gaussians that hang before what another submap shows behind them.
 
     One submap after the other, each judged by what is left of the others: two shells never drop each other.
@@ -93,6 +97,6 @@ def _without_near_shells(submaps: Sequence[Submap], stays: Sequence[Mask]) -> tu
             mine = each.shell & left[number]
             if other_number == number or not mine.any() or not (other.shell & left[other_number]).any():
                 continue
-            views = depth_views(take(other.gaussians, left[other_number]), other.cameras)
-            left[number] &= ~_hanging(each.gaussians, mine, views)
+            views = depth_views(select_gaussians(other.gaussians, left[other_number]), other.cameras)
+            left[number] &= ~_find_floaters(each.gaussians, mine, views)
     return tuple(left)

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import to_camera
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.geometry import transform_to_camera
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.rendering import NEAR, render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
@@ -32,8 +32,8 @@ class DepthView:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """What the cameras of one submap know of M points. Pixels are those of the cameras at modelled size."""
+class PointVisibility:
+    """The visibility of M points in the cameras of one submap. Pixels are those of the cameras at modelled size."""
 
     resolution: Array  # (M,) pixels a unit of length of the best camera that has the point on its surface, or 0
     on: npt.NDArray[np.int32]  # (M,) cameras that have the point on their surface
@@ -47,7 +47,7 @@ class Sight:
 
 
 def depth_views(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> tuple[DepthView, ...]:
-    """What the Gaussians show to each camera as a surface."""
+    """Renders the surface of the Gaussians in each camera."""
     return tuple(_depth_view(gaussians, camera) for camera in cameras)
 
 
@@ -55,16 +55,16 @@ def surface_views(
     gaussians: GaussianArrays, shell: npt.NDArray[np.bool_], cameras: Sequence[CameraEstimate]
 ) -> tuple[DepthView, ...]:
     """The same without the far shell, which is no surface."""
-    return depth_views(take(gaussians, ~shell), cameras)
+    return depth_views(select_gaussians(gaussians, ~shell), cameras)
 
 
-def sight(views: Sequence[DepthView], points: npt.NDArray[np.floating]) -> Sight:
-    """What all `views` together know of the world points (M, 3)."""
+def measure_visibility(views: Sequence[DepthView], points: npt.NDArray[np.floating]) -> PointVisibility:
+    """Measures the visibility of the world points (M, 3) in all `views` together."""
     count = len(points)
     resolution, veiled = np.zeros(count), np.zeros(count)
     on, before = np.zeros(count, np.int32), np.zeros(count, np.int32)
     for view in views:
-        index, depth, nearest, farthest = _looked_up(view, points)
+        index, depth, nearest, farthest = _look_up_depths(view, points)
         focal = float(view.camera.K[0, 0])
         here = (depth >= (1 - ALIKE) * nearest) & (depth <= (1 + ALIKE) * farthest)
         through = depth < (1 - BEFORE) * nearest
@@ -73,7 +73,7 @@ def sight(views: Sequence[DepthView], points: npt.NDArray[np.floating]) -> Sight
         before[index[through]] += 1
         resolution[index[here]] = np.maximum(resolution[index[here]], focal / depth[here])
         veiled[index[through]] = np.maximum(veiled[index[through]], focal / nearest[through])
-    return Sight(resolution, on, before, veiled)
+    return PointVisibility(resolution, on, before, veiled)
 
 
 def _depth_view(gaussians: GaussianArrays, camera: CameraEstimate) -> DepthView:
@@ -88,10 +88,12 @@ def _depth_view(gaussians: GaussianArrays, camera: CameraEstimate) -> DepthView:
     return DepthView(camera, np.asarray(eroded, np.float32), np.asarray(dilated, np.float32))
 
 
-def _looked_up(view: DepthView, points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.intp], Array, Array, Array]:
-    """Of the points (M, 3) that are inside the image: their indices, their depths, and between which the surface is."""
+def _look_up_depths(
+    view: DepthView, points: npt.NDArray[np.floating]
+) -> tuple[npt.NDArray[np.intp], Array, Array, Array]:
+    """Looks up the points (M, 3) inside the image: returns indices, depths, and the nearest and farthest surface."""
     camera = view.camera
-    local = to_camera(points.astype(np.float64), camera.T_world_camera)
+    local = transform_to_camera(points.astype(np.float64), camera.T_world_camera)
     ahead = np.flatnonzero(local[:, 2] > NEAR)
     x, y, z = local[ahead].T
     columns = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])

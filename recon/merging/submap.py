@@ -13,10 +13,10 @@ from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.shell import far_shell
+from splatnode.recon.result.shell import find_far_shell
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import SURE
-from splatnode.recon.result.whole import ScenePlace, Whole, WholeMap
+from splatnode.recon.result.whole import JoinedMap, MapSet, SubmapEntry
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +34,13 @@ class Submap:
 
 @dataclass(frozen=True, eq=False)
 class Submaps:
-    """What of a map can be merged, and why the rest cannot."""
+    """The submaps of a map that can be merged, and why the rest cannot."""
 
     used: tuple[Submap, ...]
     left_out: dict[str, str]  # scene_id: why
 
 
-def load_submaps(whole: Whole, of: WholeMap) -> Submaps:
+def load_submaps(whole: MapSet, of: JoinedMap) -> Submaps:
     """The scenes of a map that are final and published, in the order of places.json.
 
     Raises SceneFileError where a result is damaged, OSError where it cannot be read.
@@ -48,7 +48,7 @@ def load_submaps(whole: Whole, of: WholeMap) -> Submaps:
     used, left_out = [], {}
     for scene_id, placement in of.placements.items():
         place = whole.places[scene_id]
-        why = _why_not(place)
+        why = _explain_exclusion(place)
         if why:
             left_out[scene_id] = why
         else:
@@ -56,7 +56,7 @@ def load_submaps(whole: Whole, of: WholeMap) -> Submaps:
     return Submaps(tuple(used), left_out)
 
 
-def submap(
+def place_submap(
     scene_id: str,
     verdict: str,
     gaussians: GaussianArrays,
@@ -65,13 +65,13 @@ def submap(
     depths: Mapping[str, npt.NDArray[np.float16]] = MappingProxyType({}),
 ) -> Submap:
     """The scene, given in its own world, where `placement` puts it."""
-    shell = far_shell(gaussians, cameras)
-    moved = tuple(placement.camera(camera) for camera in cameras)
+    shell = find_far_shell(gaussians, cameras)
+    moved = tuple(placement.transform_camera(camera) for camera in cameras)
     farther = {name: (placement.scale * depth.astype(np.float32)).astype(np.float16) for name, depth in depths.items()}
-    return Submap(scene_id, verdict, placement.gaussians(gaussians), moved, shell, farther)
+    return Submap(scene_id, verdict, placement.transform_gaussians(gaussians), moved, shell, farther)
 
 
-def _why_not(place: ScenePlace) -> str:
+def _explain_exclusion(place: SubmapEntry) -> str:
     if place.folder is None or not place.publishable:
         return f"it has no result: {place.verdict}"
     if place.provisional:
@@ -81,12 +81,12 @@ def _why_not(place: ScenePlace) -> str:
     return ""
 
 
-def _load(place: ScenePlace, placement: Placement) -> Submap:
+def _load(place: SubmapEntry, placement: Placement) -> Submap:
     assert place.folder is not None  # `_why_not` has seen to it
-    result = StoredResult.at(place.folder)
+    result = StoredResult.create_from_path(place.folder)
     try:
         sure = place.verdict in {code.value for code in SURE}
         depths = read_depths(place.folder) if sure else {}
-        return submap(place.scene_id, place.verdict, result.gaussians(), result.cameras(), placement, depths)
+        return place_submap(place.scene_id, place.verdict, result.gaussians(), result.cameras(), placement, depths)
     except SceneFileError as error:
         raise SceneFileError(f"{place.folder}: {error}") from error

@@ -6,15 +6,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.process.lengths import measured, measured_argument
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.lengths import measurement_argument, parse_measurement
+from splatnode.capture.process.printable import sanitize_text
 
 
 def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:
-    """Of all recordings alike: for many, too."""
+    """Adds the option --marker, which applies to many recordings alike."""
     return parser.add_argument(
         "--marker",
-        type=measured_argument,
+        type=measurement_argument,
         metavar="LENGTH[@SIGMA]",
         help="look for printed markers (splatnode marker) whose black square has this side, as 100mm, and take the "
         "metres from them; @0.2mm: you measured it to that (standard deviation; default: 0.5mm)",
@@ -42,7 +42,7 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--poses-sigma",
-        type=_two_sigmas,
+        type=_parse_two_sigmas,
         metavar="METRES,DEGREES",
         help="how unsure each pose is: the standard deviation of its position and of its orientation, absolute in the "
         "poses' world. With a lens that is told (--intrinsics) the poses then hold the cameras, also where photographs "
@@ -65,21 +65,21 @@ def add_stereo(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--stereo-baseline",
-        type=measured_argument,
+        type=measurement_argument,
         metavar="LENGTH[@SIGMA]",
         help="how far apart the two cameras of the pairs are, as 75mm; @0.1mm: you know it to that (standard "
         "deviation; default: 0.3mm)",
     )
 
 
-def _two_sigmas(text: str) -> tuple[float, float]:
+def _parse_two_sigmas(text: str) -> tuple[float, float]:
     try:
         metres, degrees = map(float, text.split(","))
     except ValueError:
         metres = degrees = 0.0
     if not (0.0 < metres <= 1e6 and 0.0 < degrees <= 180.0):
         raise argparse.ArgumentTypeError(
-            f"must be metres and degrees above 0 with a comma between them, as 0.01,2; got {printable(text, 100)!r}"
+            f"must be metres and degrees above 0 with a comma between them, as 0.01,2; got {sanitize_text(text, 100)!r}"
         )
     return metres, degrees
 
@@ -89,17 +89,17 @@ def trusts_poses(args: argparse.Namespace) -> bool:
     return args.poses_sigma is not None and not args.poses_only_check
 
 
-def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
-    """What of the configuration's `metric` these arguments set. Raises ValueError."""
+def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
+    """Collects the changes of the configuration's `metric` that these arguments set. Raises ValueError."""
     changes: dict[str, Any] = {}
     if args.baseline is not None:
-        first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
+        first, *further = ([*names, _parse_metres(metres)] for *names, metres in args.baseline)
         changes |= {"baseline": first, "further_baselines": further}
-    changes |= marker_changes(args)
+    changes |= collect_marker_changes(args)
     if (args.stereo is None) != (args.stereo_baseline is None):
         raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
     if args.stereo_baseline is not None:
-        changes |= _measured("stereo", args.stereo_baseline)
+        changes |= _parse_length("stereo", args.stereo_baseline)
     if args.poses_sigma is not None and args.poses is None:
         raise ValueError("--poses-sigma is of --poses FILE, which is not given: how unsure are which poses?")
     if args.poses_only_check and args.poses is None:
@@ -109,17 +109,17 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     return changes
 
 
-def marker_changes(args: argparse.Namespace) -> dict[str, float]:
-    """What of it the marker's argument alone sets. Raises ValueError."""
-    return {} if args.marker is None else _measured("marker", args.marker)
+def collect_marker_changes(args: argparse.Namespace) -> dict[str, float]:
+    """Collects the changes that --marker alone sets. Raises ValueError."""
+    return {} if args.marker is None else _parse_length("marker", args.marker)
 
 
-def _measured(what: str, text: str) -> dict[str, float]:
-    length_m, sigma_m = measured(text)
+def _parse_length(what: str, text: str) -> dict[str, float]:
+    length_m, sigma_m = parse_measurement(text)
     return {f"{what}_m": length_m} | ({} if sigma_m is None else {f"{what}_sigma_m": sigma_m})
 
 
-def _metres(text: str) -> float:
+def _parse_metres(text: str) -> float:
     try:
         return float(text)
     except ValueError as error:

@@ -13,14 +13,14 @@ _LARGEST_MARKER = 100.0  # metres
 
 
 class Baseline(NamedTuple):
-    """What was measured: the distance of two cameras."""
+    """A measured distance between two cameras."""
 
     first: str  # photograph
     second: str
     metres: float
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     baseline: Baseline | None = None  # two photographs and the metres between their cameras
     further_baselines: tuple[Baseline, ...] = ()  # more of them: they make the scale surer, and check one another
     # Standard deviation of each measured distance, as a share of it

@@ -12,7 +12,9 @@ from splatnode.recon.metric.measurement import TWO_SIDED_95, Measurement
 from splatnode.recon.result.snapshot import CameraEstimate
 
 
-def by_distance(cameras: Sequence[CameraEstimate], baseline: Baseline, sigma: float) -> Measurement | str:
+def estimate_scale_from_distance(
+    cameras: Sequence[CameraEstimate], baseline: Baseline, sigma: float
+) -> Measurement | str:
     """The unit, or a sentence why these cameras do not give it.
 
     `sigma` is the standard deviation of the measured distance, as a share of it. To its error comes that of the

@@ -12,26 +12,26 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
 from splatnode.capture.motion import Motion
-from splatnode.capture.process.progress import Step, Tell, told_to_nobody
-from splatnode.recon.metric.config import Config
-from splatnode.recon.metric.marker_detection import Sighting, sightings
-from splatnode.recon.metric.stereo_pairs import Pair, pair_with
+from splatnode.capture.process.progress import ProgressStep, Tell, ignore_progress
+from splatnode.recon.metric.config import MetricConfig
+from splatnode.recon.metric.marker_detection import MarkerDetection, detect_markers
+from splatnode.recon.metric.stereo_pairs import StereoPair, make_own_pair
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was found in photographs, whatever becomes of them."""
+    """The scale evidence found in images, whether or not they get cameras."""
 
-    sightings: tuple[Sighting, ...] = ()  # of printed markers
+    sightings: tuple[MarkerDetection, ...] = ()  # of printed markers
     # T_world_camera (4, 4) in metres that others estimated, by photograph; None: no poses were given
     poses: Mapping[str, npt.NDArray[np.float64]] | None = None
-    pairs: tuple[Pair, ...] = ()  # of stereo cameras
+    pairs: tuple[StereoPair, ...] = ()  # of stereo cameras
     tracked: Mapping[str, GivenPose] = field(default_factory=dict)  # that came with the photographs, by photograph
     motions: Mapping[str, Motion] = field(default_factory=dict)  # likewise
     gravities: Mapping[str, Gravity] = field(default_factory=dict)  # likewise
 
-    def and_also(self, further: Evidence) -> Evidence:
-        """With what further photographs tell."""
+    def merge(self, further: Evidence) -> Evidence:
+        """Returns this evidence merged with that of further images."""
         poses = self.poses if further.poses is None else {**(self.poses or {}), **further.poses}
         sightings, pairs = (*self.sightings, *further.sightings), (*self.pairs, *further.pairs)
         tracked, motions = {**self.tracked, **further.tracked}, {**self.motions, **further.motions}
@@ -41,8 +41,10 @@ class Evidence:
 NOTHING = Evidence()
 
 
-def gathered(frames: Iterable[Frame | DroppedFrame], config: Config, tell: Tell = told_to_nobody) -> Evidence:
-    """What the frames tell of what `config` asks for, and what came with them: poses, motions, gravity, right images.
+def gather_evidence(
+    frames: Iterable[Frame | DroppedFrame], config: MetricConfig, tell: Tell = ignore_progress
+) -> Evidence:
+    """Gathers the markers that `config` asks for, and the poses, motions, gravity and right images.
 
     Raises ValueError where intrinsics cannot be used.
     """
@@ -51,9 +53,9 @@ def gathered(frames: Iterable[Frame | DroppedFrame], config: Config, tell: Tell 
         tracked={each.name: each.given_pose for each in known if each.given_pose is not None},
         motions={each.name: each.motion for each in known if each.motion is not None},
         gravities={each.name: each.gravity for each in known if each.gravity is not None},
-        pairs=tuple(pair for pair in map(pair_with, known) if pair is not None),
+        pairs=tuple(pair for pair in map(make_own_pair, known) if pair is not None),
     )
     if config.marker_m is None:
         return came
-    tell(Step("looking for markers"))
-    return replace(came, sightings=tuple(sightings(known, config.marker_dictionary)))
+    tell(ProgressStep("looking for markers"))
+    return replace(came, sightings=tuple(detect_markers(known, config.marker_dictionary)))

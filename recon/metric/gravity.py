@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.gravity import Gravity
-from splatnode.recon.metric.views import View
+from splatnode.recon.metric.views import MetricView
 from splatnode.recon.result.up import Up
 
 Array = npt.NDArray[np.float64]
@@ -20,7 +20,7 @@ _SHARED_DEG = 0.5  # standard deviation of an error that all have alike: how the
 _ROUNDS = 10
 
 
-def by_gravity(views: Mapping[str, View], gravities: Mapping[str, Gravity]) -> Up | None:
+def estimate_up(views: Mapping[str, MetricView], gravities: Mapping[str, Gravity]) -> Up | None:
     """Up in the world of the cameras; None where nothing was said, or less than 60 % of it agrees.
 
     The source names the photographs whose gravity was left out because it does not fit the others.
@@ -30,10 +30,10 @@ def by_gravity(views: Mapping[str, View], gravities: Mapping[str, Gravity]) -> U
         return None
     ups = np.stack([-views[name].T_world_camera[:3, :3] @ gravities[name].direction for name in names])
     sigmas = np.array([gravities[name].sigma_deg for name in names])
-    up = ups[np.argmin([_truncated(ups, sigmas, each) for each in ups])]
+    up = ups[np.argmin([_compute_truncated_cost(ups, sigmas, each) for each in ups])]
     kept = np.zeros(len(names), bool)
     for _ in range(_ROUNDS):
-        fits = _off_deg(ups, up) < _FARTHEST * np.hypot(sigmas, _SHARED_DEG)
+        fits = _compute_angles_deg(ups, up) < _FARTHEST * np.hypot(sigmas, _SHARED_DEG)
         if not fits.any() or (fits == kept).all():
             break
         kept = fits
@@ -41,7 +41,9 @@ def by_gravity(views: Mapping[str, View], gravities: Mapping[str, Gravity]) -> U
         up = mean / np.linalg.norm(mean)
     if kept.sum() < math.ceil(_LEAST_FITTING * len(names)):
         return None
-    wider = max(1.0, float(((_off_deg(ups[kept], up) / sigmas[kept]) ** 2).sum()) / max(2 * int(kept.sum()) - 2, 1))
+    wider = max(
+        1.0, float(((_compute_angles_deg(ups[kept], up) / sigmas[kept]) ** 2).sum()) / max(2 * int(kept.sum()) - 2, 1)
+    )
     sigma = math.hypot(math.sqrt(wider / float((sigmas[kept] ** -2.0).sum())), _SHARED_DEG)
     x, y, z = up.tolist()
     return Up((x, y, z), sigma, _source(names, kept))
@@ -53,9 +55,9 @@ def _source(names: list[str], kept: npt.NDArray[np.bool_]) -> str:
     return f"{said}; that of {', '.join(left_out)} was left out: it does not fit the others" if left_out else said
 
 
-def _truncated(ups: Array, sigmas: Array, up: Array) -> float:
-    return float(np.minimum((_off_deg(ups, up) / sigmas) ** 2, _FARTHEST**2).sum())
+def _compute_truncated_cost(ups: Array, sigmas: Array, up: Array) -> float:
+    return float(np.minimum((_compute_angles_deg(ups, up) / sigmas) ** 2, _FARTHEST**2).sum())
 
 
-def _off_deg(ups: Array, up: Array) -> Array:
+def _compute_angles_deg(ups: Array, up: Array) -> Array:
     return np.degrees(np.arctan2(np.linalg.norm(np.cross(ups, up), axis=1), ups @ up))

@@ -37,7 +37,7 @@ class Corners:
     correlation: float  # of the picture with the marker as it must look, -1 to 1
 
 
-def fitted(picture: Grey, bits: npt.NDArray[np.bool_], corners: Array) -> Corners | None:
+def refine_corners(picture: Grey, bits: npt.NDArray[np.bool_], corners: Array) -> Corners | None:
     """The corners near `corners` (4, 2); None where the marker or the white around it is partly outside the picture.
 
     `bits` (B, B) are True where the marker is white, its black border included.
@@ -51,7 +51,7 @@ def fitted(picture: Grey, bits: npt.NDArray[np.bool_], corners: Array) -> Corner
     patch = picture[top : top + height * shrink, left : left + width * shrink]
     patch = np.asarray(cv2.resize(patch, (width, height), interpolation=cv2.INTER_AREA), np.float32)
     within = (corners - (left, top)) / shrink
-    moved, covariance, correlation = _adjusted(patch, bits, within)
+    moved, covariance, correlation = _fit_corners(patch, bits, within)
     return Corners(shrink * moved + (left, top), shrink**2 * covariance, correlation)
 
 
@@ -64,10 +64,10 @@ def _window(corners: Array, around: float, shrink: int, shape: tuple[int, ...]) 
     return int(least[0]), int(least[1]), int(size[0]), int(size[1])
 
 
-def _adjusted(patch: Grey, bits: npt.NDArray[np.bool_], start: Array) -> tuple[Array, Array, float]:
+def _fit_corners(patch: Grey, bits: npt.NDArray[np.bool_], start: Array) -> tuple[Array, Array, float]:
     """Corners (4, 2), their covariance (8, 8), and the correlation: Gauss-Newton with halved steps."""
     texture, per_bit = _texture(bits, start)
-    used = _used(start, len(bits), patch.shape)
+    used = _mask_used_pixels(start, len(bits), patch.shape)
     before: Array = np.array([*start.ravel(), np.log(_FIRST_BLUR_PX), 0.0])
     held = np.array([*[0.0] * 8, 1.0, 1.0]) / _LOG_SIGMA  # blur and mixing, by their prior
 
@@ -117,7 +117,7 @@ def _texture(bits: npt.NDArray[np.bool_], corners: Array) -> tuple[Grey, int]:
     return np.kron(np.pad(bits, 1, constant_values=True), np.ones((per_bit, per_bit))).astype(np.float32), per_bit
 
 
-def _used(corners: Array, bits: int, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
+def _mask_used_pixels(corners: Array, bits: int, shape: tuple[int, ...]) -> npt.NDArray[np.bool_]:
     """(h, w) the pixels in the marker and in the white around it."""
     grown = corners.mean(0) + (corners - corners.mean(0)) * (1.0 + 2.0 * _MARGIN / bits)
     inside = np.zeros(shape, np.uint8)

@@ -25,11 +25,11 @@ class Measurement:
 
     @property
     def interval_95(self) -> tuple[float, float]:
-        """What a length that is stated in metres is to be multiplied by, at least and at most: 95 %."""
+        """The 95 % interval of the factor from a stated length in metres to the true one."""
         return math.exp(-TWO_SIDED_95 * self.sigma), math.exp(TWO_SIDED_95 * self.sigma)
 
 
-def together(measurements: Sequence[Measurement]) -> Measurement | str:
+def combine_measurements(measurements: Sequence[Measurement]) -> Measurement | str:
     """The mean of logarithms, each weighed by the inverse of its variance; of one source, that source.
 
     Where two sources contradict each other there is no mean, but a sentence that names the two that do most. Which of
@@ -39,12 +39,12 @@ def together(measurements: Sequence[Measurement]) -> Measurement | str:
         raise ValueError("the unit must have a source, got none")
     if len(measurements) == 1:
         return measurements[0]
-    first, second = max(combinations(measurements, 2), key=lambda pair: _deviation(*pair))
-    if _deviation(first, second) > MAX_DEVIATION:
+    first, second = max(combinations(measurements, 2), key=lambda pair: _compute_deviation(*pair))
+    if _compute_deviation(first, second) > MAX_DEVIATION:
         ratio = max(first.metres_per_unit, second.metres_per_unit) / min(first.metres_per_unit, second.metres_per_unit)
         return (
             f"{first.source}, contradicts {second.source}: the scales differ by {100 * (ratio - 1):.2g} %, which is "
-            f"{_deviation(first, second):.2g} standard deviations; measure both again"
+            f"{_compute_deviation(first, second):.2g} standard deviations; measure both again"
         )
     weights = [each.sigma**-2 for each in measurements]
     logs = [math.log(each.metres_per_unit) for each in measurements]
@@ -52,7 +52,7 @@ def together(measurements: Sequence[Measurement]) -> Measurement | str:
     return Measurement(math.exp(mean), sum(weights) ** -0.5, "; ".join(each.source for each in measurements))
 
 
-def _deviation(first: Measurement, second: Measurement) -> float:
+def _compute_deviation(first: Measurement, second: Measurement) -> float:
     """How many standard deviations of their difference two sources are apart."""
     difference = math.log(first.metres_per_unit) - math.log(second.metres_per_unit)
     return abs(difference) / math.hypot(first.sigma, second.sigma)

@@ -8,101 +8,107 @@ import numpy as np
 
 from splatnode.capture.process.printable import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.metric.config import Config
-from splatnode.recon.metric.distances import by_distance
+from splatnode.recon.metric.config import MetricConfig
+from splatnode.recon.metric.distances import estimate_scale_from_distance
 from splatnode.recon.metric.evidence import NOTHING, Evidence
-from splatnode.recon.metric.gravity import by_gravity
-from splatnode.recon.metric.markers import by_markers
-from splatnode.recon.metric.measurement import Measurement, together
-from splatnode.recon.metric.motions import by_motions
-from splatnode.recon.metric.network import MetricDepth, by_network
-from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
-from splatnode.recon.metric.stereo import by_stereo
-from splatnode.recon.metric.stereo_pairs import Pair
-from splatnode.recon.metric.views import views_of
+from splatnode.recon.metric.gravity import estimate_up
+from splatnode.recon.metric.markers import estimate_scale_from_markers
+from splatnode.recon.metric.measurement import Measurement, combine_measurements
+from splatnode.recon.metric.motions import estimate_scale_from_motions
+from splatnode.recon.metric.network import MetricDepth, estimate_scale_from_network
+from splatnode.recon.metric.poses import PoseAlignment, PoseSigmas, align_to_poses
+from splatnode.recon.metric.stereo import estimate_scale_from_stereo
+from splatnode.recon.metric.stereo_pairs import StereoPair
+from splatnode.recon.metric.views import make_metric_views
 from splatnode.recon.networks.depth_anything import load_metric
-from splatnode.recon.result.bounds_in_words import rounded_up
+from splatnode.recon.result.bounds_in_words import format_rounded_up
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.scale import Scale, sentences
+from splatnode.recon.result.scale import Scale, join_sentences
 from splatnode.recon.result.snapshot import InGivenWorld, Snapshot
 
 # Of the scene's size: a grid as coarse as its coordinates may be. A render then has 40 dB against the same elsewhere.
 MOST_STEP = 1e-3
 
 
-def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) -> Snapshot:
+def apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evidence = NOTHING) -> Snapshot:
     """The snapshot with lengths in metres where `config` gives them a unit; as it is where nothing was asked for.
 
     `evidence` is what its photographs tell of what `config` asks for. A source that can say nothing is left out where
     another can. Where sources contradict each other the scene stays relative. Where poses are among what counts, the
     world is theirs. Gravity, where it came with photographs, tells where up is.
     """
-    measured = _in_metres(snapshot, config, evidence)
-    up = by_gravity(views_of(measured), evidence.gravities)
+    measured = _apply_metric_scale(snapshot, config, evidence)
+    up = estimate_up(make_metric_views(measured), evidence.gravities)
     return measured if up is None else replace(measured, up=up)
 
 
-def _in_metres(snapshot: Snapshot, config: Config, evidence: Evidence) -> Snapshot:
-    said, aligned = _said(snapshot, config, evidence) if len(snapshot.cameras) else ([], None)
+def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Snapshot:
+    said, aligned = _collect_measurements(snapshot, config, evidence) if len(snapshot.cameras) else ([], None)
     if not said:
         return snapshot
     measurements = [each for each in said if isinstance(each, Measurement)]
     silent = [each for each in said if isinstance(each, str)]
-    agreed = together(measurements) if measurements else sentences(silent)
+    agreed = combine_measurements(measurements) if measurements else join_sentences(silent)
     if isinstance(agreed, str):
         return replace(snapshot, scale=Scale(False, agreed))
     low, high = agreed.interval_95
-    known = sentences([each.source for each in measurements], LONGEST_TEXT // 2)
-    source = sentences([f"{known}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
+    known = join_sentences([each.source for each in measurements], LONGEST_TEXT // 2)
+    source = join_sentences([f"{known}, known to {format_rounded_up(100 * (high - 1.0))} %", *silent])
     unit = agreed.metres_per_unit
-    to_metres = Similarity(unit, np.eye(3), np.zeros(3)) if aligned is None else aligned.placed(unit)
-    metric = _placed(snapshot, to_metres)
+    to_metres = Similarity(unit, np.eye(3), np.zeros(3)) if aligned is None else aligned.rescale(unit)
+    metric = _transform_snapshot(snapshot, to_metres)
     return replace(metric, scale=Scale(True, source, (low, high)))
 
 
-def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[Measurement | str], Aligned | None]:
-    """What each source says, or why it says nothing; and where given poses place the scene."""
+def _collect_measurements(
+    snapshot: Snapshot, config: MetricConfig, evidence: Evidence
+) -> tuple[list[Measurement | str], PoseAlignment | None]:
+    """Collects what each scale source measures, or why it cannot; and the alignment to given poses."""
     said: list[Measurement | str] = [
-        by_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines
+        estimate_scale_from_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines
     ]
     if config.marker_m is not None:
-        said += by_markers(views_of(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m)
+        said += estimate_scale_from_markers(
+            make_metric_views(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m
+        )
     aligned = None
     if snapshot.given is not None:
-        found = _by_held(snapshot, snapshot.given)
+        found = _align_to_given_world(snapshot, snapshot.given)
         aligned = None if isinstance(found, str) else found
         said.append(found if isinstance(found, str) else found.unit)
     elif evidence.poses is not None or evidence.tracked:
         given = evidence.poses or {}  # which are meant where the photographs came with others
         tracked = {name: pose for name, pose in evidence.tracked.items() if name not in given}
         poses = {**{name: pose.matrix for name, pose in tracked.items()}, **given}
-        sigmas = Sigmas(config.poses_sigma_m, config.poses_sigma_deg, config.poses_drift)
+        sigmas = PoseSigmas(config.poses_sigma_m, config.poses_sigma_deg, config.poses_drift)
         own = {name: (pose.sigma_m, pose.sigma_deg) for name, pose in tracked.items()}
-        found = by_poses(views_of(snapshot), poses, sigmas, own)
-        if isinstance(found, Aligned) and (offset := _too_far(snapshot, found)):
+        found = align_to_poses(make_metric_views(snapshot), poses, sigmas, own)
+        if isinstance(found, PoseAlignment) and (offset := _explain_too_far(snapshot, found)):
             found = offset
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
-    said += by_motions(views_of(snapshot), evidence.motions, config.motions_shared)
-    for (baseline_m, sigma_m), pairs in _rigs(config, evidence).items():
-        said.append(by_stereo(views_of(snapshot), snapshot.landmarks, pairs, baseline_m, sigma_m))
+    said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.motions_shared)
+    for (baseline_m, sigma_m), pairs in _group_stereo_pairs(config, evidence).items():
+        said.append(
+            estimate_scale_from_stereo(make_metric_views(snapshot), snapshot.landmarks, pairs, baseline_m, sigma_m)
+        )
     if config.network:
-        said.append(_by_the_network(snapshot, config.network_sigma))
+        said.append(_estimate_scale_from_network(snapshot, config.network_sigma))
     return said, aligned
 
 
-def _by_held(snapshot: Snapshot, given: InGivenWorld) -> Aligned | str:
-    """What the poses that hold the cameras tell: the world that these are in already, but for its unit and place."""
+def _align_to_given_world(snapshot: Snapshot, given: InGivenWorld) -> PoseAlignment | str:
+    """Aligns to the poses that hold the cameras, whose world these are in already, but for its unit and place."""
     to_world = Similarity(given.scale, given.rotation, given.translation)
     centre = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras]).mean(0)
     unit = Measurement(
         given.scale, given.scale_sigma, f"poses of {given.num_poses} photographs, which hold the cameras"
     )
-    aligned = Aligned(unit, to_world, centre, ())
-    return _too_far(snapshot, aligned) or aligned
+    aligned = PoseAlignment(unit, to_world, centre, ())
+    return _explain_too_far(snapshot, aligned) or aligned
 
 
-def _too_far(snapshot: Snapshot, aligned: Aligned) -> str:
+def _explain_too_far(snapshot: Snapshot, aligned: PoseAlignment) -> str:
     """Why the world of the poses cannot be the scene's: its origin is too far away, as in a map of a country.
 
     Empty where it can. A coordinate of a Gaussian has 24 bits: so far out the scene would stand on a coarse grid.
@@ -121,10 +127,10 @@ def _too_far(snapshot: Snapshot, aligned: Aligned) -> str:
     )
 
 
-def _rigs(config: Config, evidence: Evidence) -> dict[tuple[float, float], list[Pair]]:
+def _group_stereo_pairs(config: MetricConfig, evidence: Evidence) -> dict[tuple[float, float], list[StereoPair]]:
     """The stereo pairs by how far apart their cameras are, and its standard deviation, metres."""
     usual = None if config.stereo_m is None else (config.stereo_m, config.stereo_sigma_m)
-    rigs: dict[tuple[float, float], list[Pair]] = {} if usual is None else {usual: []}
+    rigs: dict[tuple[float, float], list[StereoPair]] = {} if usual is None else {usual: []}
     for pair in evidence.pairs:
         own = usual if pair.baseline is None else (pair.baseline.metres, pair.baseline.sigma_m)
         if own is not None:
@@ -132,21 +138,21 @@ def _rigs(config: Config, evidence: Evidence) -> dict[tuple[float, float], list[
     return rigs
 
 
-def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:
+def _estimate_scale_from_network(snapshot: Snapshot, sigma: float) -> Measurement | str:
     loaded = load_metric()
     if loaded is None:
         return "no weights of the metric network: splatnode weights list tells where they are had"
-    return by_network(snapshot, MetricDepth(loaded.name, loaded), sigma)
+    return estimate_scale_from_network(snapshot, MetricDepth(loaded.name, loaded), sigma)
 
 
-def _placed(snapshot: Snapshot, by: Similarity) -> Snapshot:
+def _transform_snapshot(snapshot: Snapshot, by: Similarity) -> Snapshot:
     """The snapshot, with all lengths in it, in the world that `by` leads to, in metres."""
     placement, factor = Placement(by.scale, by.rotation, by.translation), np.float32(by.scale)
-    landmarks = snapshot.landmarks and snapshot.landmarks.moved(by.scale, by.rotation, by.translation, metric=True)
+    landmarks = snapshot.landmarks and snapshot.landmarks.transform(by.scale, by.rotation, by.translation, metric=True)
     return replace(
         snapshot,
-        cameras=tuple(map(placement.camera, snapshot.cameras)),
-        gaussians=placement.gaussians(snapshot.gaussians),
+        cameras=tuple(map(placement.transform_camera, snapshot.cameras)),
+        gaussians=placement.transform_gaussians(snapshot.gaussians),
         landmarks=landmarks,
         given=None,
         depths={name: (depth * factor).astype(np.float16) for name, depth in snapshot.depths.items()},

@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 from splatnode.capture.motion import Motion
 from splatnode.recon.geometry import angles_deg
 from splatnode.recon.metric.measurement import TWO_SIDED_95, Measurement
-from splatnode.recon.metric.views import View
+from splatnode.recon.metric.views import MetricView
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -32,7 +32,7 @@ _ROUNDS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class _MotionSteps:
     """Motions between neighbouring cameras of the scene, each in the frame of its first camera."""
 
     names: tuple[tuple[str, str], ...]
@@ -43,7 +43,7 @@ class _Steps:
     sigma_deg: Array  # (K,) about each axis
     bounds: Array  # (K,) standard deviation of `scene`, in each direction
 
-    def normalised(self, scale: float) -> Array:
+    def normalize_errors(self, scale: float) -> Array:
         """(K, 3) the errors over their standard deviations: along the motion, and twice across it."""
         off = scale * self.scene - self.given
         length = np.linalg.norm(self.given, axis=1)
@@ -54,35 +54,37 @@ class _Steps:
         turned = np.hypot(sigma, np.radians(np.hypot(self.sigma_deg, _LEAST_DEG)) * length)
         return np.column_stack([along / sigma, np.linalg.norm(across, axis=1) / turned])
 
-    def fits(self, scale: float) -> Mask:
-        near = np.linalg.norm(self.normalised(scale), axis=1) < _FARTHEST
+    def find_fitting(self, scale: float) -> Mask:
+        near = np.linalg.norm(self.normalize_errors(scale), axis=1) < _FARTHEST
         return near & (self.turned_deg < _FARTHEST * np.hypot(self.sigma_deg, _LEAST_DEG))
 
     def cost(self, scale: float, kept: Mask) -> float:
-        return float((self.normalised(scale)[kept] ** 2).sum())
+        return float((self.normalize_errors(scale)[kept] ** 2).sum())
 
 
-def by_motions(views: Mapping[str, View], motions: Mapping[str, Motion], shared: float) -> list[Measurement | str]:
-    """What motions tell of the unit, and a sentence for each that was left out; or one why they tell nothing.
+def estimate_scale_from_motions(
+    views: Mapping[str, MetricView], motions: Mapping[str, Motion], shared: float
+) -> list[Measurement | str]:
+    """Estimates the scale, with a sentence for each motion that was left out; else one on why not.
 
     `views` are in the order of the way. `shared` is the standard deviation of an error that all motions have alike, as
     a share of their length. Nothing of motions that all are the first of their chain.
     """
     if not any(motion.sigma_m for motion in motions.values()):
         return []
-    steps = _steps(views, motions)
+    steps = _collect_steps(views, motions)
     if steps is None:
         return ["motions were given, and none of them is between two cameras of the scene that follow one another"]
     count = len(steps.names)
-    scale, kept = _agreed(steps)
+    scale, kept = _find_consensus(steps)
     if kept.sum() < max(1, math.ceil(_LEAST_FITTING * count)):
         return [
-            f"motions between {_pairs(count)} were given, of which no more than {kept.sum()} fit the cameras of the "
+            f"motions between {_format_pair_count(count)} were given, of which no more than {kept.sum()} fit the cameras of the "
             "scene: are they of the camera, with x right, y down and z forward, and in metres?"
         ]
-    sigma = _sigma(steps, scale, kept)
+    sigma = _estimate_sigma(steps, scale, kept)
     if sigma > _LEAST_KNOWN:
-        return [f"motions between {_pairs(count)} were given, which are not longer than they are unsure"]
+        return [f"motions between {_format_pair_count(count)} were given, which are not longer than they are unsure"]
     off = np.linalg.norm(scale * steps.scene - steps.given, axis=1)
     told = [
         f"the motion from {first} to {second} was left out: it is {off[i]:.2g} m and {steps.turned_deg[i]:.2g} degrees "
@@ -90,15 +92,15 @@ def by_motions(views: Mapping[str, View], motions: Mapping[str, Motion], shared:
         for i, (first, second) in enumerate(steps.names)
         if not kept[i]
     ]
-    unit = Measurement(scale, math.hypot(sigma, shared), f"motions between {_pairs(int(kept.sum()))}")
+    unit = Measurement(scale, math.hypot(sigma, shared), f"motions between {_format_pair_count(int(kept.sum()))}")
     return [unit, *told]
 
 
-def _pairs(count: int) -> str:
+def _format_pair_count(count: int) -> str:
     return "one pair of photographs" if count == 1 else f"{count} pairs of photographs"
 
 
-def _steps(views: Mapping[str, View], motions: Mapping[str, Motion]) -> _Steps | None:
+def _collect_steps(views: Mapping[str, MetricView], motions: Mapping[str, Motion]) -> _MotionSteps | None:
     known = [name for name in views if name in motions]
     pairs = [(a, b) for a, b in pairwise(known) if _follows(motions[a], motions[b])]
     if not pairs:
@@ -107,7 +109,7 @@ def _steps(views: Mapping[str, View], motions: Mapping[str, Motion]) -> _Steps |
     firsts, seconds = ([motions[pair[i]] for pair in pairs] for i in (0, 1))
     of_scene = np.stack([_relative(a.T_world_camera, b.T_world_camera) for a, b in zip(one, other, strict=True)])
     given = np.stack([_relative(a.matrix, b.matrix) for a, b in zip(firsts, seconds, strict=True)])
-    return _Steps(
+    return _MotionSteps(
         names=tuple(pairs),
         scene=of_scene[:, :3, 3],
         given=given[:, :3, 3],
@@ -128,7 +130,7 @@ def _relative(first: Array, second: Array) -> Array:
     return np.linalg.inv(first) @ second
 
 
-def _agreed(steps: _Steps) -> tuple[float, Mask]:
+def _find_consensus(steps: _MotionSteps) -> tuple[float, Mask]:
     """The unit that most motions agree on, and which do: first by that of each of them, then by all that fit."""
     lengths = np.linalg.norm(steps.scene, axis=1), np.linalg.norm(steps.given, axis=1)
     moved = (lengths[0] > 0) & (lengths[1] > 0)
@@ -137,22 +139,22 @@ def _agreed(steps: _Steps) -> tuple[float, Mask]:
         return 1.0, np.zeros(len(steps.names), bool)
 
     def cost(scale: float) -> float:
-        return float(np.minimum((steps.normalised(scale) ** 2).sum(1), _FARTHEST**2).sum())
+        return float(np.minimum((steps.normalize_errors(scale) ** 2).sum(1), _FARTHEST**2).sum())
 
     scale = min(proposals, key=cost)
-    kept = steps.fits(scale)
+    kept = steps.find_fitting(scale)
     for _ in range(_ROUNDS):
         if not kept.any():
             break
-        scale = _best(steps, scale, kept)
-        now = steps.fits(scale)
+        scale = _minimize_cost(steps, scale, kept)
+        now = steps.find_fitting(scale)
         if (now == kept).all():
             break
         kept = now
     return scale, kept
 
 
-def _best(steps: _Steps, near: float, kept: Mask) -> float:
+def _minimize_cost(steps: _MotionSteps, near: float, kept: Mask) -> float:
     """The unit with the least squares, errors of the cameras counted like those of the motions."""
 
     def cost(log: float) -> float:
@@ -163,7 +165,7 @@ def _best(steps: _Steps, near: float, kept: Mask) -> float:
     return near * math.exp(float(found.x))
 
 
-def _sigma(steps: _Steps, scale: float, kept: Mask) -> float:
+def _estimate_sigma(steps: _MotionSteps, scale: float, kept: Mask) -> float:
     """Standard deviation of the log of the unit; wider where motions scatter more than they should."""
     length = (scale * steps.scene * steps.given).sum(1) / np.maximum(np.linalg.norm(steps.given, axis=1), 1e-12)
     sigma = np.hypot(steps.sigma_m, scale * steps.bounds)

@@ -29,13 +29,13 @@ class MetricDepth:
     depth: Callable[[npt.NDArray[np.uint8]], tuple[Map, Crop]]  # image (h, w, 3) -> metres (H, W), and their crop
 
 
-def by_network(snapshot: Snapshot, network: MetricDepth, sigma: float) -> Measurement | str:
+def estimate_scale_from_network(snapshot: Snapshot, network: MetricDepth, sigma: float) -> Measurement | str:
     """The unit, or a sentence why the network does not give it: its views disagree, or show too little.
 
     `sigma` is the standard deviation, as a share, of an error that all views of a place have alike.
     """
     step = -(-len(snapshot.cameras) // _VIEWS)
-    ratios = [_ratio(snapshot, camera, network) for camera in snapshot.cameras[::step]]
+    ratios = [_measure_ratio(snapshot, camera, network) for camera in snapshot.cameras[::step]]
     logs = np.log([ratio for ratio in ratios if ratio is not None])
     if not len(logs):
         return f"{network.name} was asked, and no view shows enough of the scene to compare"
@@ -46,13 +46,13 @@ def by_network(snapshot: Snapshot, network: MetricDepth, sigma: float) -> Measur
     return Measurement(float(np.exp(np.median(logs))), math.hypot(sigma, spread / math.sqrt(len(logs))), source)
 
 
-def _ratio(snapshot: Snapshot, camera: CameraEstimate, network: MetricDepth) -> float | None:
+def _measure_ratio(snapshot: Snapshot, camera: CameraEstimate, network: MetricDepth) -> float | None:
     """Metres by scene unit in the median of a view's pixels; None where too few can be compared."""
     metres, crop = network.depth(snapshot.images[camera.name])
     shape = camera.T_world_camera, camera.K, camera.width, camera.height
     picture = render_arrays(snapshot.gaussians, *shape, channels=("depth", "alpha"))
     rows, columns = np.mgrid[: crop.height, : crop.width]
-    there = np.floor(crop.to_photograph(np.stack([columns, rows], -1) + 0.5)).astype(np.int64)
+    there = np.floor(crop.map_to_image(np.stack([columns, rows], -1) + 0.5)).astype(np.int64)
     depth, alpha = (channel[there[..., 1], there[..., 0]] for channel in (picture.depth, picture.alpha))
     both = (alpha > _OPAQUE) & (depth > 0) & (metres > 0)
     return float(np.median(metres[both] / depth[both])) if both.mean() > _ENOUGH else None

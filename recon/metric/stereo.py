@@ -10,17 +10,17 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.lengths import in_words
+from splatnode.capture.process.lengths import format_length
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.metric.measurement import Measurement
-from splatnode.recon.metric.stereo_pairs import Pair
-from splatnode.recon.metric.views import View, of_cameras
+from splatnode.recon.metric.stereo_pairs import StereoPair
+from splatnode.recon.metric.views import MetricView, compute_scale_sigma
 from splatnode.recon.registration import patch_alignment
 from splatnode.recon.result.landmarks import Landmarks
 
 Array = npt.NDArray[np.float64]
 
-_PATCHES = patch_alignment.Config(radius=6)
+_PATCHES = patch_alignment.PatchAlignmentConfig(radius=6)
 _LEAST_CORRELATION, _MOST_SIGMA_PX = 0.85, 0.25  # of a patch with what it was aligned to
 _MOST_BACK_PX = 0.5  # between a point and where it comes from there and back
 _LEAST_POINTS = 30
@@ -41,8 +41,12 @@ class _Disparities:
     px: float  # of the reference size, in rays
 
 
-def by_stereo(
-    views: Mapping[str, View], landmarks: Landmarks | None, pairs: Sequence[Pair], baseline_m: float, sigma_m: float
+def estimate_scale_from_stereo(
+    views: Mapping[str, MetricView],
+    landmarks: Landmarks | None,
+    pairs: Sequence[StereoPair],
+    baseline_m: float,
+    sigma_m: float,
 ) -> Measurement | str:
     """The unit, or a sentence why the pairs do not give it.
 
@@ -50,11 +54,11 @@ def by_stereo(
     Pairs of which there is no view, or which the landmarks do not know, do not count: the scene that is shown and the
     newest estimate, whose landmarks they are, need not have the same cameras.
     """
-    name = f"stereo pairs with {in_words(baseline_m)} between the cameras"
+    name = f"stereo pairs with {format_length(baseline_m)} between the cameras"
     if landmarks is None:
         return f"{name} were given, and the scene has no points to compare with"
     pairs = [each for each in pairs if each.photograph in views and each.photograph in landmarks.names]
-    seen = [_compared(views[each.photograph], landmarks, each) for each in pairs]
+    seen = [_measure_disparities(views[each.photograph], landmarks, each) for each in pairs]
     seen = [each for each in seen if len(each.depths)]
     count = sum(len(each.depths) for each in seen)
     if count < _LEAST_POINTS:
@@ -67,35 +71,35 @@ def by_stereo(
         return f"{name} have left and right exchanged: the photographs of the scene must be the left camera's"
     px = np.concatenate([np.full(len(each.depths), each.px) for each in seen])
     nearness = 1.0 / (np.concatenate([each.depths for each in seen]) * px)
-    free = _fitted(nearness, across_px, _FREE_PX)
+    free = _fit_line(nearness, across_px, _FREE_PX)
     if abs(free.shift) > _MOST_SIGMAS * math.hypot(free.shift_sigma, _SHIFT_SIGMA_PX):
         return (
             f"{name} are not rectified: what is far away moves by {free.shift:.1f} pixels between them; the principal "
             "points of both must be the same"
         )
-    line = _fitted(nearness, across_px, _SHIFT_SIGMA_PX)
-    of_scene = of_cameras(list(views.values()))  # all fix the depths of the points, whichever have a partner
+    line = _fit_line(nearness, across_px, _SHIFT_SIGMA_PX)
+    of_scene = compute_scale_sigma(list(views.values()))  # all fix the depths of the points, whichever have a partner
     sigma = math.hypot(line.log_sigma, of_scene, sigma_m / baseline_m)
     return Measurement(baseline_m / line.slope, sigma, f"{len(seen)} {name}")
 
 
-def _compared(view: View, landmarks: Landmarks, pair: Pair) -> _Disparities:
+def _measure_disparities(view: MetricView, landmarks: Landmarks, pair: StereoPair) -> _Disparities:
     """The scene's points that the photograph shows, found in its partner to parts of a pixel."""
     height, width = pair.left.shape
     number = landmarks.names.index(pair.photograph)
     points = landmarks.points[np.unique(landmarks.point_of[landmarks.photograph_of == number])]
     depths = ((points - view.centre) @ view.T_world_camera[:3, :3])[:, 2]
-    left = view.pixels(points, width, height)
+    left = view.project(points, width, height)
     margin = _PATCHES.radius + 1.0
     inside = (depths > 0) & (left > margin).all(1) & (left < np.array([width, height]) - margin).all(1)
     left, depths = left[inside], depths[inside]
-    right, found = _tracked(pair, left)
-    rays = view.rays(left[found], width, height), view.rays(right[found], width, height)
+    right, found = _track_points(pair, left)
+    rays = view.unproject(left[found], width, height), view.unproject(right[found], width, height)
     across, down = (rays[0] - rays[1]).T
     return _Disparities(depths[found], across, down, 1.0 / (REFERENCE_SIDE * view.focal))
 
 
-def _tracked(pair: Pair, left: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
+def _track_points(pair: StereoPair, left: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Pixels (M, 2) in the right picture of pixels in the left one, and which of them were found (M,)."""
     if not len(left):
         return left, np.zeros(0, bool)
@@ -121,7 +125,7 @@ class _Line:
     shift_sigma: float  # of the shift, pixels
 
 
-def _fitted(nearness: Array, across: Array, held: float) -> _Line:
+def _fit_line(nearness: Array, across: Array, held: float) -> _Line:
     """The line of `across` (M,) over `nearness` (M,), robust (Huber's weights).
 
     The shift is held near 0 with the standard deviation `held`, pixels.

@@ -10,7 +10,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import distortion, without_distortion
+from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.metric.measurement import TWO_SIDED_95
 from splatnode.recon.registration.straightened import radial_of
 from splatnode.recon.result.snapshot import Snapshot
@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class MetricView:
     """A camera. Lengths in its picture count over the picture's longer side."""
 
     T_world_camera: Array  # (4, 4)
@@ -32,13 +32,13 @@ class View:
     def centre(self) -> Array:
         return self.T_world_camera[:3, 3]
 
-    def rays(self, pixels: Array, width: int, height: int) -> Array:
+    def unproject(self, pixels: Array, width: int, height: int) -> Array:
         """(M, 2) at depth 1 of pixels (M, 2) in a picture of this size."""
         side = max(width, height)
         distorted = ((pixels - np.array([width, height]) / 2.0) / side - self.shift) / self.focal
-        return without_distortion(distorted, self.radial)
+        return undistort_rays(distorted, self.radial)
 
-    def pixels(self, points: Array, width: int, height: int) -> Array:
+    def project(self, points: Array, width: int, height: int) -> Array:
         """(M, 2) in a picture of this size of world points (M, 3); not a number behind the camera."""
         in_camera = (points - self.centre) @ self.T_world_camera[:3, :3]
         depth = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.nan)
@@ -47,8 +47,8 @@ class View:
         return max(width, height) * distorted + np.array([width, height]) / 2.0
 
 
-def views_of(snapshot: Snapshot) -> Mapping[str, View]:
-    """By the photograph's name, in their order: as they were registered, where that is known; else as published."""
+def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
+    """Makes the views by image name, in their order: as registered where that is known, else as published."""
     bounds = {camera.name: camera.bounds.centre if camera.bounds else 0.0 for camera in snapshot.cameras}
     found = {}
     for camera in sorted(snapshot.cameras, key=lambda camera: camera.frame_id):
@@ -56,7 +56,9 @@ def views_of(snapshot: Snapshot) -> Mapping[str, View]:
         K = camera.K_photographed
         shift = (K[:2, 2] - size / 2.0) / side
         radial = np.array(radial_of(camera.lens))
-        found[camera.name] = View(camera.T_world_camera, float(K[0, 0]) / side, radial, shift, bounds[camera.name])
+        found[camera.name] = MetricView(
+            camera.T_world_camera, float(K[0, 0]) / side, radial, shift, bounds[camera.name]
+        )
     landmarks = snapshot.landmarks
     if landmarks is None:
         return found
@@ -64,11 +66,11 @@ def views_of(snapshot: Snapshot) -> Mapping[str, View]:
     for index, name in enumerate(landmarks.names):
         if name in found:
             lens = float(lenses.focals[index]), lenses.radials[index], lenses.shifts[index]
-            found[name] = View(landmarks.Ts_world_camera[index], *lens, bounds[name])
+            found[name] = MetricView(landmarks.Ts_world_camera[index], *lens, bounds[name])
     return found
 
 
-def of_cameras(views: Sequence[View]) -> float:
+def compute_scale_sigma(views: Sequence[MetricView]) -> float:
     """Standard deviation of log length that the cameras' bounds allow, by the two that are farthest apart; 0 of one."""
     if len(views) < 2:
         return 0.0

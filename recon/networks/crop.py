@@ -21,15 +21,15 @@ class Crop:
     width: int  # of the network's image
     height: int
 
-    def to_network(self, pixels: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def map_to_network(self, pixels: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(M, 2) pixels of the photograph as pixels of the network's image."""
         return pixels * self.scale - [self.left, self.top]
 
-    def to_photograph(self, pixels: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def map_to_image(self, pixels: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(M, 2) pixels of the network's image as pixels of the photograph."""
         return (pixels + [self.left, self.top]) / self.scale
 
-    def cut(self, width: int, height: int) -> Crop:
+    def crop_centre(self, width: int, height: int) -> Crop:
         """The middle of it, of at most `width` x `height`."""
         width, height = min(width, self.width), min(height, self.height)
         left, top = self.left + (self.width - width) // 2, self.top + (self.height - height) // 2
@@ -50,7 +50,7 @@ def crop(width: int, height: int, longer_side: int, patch: int) -> Crop:
     return Crop(scale, left, top, cut_width, cut_height)
 
 
-def cropped(image: npt.NDArray[np.uint8], to: Crop) -> Tensor:
+def crop_image(image: npt.NDArray[np.uint8], to: Crop) -> Tensor:
     """(H, W, 3) in [0, 1]: what the network sees of a photograph (h, w, 3)."""
     size = (round(image.shape[1] * to.scale), round(image.shape[0] * to.scale))
     resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA if to.scale < 1 else cv2.INTER_CUBIC)

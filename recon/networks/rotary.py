@@ -18,7 +18,7 @@ class Rotary:
     sine: Tensor  # (N, D)
 
     @classmethod
-    def of(cls, positions: Tensor, dimension: int) -> Rotary:
+    def create_from_positions(cls, positions: Tensor, dimension: int) -> Rotary:
         """For vectors of `dimension` D, a multiple of 4, at `positions` (N, 2) in patches."""
         quarter = dimension // 4
         frequencies = _BASE ** (-torch.arange(quarter, device=positions.device, dtype=torch.float32) / quarter)
@@ -26,7 +26,7 @@ class Rotary:
         angles = torch.cat([angles, angles], dim=-1).flatten(1)
         return cls(angles.cos(), angles.sin())
 
-    def turned(self, x: Tensor) -> Tensor:
+    def rotate(self, x: Tensor) -> Tensor:
         """(..., N, D) vectors, each turned by the rotation of its position."""
         first, second = x.unflatten(-1, (2, 2, -1)).unbind(-2)  # pairs lie a quarter of D apart
         across = torch.stack([-second, first], dim=-2).flatten(-3)

@@ -37,10 +37,10 @@ class Attention(nn.Module):
 
     def forward(self, x: Tensor, rotary: Rotary | None) -> Tensor:
         """(..., N, C) from tokens (..., N, C); `rotary` turns queries and keys by their positions."""
-        query, key, value = (by_head(part, self._heads) for part in self.qkv(x).chunk(3, dim=-1))
+        query, key, value = (split_heads(part, self._heads) for part in self.qkv(x).chunk(3, dim=-1))
         query, key = self.q_norm(query), self.k_norm(key)
         if rotary is not None:
-            query, key = rotary.turned(query), rotary.turned(key)
+            query, key = rotary.rotate(query), rotary.rotate(key)
         return self.proj(attend(query, key, value))
 
 
@@ -85,7 +85,7 @@ class Block(nn.Module):
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
-def by_head(x: Tensor, heads: int) -> Tensor:
+def split_heads(x: Tensor, heads: int) -> Tensor:
     """(..., heads, N, D) from (..., N, heads * D)."""
     return x.unflatten(-1, (heads, -1)).transpose(-3, -2)
 

@@ -19,7 +19,7 @@ class Weights:
 
     @property
     def name(self) -> str:
-        """What the user calls it: the file's name without its ending."""
+        """Returns the name that the user gives: the file's name without its ending."""
         return Path(self.path).stem
 
 

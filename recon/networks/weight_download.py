@@ -10,7 +10,7 @@ import urllib.request
 from pathlib import Path
 from typing import BinaryIO
 
-from splatnode.capture.process.private import NotPrivate, check_only_ours
+from splatnode.capture.process.private import NotOwnerOnly, check_owner_only
 from splatnode.capture.process.terminal import progress
 from splatnode.recon.networks.weight_catalogue import Weights
 from splatnode.recon.networks.weight_folder import WeightsError
@@ -29,7 +29,7 @@ def fetch(weights: Weights, to: Path, source: Path | None = None) -> Path:
     from its publisher can give it by `source`. Raises WeightsError, and OSError where the disk does not take it.
     """
     target = to / weights.path
-    if target.is_file() and not complaint(weights, target):
+    if target.is_file() and not find_mismatch(weights, target):
         return target
     _make(target.parent, to)
     part = target.with_name(f"{target.name}.part")
@@ -38,7 +38,7 @@ def fetch(weights: Weights, to: Path, source: Path | None = None) -> Path:
         local = next((candidate for candidate in candidates if candidate.is_file()), None)
         if local is None:
             raise WeightsError(f"{source} holds no {Path(weights.path).name}: give the folder it was downloaded to")
-        if wrong := complaint(weights, local):
+        if wrong := find_mismatch(weights, local):
             raise WeightsError(f"{weights.name} from {local}: {wrong}; nothing was kept")
         part.unlink(missing_ok=True)
         shutil.copyfile(local, part)
@@ -51,7 +51,7 @@ def fetch(weights: Weights, to: Path, source: Path | None = None) -> Path:
         )
     else:
         _download(weights, part, weights.num_bytes)
-    wrong = complaint(weights, part)
+    wrong = find_mismatch(weights, part)
     if wrong:
         part.unlink()
         raise WeightsError(f"{weights.name} from {source or weights.url}: {wrong}; nothing was kept")
@@ -59,8 +59,8 @@ def fetch(weights: Weights, to: Path, source: Path | None = None) -> Path:
     return target
 
 
-def complaint(weights: Weights, file: Path) -> str:
-    """What is wrong with `file`; empty if it is what its publisher gave out, as far as that can be told."""
+def find_mismatch(weights: Weights, file: Path) -> str:
+    """Returns what is wrong with `file`; empty if it is what its publisher gave out, as far as that can be told."""
     size = file.stat().st_size
     if weights.num_bytes is not None and size != weights.num_bytes:
         return f"it has {size} bytes instead of {weights.num_bytes}"
@@ -74,14 +74,14 @@ def _make(folder: Path, top: Path) -> None:
     folder.mkdir(mode=0o755, parents=True, exist_ok=True)
     try:
         for each in (top, folder):
-            check_only_ours(each)
-    except NotPrivate as error:
+            check_owner_only(each)
+    except NotOwnerOnly as error:
         raise WeightsError(f"{error}. Or set $SPLATNODE_WEIGHTS to another folder") from error
 
 
 def _download(weights: Weights, part: Path, num_bytes: int) -> None:
     """Appends to `part` what it lacks, and no more than that."""
-    have = _begun(part, num_bytes)
+    have = _partial_size(part, num_bytes)
     if have == num_bytes:  # the digest decides
         return
     request = urllib.request.Request(weights.url, headers={"Range": f"bytes={have}-"} if have else {})
@@ -91,7 +91,7 @@ def _download(weights: Weights, part: Path, num_bytes: int) -> None:
             length = answer.headers.get("Content-Length")
             done = have if goes_on else 0
             if length is not None and length.isdecimal() and int(length) > num_bytes - done:
-                raise WeightsError(_too_much(weights, part, num_bytes))
+                raise WeightsError(_reject_oversized(weights, part, num_bytes))
             with open(os.open(part, _ADD if goes_on else _ANEW, 0o644), "ab") as file:
                 fits = _copy(answer, file, weights.name, done, num_bytes)
     except urllib.error.HTTPError as error:
@@ -103,12 +103,12 @@ def _download(weights: Weights, part: Path, num_bytes: int) -> None:
             f"splatnode weights fetch {weights.name} --from FOLDER"
         ) from error
     if not fits:
-        raise WeightsError(_too_much(weights, part, num_bytes))
+        raise WeightsError(_reject_oversized(weights, part, num_bytes))
     if part.stat().st_size < num_bytes:
         raise WeightsError(f"{weights.url}: the connection ended early; fetch again goes on from there")
 
 
-def _begun(part: Path, num_bytes: int) -> int:
+def _partial_size(part: Path, num_bytes: int) -> int:
     """Bytes of what an earlier download left, which is removed where it cannot be a part of the file."""
     if not os.path.lexists(part):
         return 0
@@ -118,14 +118,14 @@ def _begun(part: Path, num_bytes: int) -> int:
     return 0
 
 
-def _too_much(weights: Weights, part: Path, num_bytes: int) -> str:
-    """What is said of it; nothing of it is kept."""
+def _reject_oversized(weights: Weights, part: Path, num_bytes: int) -> str:
+    """Removes the partial file, and says that the source sends too much."""
     part.unlink(missing_ok=True)
     return f"{weights.url} sends more than the {num_bytes} bytes of {weights.name}; nothing was kept"
 
 
 def _copy(source: BinaryIO, file: BinaryIO, name: str, done: int, num_bytes: int) -> bool:
-    """Whether it ended where it should, or before; no more than that is written."""
+    """Copies until the end; returns False, and writes no more, where the source sends more than `num_bytes`."""
     while chunk := source.read(min(_CHUNK, num_bytes - done + 1)):
         done += len(chunk)
         if done > num_bytes:

@@ -14,7 +14,7 @@ class WeightsError(ValueError):
 
 
 def folder() -> Path:
-    """Where weights are put: $SPLATNODE_WEIGHTS, else splatnode/weights among the user's data."""
+    """Returns the folder of the weights: $SPLATNODE_WEIGHTS, else splatnode/weights among the user's data."""
     named = os.environ.get("SPLATNODE_WEIGHTS")
     if named:
         return Path(named)
@@ -22,7 +22,7 @@ def folder() -> Path:
     return Path(data) / "splatnode" / "weights"
 
 
-def located(path: str) -> Path | None:
+def locate_weights(path: str) -> Path | None:
     """The file `path` in `folder()`, or beside a checkout of the project where developers keep them; else None.
 
     A checkout may lie in a folder into which everybody writes, such as /tmp: what somebody else put beside it is not
@@ -47,7 +47,7 @@ def _are_of_whoever_wrote_the_code(checkout: Path, weights: Path) -> bool:
 
 def find(path: str) -> Path:
     """The file `path` as the catalogue names it. Raises WeightsError where it is not there."""
-    found = located(path)
+    found = locate_weights(path)
     if found is None:
         name = Path(path).stem
         raise WeightsError(f"no weights {path} in {folder()}: splatnode weights fetch {name}, or list for its source")

@@ -13,7 +13,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -39,7 +39,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise FileNotFoundError(2, "no such checkpoint (splatnode weights tells where it can be had)", str(path))
     if path.suffix == ".safetensors":
-        return _checked(_read_safetensors(path), path)
+        return _check_tensors(_read_safetensors(path), path)
     _check_archive(path)
     try:
         # Only plain data and this one class, which holds attributes and does nothing, are let through.
@@ -56,18 +56,18 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     weights = content.get("model", content) if isinstance(content, Mapping) else None
     if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise ValueError(f"{path} must hold a dict of tensors, or one under 'model'; it holds something else")
-    return _checked(dict(weights), path)
+    return _check_tensors(dict(weights), path)
 
 
-def _checked(weights: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+def _check_tensors(weights: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
     """Raises ValueError unless all are plain arrays of numbers, each no larger than what the file holds of it."""
     for name, tensor in weights.items():
         is_plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout == torch.strided and not tensor.is_quantized
         if not isinstance(name, str) or not is_plain or tensor.device.type != "cpu":
             raise ValueError(
-                f"{path} must hold plain tensors, {printable(str(name), 100)} is none; take the official file"
+                f"{path} must hold plain tensors, {sanitize_text(str(name), 100)} is none; take the official file"
             )
-        held, shown = tensor.untyped_storage().nbytes(), f"{printable(name, 100)} {tuple(tensor.shape)}"
+        held, shown = tensor.untyped_storage().nbytes(), f"{sanitize_text(name, 100)} {tuple(tensor.shape)}"
         if tensor.numel() * tensor.element_size() > held:
             raise ValueError(f"{path} holds {held} bytes of {shown}, fewer than it needs; take the official file")
     return weights
@@ -99,9 +99,9 @@ def check_names_and_shapes(
         return
     complaints = []
     if missing:
-        complaints.append(f"lacks {_some(missing)}")
+        complaints.append(f"lacks {_abbreviate_names(missing)}")
     if extra:
-        complaints.append(f"has {_some(extra)}, which does not belong to it")
+        complaints.append(f"has {_abbreviate_names(extra)}, which does not belong to it")
     if wrong:
         name = wrong[0]
         complaints.append(f"has {name} of shape {tuple(weights[name].shape)} instead of {expected[name]}")
@@ -121,5 +121,5 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
         raise ValueError(f"{path} is damaged or not a safetensors file; fetch it again ({error})") from error
 
 
-def _some(names: list[str]) -> str:
+def _abbreviate_names(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 
 from splatnode.capture.process.terminal import say
 from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
-from splatnode.recon.networks.weight_download import complaint, fetch
-from splatnode.recon.networks.weight_folder import WeightsError, find, folder, located
+from splatnode.recon.networks.weight_download import fetch, find_mismatch
+from splatnode.recon.networks.weight_folder import WeightsError, find, folder, locate_weights
 
 _UNAVAILABLE = 75  # the exit code where something is missing or could not be had: EX_TEMPFAIL
 
 
-def _named(names: Sequence[str]) -> list[Weights]:
+def _select_weights(names: Sequence[str]) -> list[Weights]:
     """The entries of the catalogue, all where none are named. Raises WeightsError for an unknown name."""
     known = {weights.name: weights for weights in CATALOGUE}
     unknown = [name for name in names if name not in known]
@@ -23,10 +23,10 @@ def _named(names: Sequence[str]) -> list[Weights]:
     return [known[name] for name in names] if names else list(CATALOGUE)
 
 
-def _listed(chosen: Sequence[Weights]) -> Iterator[dict[str, object]]:
-    """What `--json` prints, an entry a line."""
+def _describe_weights(chosen: Sequence[Weights]) -> Iterator[dict[str, object]]:
+    """Lists what `--json` prints, an entry a line."""
     for weights in chosen:
-        where = located(weights.path)
+        where = locate_weights(weights.path)
         yield {
             "name": weights.name,
             "what": weights.what,
@@ -40,9 +40,9 @@ def _listed(chosen: Sequence[Weights]) -> Iterator[dict[str, object]]:
 
 def command(args: argparse.Namespace) -> int:
     """Prints, fetches or checks what `args` name. 0; 75 where something is missing or could not be had."""
-    chosen = _named(args.names)
+    chosen = _select_weights(args.names)
     if args.action == "list":
-        for entry in _listed(chosen):
+        for entry in _describe_weights(chosen):
             if args.json:
                 print(json.dumps(entry))
             else:
@@ -58,7 +58,7 @@ def command(args: argparse.Namespace) -> int:
                 say(f"{weights.name}: {weights.licence}", error=True)
                 say(fetch(weights, folder(), args.source))
             else:
-                wrong = complaint(weights, find(weights.path))
+                wrong = find_mismatch(weights, find(weights.path))
                 failed |= bool(wrong)
                 unknown = "" if weights.sha256 else " (its publisher gives no digest: checked when loaded)"
                 say(f"{weights.name}: {wrong or 'as published' + unknown}")

@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.carving import passed, without_pause
-from splatnode.recon.occupancy.layout import laid_out
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
-from splatnode.recon.occupancy.sight import Sight, sights
-from splatnode.recon.occupancy.surfaces import blurred, surfaces
+from splatnode.recon.occupancy.carving import carve_free_space, ignore_cancel
+from splatnode.recon.occupancy.layout import choose_layout
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
+from splatnode.recon.occupancy.sight import DepthObservation, make_depth_observations
+from splatnode.recon.occupancy.surfaces import find_surface_voxels, thicken_points
 from splatnode.recon.occupancy.upright import upright
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import SURE
@@ -22,7 +22,7 @@ LEAST_KNOWN = 0.01  # of the pixels: with fewer confirmed depths there is no map
 
 
 class NoMap(ValueError):
-    """Of this result there is no map; the text says why, and what to do."""
+    """A result has no map; the text says why, and what to do."""
 
     exit_code = 65
 
@@ -31,7 +31,7 @@ def occupancy_map(
     snapshot: Snapshot,
     voxel: float | None = None,
     up: npt.NDArray[np.float64] | None = None,
-    pause: Callable[[], None] = without_pause,
+    pause: Callable[[], None] = ignore_cancel,
 ) -> OccupancyMap:
     """The map of what the photographs show at depths that two of them confirm; nothing else makes a voxel known.
 
@@ -40,22 +40,26 @@ def occupancy_map(
     direction of up in the world; None: gravity tells it, where the snapshot knows it. `pause` is called several times
     a second, and may raise to abandon the work. Raises NoMap, and ValueError for arguments that cannot be used.
     """
-    seen = _sights(snapshot)
+    seen = _load_depth_observations(snapshot)
     points, unit = _sample(seen)
     told, how = _up(snapshot) if up is None else (up, "given")
     frame = upright([camera.T_world_camera for camera in snapshot.cameras], points, told, unit, how)
     T = frame.T_world_map
     centres = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras])
-    layout = laid_out(_in_map(points, T), _in_map(centres, T), unit, snapshot.scale.metric, voxel)
+    layout = choose_layout(
+        _transform_to_map(points, T), _transform_to_map(centres, T), unit, snapshot.scale.metric, voxel
+    )
     states = np.zeros(layout.shape, np.uint8)
     for sight in seen:
-        states[passed(sight, layout, T, pause)] = State.FREE
+        states[carve_free_space(sight, layout, T, pause)] = VoxelState.FREE
     pause()
-    states[surfaces((_in_map(blurred(sight), T) for sight in seen), layout)] = State.OCCUPIED
+    states[find_surface_voxels((_transform_to_map(thicken_points(sight), T) for sight in seen), layout)] = (
+        VoxelState.OCCUPIED
+    )
     return OccupancyMap(states, layout.voxel, layout.origin, frame, snapshot.scale)
 
 
-def _sample(seen: Sequence[Sight]) -> tuple[npt.NDArray[np.float64], float]:
+def _sample(seen: Sequence[DepthObservation]) -> tuple[npt.NDArray[np.float64], float]:
     """World points (M, 3) of what was seen, all or evenly MOST_SAMPLED of them, and their median depth."""
     each = -(-sum(int(np.count_nonzero(sight.depth)) for sight in seen) // MOST_SAMPLED)
     depths = np.concatenate([sight.depth[sight.depth > 0][::each] for sight in seen])
@@ -63,17 +67,17 @@ def _sample(seen: Sequence[Sight]) -> tuple[npt.NDArray[np.float64], float]:
 
 
 def _up(snapshot: Snapshot) -> tuple[npt.NDArray[np.float64] | None, str]:
-    """By gravity, and how; none where nothing tells it, or it is too unsure to keep the floor level."""
+    """Returns up by gravity, and its source; none where it is unknown, or too unsure to keep the floor level."""
     up = snapshot.up
     return (None, "") if up is None or up.sigma_deg > UNSURE_DEG else (np.array(up.direction), up.source)
 
 
-def _in_map(points: npt.NDArray[np.float64], T_world_map: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _transform_to_map(points: npt.NDArray[np.float64], T_world_map: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return (points - T_world_map[:3, 3]) @ T_world_map[:3, :3]
 
 
-def _sights(snapshot: Snapshot) -> list[Sight]:
-    """Of a scene that a map may be made of. Raises NoMap."""
+def _load_depth_observations(snapshot: Snapshot) -> list[DepthObservation]:
+    """Makes the depth observations of a scene that a map may be made of. Raises NoMap."""
     verdict = snapshot.verdict
     if not verdict.publishable:
         raise NoMap(f"there is no map of a scene that was refused: {verdict.code.value}. {verdict.message}")
@@ -88,7 +92,7 @@ def _sights(snapshot: Snapshot) -> list[Sight]:
             "made it, or it is a scene file, or not final, or merged of scenes that are all known roughly. Reconstruct "
             "the photographs again"
         )
-    seen = sights(snapshot.cameras, snapshot.depths)
+    seen = make_depth_observations(snapshot.cameras, snapshot.depths)
     known = sum(int((sight.depth > 0).sum()) for sight in seen)
     if known < LEAST_KNOWN * sum(sight.depth.size for sight in seen) or not known:
         raise NoMap("next to no depth is confirmed by two photographs: give photographs that share more of the scene")

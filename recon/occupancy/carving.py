@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.occupancy.layout import Layout
-from splatnode.recon.occupancy.sight import Sight
+from splatnode.recon.occupancy.sight import DepthObservation
 
 Float32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -20,12 +20,15 @@ _RADII = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # pixels, of the squares th
 _AT_ONCE = 2_000_000  # voxels
 
 
-def without_pause() -> None:
-    """What is called between the parts of work that nobody interrupts."""
+def ignore_cancel() -> None:
+    """Ignores the check for cancellation, for work that nobody interrupts."""
 
 
-def passed(
-    sight: Sight, layout: Layout, T_world_map: npt.NDArray[np.float64], pause: Callable[[], None] = without_pause
+def carve_free_space(
+    sight: DepthObservation,
+    layout: Layout,
+    T_world_map: npt.NDArray[np.float64],
+    pause: Callable[[], None] = ignore_cancel,
 ) -> Mask:
     """(X, Y, Z) the voxels that the camera looks through; `pause` is called in between, and may raise.
 
@@ -42,7 +45,7 @@ def passed(
     for first in range(0, layout.shape[0], rows):
         pause()
         part = slice(first, min(first + rows, layout.shape[0]))
-        free[part] = _passed(_coordinates(start, steps, part, layout.shape), sight.K, limits, reach)
+        free[part] = _carve_block(_coordinates(start, steps, part, layout.shape), sight.K, limits, reach)
     return free
 
 
@@ -61,7 +64,7 @@ def _coordinates(
     return x, y, z
 
 
-def _passed(
+def _carve_block(
     centres: tuple[Float32, Float32, Float32], K: npt.NDArray[np.float64], limits: Float32, reach: np.float32
 ) -> Mask:
     x, y, z = centres
@@ -78,7 +81,7 @@ def _passed(
     return free.reshape(centres[0].shape)
 
 
-def _limits(sight: Sight, stop_short: float) -> Float32:
+def _limits(sight: DepthObservation, stop_short: float) -> Float32:
     """(radii, h, w) how far all rays of the square around a pixel pass; 0 where too few of them are known."""
     known = sight.depth > 0
     far = np.float32(np.finfo(np.float32).max)

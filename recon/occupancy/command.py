@@ -8,21 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.process.progress import waiting
+from splatnode.capture.process.progress import show_waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.occupancy.build import occupancy_map
 from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export.manifest import MAPS
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
-from splatnode.recon.result.whole import is_whole
+from splatnode.recon.result.whole import is_map_set
 
 
 def map_result(args: argparse.Namespace) -> int:
     """Says what is known and how up was found; raises NoMap, with the exit code of a refusal, where there is no map."""
     snapshot = read_to_map(args.result)
-    with waiting("looking through the place"):
-        folder = args.out or _beside(args.result)
+    with show_waiting("looking through the place"):
+        folder = args.out or _find_maps_folder(args.result)
         made = occupancy_map(snapshot, args.voxel, None if args.up is None else np.array(args.up))
         written = made.save(folder, args.band)
     x, y, z = made.states.shape
@@ -36,7 +36,7 @@ def map_result(args: argparse.Namespace) -> int:
     return 0
 
 
-def _beside(result: Path) -> Path:
+def _find_maps_folder(result: Path) -> Path:
     """The folder of maps in a result. Raises ValueError for a link, which may be of whoever made the result."""
     if (folder := result / MAPS).is_symlink():
         raise ValueError(f"{folder} must be no link; remove it, or name a folder with --out")
@@ -47,7 +47,7 @@ def read_to_map(folder: Path) -> Snapshot:
     """The result in `folder` with its confirmed depths. Raises FileNotFoundError, ValueError."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder; give one that splatnode replay --out wrote")
-    if is_whole(folder):
+    if is_map_set(folder):
         scenes = ", ".join(sorted(path.parent.name for path in folder.glob("*/report.json")))
         raise ValueError(f"{folder} holds several results; give one of its folders: {scenes}")
     return replace(read_result(folder)[0], depths=read_depths(folder))

@@ -12,7 +12,7 @@ from splatnode.recon.occupancy.formats.octomap import encode_octomap
 from splatnode.recon.occupancy.formats.ply import encode_ply_mesh
 from splatnode.recon.occupancy.mesh import surface_mesh
 from splatnode.recon.occupancy.occupancy_map import OccupancyMap
-from splatnode.recon.result.export.manifest import OF_A_MAP, digests, entries
+from splatnode.recon.result.export.manifest import OF_A_MAP, make_entries, read_digests
 from splatnode.recon.result.export.staged import json_bytes, write_files
 
 
@@ -26,7 +26,7 @@ def save(occupancy: OccupancyMap, folder: Path, band: Sequence[float] | None) ->
         "collision.glb": encode_glb(mesh),
         **({} if band is None else encode_nav2(occupancy, band)),
     }
-    superseded = {name: digest for name, digest in digests(folder / OF_A_MAP).items() if name not in files}
-    manifest = {**occupancy.scale.record(), "files": entries(files)}
+    superseded = {name: digest for name, digest in read_digests(folder / OF_A_MAP).items() if name not in files}
+    manifest = {**occupancy.scale.record(), "files": make_entries(files)}
     write_files(folder, files | {OF_A_MAP: json_bytes(manifest)}, superseded)
     return [folder / name for name in files]

@@ -44,19 +44,19 @@ def find_floor(points: Array, centres: Array, up: Array, unit: float, tilt: floa
     if len(sample) < 3:
         return None
     candidates = _planes(sample, rng, up, np.cos(np.radians(tilt)))
-    judged = [_judged(normal, offset, sample, centres, unit) for normal, offset in candidates]
+    judged = [_validate_floor(normal, offset, sample, centres, unit) for normal, offset in candidates]
     floors = [floor for floor in judged if floor is not None]
-    return _polished(max(floors, key=lambda floor: floor.share), sample, centres, unit) if floors else None
+    return _refine_floor(max(floors, key=lambda floor: floor.share), sample, centres, unit) if floors else None
 
 
-def _polished(best: Floor, sample: Array, centres: Array, unit: float) -> Floor:
+def _refine_floor(best: Floor, sample: Array, centres: Array, unit: float) -> Floor:
     """Fitted to all points that are near to it."""
     for part in _POLISHED:
         near = sample[np.abs(sample @ best.normal - best.offset) < part * THICKNESS * unit]
         middle = near.mean(0)
         normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ best.normal)
-        best = _judged(normal, float(middle @ normal), sample, centres, unit) or best
+        best = _validate_floor(normal, float(middle @ normal), sample, centres, unit) or best
     return best
 
 
@@ -71,7 +71,7 @@ def _planes(points: Array, rng: np.random.Generator, up: Array, cosine: float) -
     return list(zip(normals[level], (a * normals).sum(1)[level].tolist(), strict=True))
 
 
-def _judged(normal: Array, offset: float, points: Array, centres: Array, unit: float) -> Floor | None:
+def _validate_floor(normal: Array, offset: float, points: Array, centres: Array, unit: float) -> Floor | None:
     """The plane as a floor; None where it cannot be one."""
     if (centres @ normal - offset).min() < LEAST_BELOW_CAMERAS * unit:
         return None

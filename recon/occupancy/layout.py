@@ -28,7 +28,7 @@ class Layout:
         return self.first.astype(np.float64) * self.voxel
 
 
-def laid_out(points: Array, centres: Array, unit: float, metric: bool, voxel: float | None) -> Layout:
+def choose_layout(points: Array, centres: Array, unit: float, metric: bool, voxel: float | None) -> Layout:
     """Voxels around surface points (M, 3) and cameras (C, 3) in the map's frame; `unit` is the median distance.
 
     Without a size `voxel`, it is chosen by the distance, and in metres made a round number. Raises ValueError for a
@@ -41,16 +41,16 @@ def laid_out(points: Array, centres: Array, unit: float, metric: bool, voxel: fl
         if not (np.isfinite(voxel) and voxel > 0):
             raise ValueError(f"a voxel must have a side above 0, got {voxel!r}")
         if _count(low, high, voxel) > MOST_VOXELS or (high - low).max() / voxel > LONGEST_SIDE:
-            least = _least(low, high, voxel)
+            least = _smallest_voxel(low, high, voxel)
             raise ValueError(
                 f"the map would have more than {MOST_VOXELS} voxels of {voxel:g}; give a voxel of at least {least:.3g}"
             )
-        return _of(low, high, voxel)
+        return _create_layout(low, high, voxel)
     wanted = unit / PART_OF_DISTANCE
-    return _of(low, high, _least(low, high, _round(wanted) if metric else wanted))
+    return _create_layout(low, high, _smallest_voxel(low, high, _round(wanted) if metric else wanted))
 
 
-def _of(low: Array, high: Array, voxel: float) -> Layout:
+def _create_layout(low: Array, high: Array, voxel: float) -> Layout:
     first = np.floor(low / voxel).astype(np.int64) - _RIM
     x, y, z = (np.ceil(high / voxel).astype(np.int64) + _RIM - first).tolist()
     return Layout(voxel, first, (x, y, z))
@@ -60,7 +60,7 @@ def _count(low: Array, high: Array, voxel: float) -> float:
     return float(np.prod((high - low) / voxel + 2 * _RIM + 2))
 
 
-def _least(low: Array, high: Array, voxel: float) -> float:
+def _smallest_voxel(low: Array, high: Array, voxel: float) -> float:
     """The voxel, doubled until there are not too many."""
     while _count(low, high, voxel) > MOST_VOXELS or (high - low).max() / voxel > LONGEST_SIDE:
         voxel *= 2

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
 
 # A face's corners, as steps from the voxel's least corner, anticlockwise from outside; by axis, for the far side
 _FAR_FACES = np.array(
@@ -29,7 +29,7 @@ class Mesh:
 
 def surface_mesh(occupancy: OccupancyMap) -> Mesh:
     """The sides of occupied voxels that another state, or the map's end, lies at; what nobody saw has no surface."""
-    occupied = np.pad(occupancy.states == State.OCCUPIED, 1)
+    occupied = np.pad(occupancy.states == VoxelState.OCCUPIED, 1)
     corners = [_corners(occupied, axis, sign) for axis in range(3) for sign in (-1, 1)]
     quads = np.concatenate(corners)  # (Q, 4, 3)
     numbers = np.array(occupied.shape) + 1

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from splatnode.capture.messaging.values import Name, Sequential, Text
 from splatnode.capture.messaging.wire import Header, Message, WireError
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import printable
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import sanitize_text
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
 from splatnode.recon.occupancy.upright import Upright
-from splatnode.recon.result.camera_check import camera_problem
-from splatnode.recon.result.message import Matrix4, ScaleRecord, Vector3, scale_from, scale_record
+from splatnode.recon.result.camera_check import find_camera_problem
+from splatnode.recon.result.message import Matrix4, ScaleRecord, Vector3, make_scale_record, parse_scale
 
 Side = Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)]
 
@@ -34,20 +34,20 @@ class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where the map lies nowhere."""
-        why = camera_problem(np.array(self.T_world_map).reshape(4, 4), np.eye(3), 1, 1)
+        why = find_camera_problem(np.array(self.T_world_map).reshape(4, 4), np.eye(3), 1, 1)
         if why:
             raise ValueError(why.replace("T_world_camera", "T_world_map"))
 
 
 class MapHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What is known of free space now; no array comes where there is no map."""
+    """The current occupancy map; no array comes where there is no map."""
 
     scene_id: Name
     why: Text  # there is no map; empty where there is one
     map: MapRecord | None
 
 
-def to_message(
+def encode_map(
     occupancy: OccupancyMap, scene_id: str, scene_sequence: int, numbering: Mapping[str, object]
 ) -> tuple[MapHeader, list[npt.NDArray]]:
     """The header and the array of a map; `numbering` is session, sequence and mono_ns."""
@@ -56,9 +56,9 @@ def to_message(
         voxel=occupancy.voxel,
         origin=tuple(occupancy.origin.tolist()),
         T_world_map=tuple(occupancy.T_world_map.ravel().tolist()),
-        up=printable(occupancy.upright.source),
+        up=sanitize_text(occupancy.upright.source),
         on_floor=occupancy.upright.on_floor,
-        scale=scale_record(occupancy.scale),
+        scale=make_scale_record(occupancy.scale),
     )
     header = MapHeader(**numbering, scene_id=scene_id, why="", map=record)  # pyright: ignore[reportArgumentType]
     return header, [occupancy.states]
@@ -66,12 +66,12 @@ def to_message(
 
 def no_map(scene_id: str, why: str, numbering: Mapping[str, object]) -> MapHeader:
     """The header that takes the map before it back."""
-    return MapHeader(**numbering, scene_id=scene_id, why=printable(why), map=None)  # pyright: ignore[reportArgumentType]
+    return MapHeader(**numbering, scene_id=scene_id, why=sanitize_text(why), map=None)  # pyright: ignore[reportArgumentType]
 
 
-def from_message(message: Message[MapHeader]) -> OccupancyMap | None:
+def decode_map(message: Message[MapHeader]) -> OccupancyMap | None:
     """The map in a message; None where it says that there is none. Raises WireError where its array is no map's."""
-    with foreign(WireError, "a map"):
+    with guard_untrusted(WireError, "a map"):
         record, arrays = message.header.map, message.arrays
         if record is None:
             if arrays:
@@ -79,8 +79,8 @@ def from_message(message: Message[MapHeader]) -> OccupancyMap | None:
             return None
         if len(arrays) != 1 or arrays[0].ndim != 3 or arrays[0].dtype != np.uint8 or not arrays[0].size:
             raise WireError(f"a map has one array, states (X, Y, Z) uint8; got {[each.shape for each in arrays]}")
-        if arrays[0].max() > max(State):
-            raise WireError(f"states must be 0 to {int(max(State))}, got {int(arrays[0].max())}")
+        if arrays[0].max() > max(VoxelState):
+            raise WireError(f"states must be 0 to {int(max(VoxelState))}, got {int(arrays[0].max())}")
         T_world_map = np.array(record.T_world_map).reshape(4, 4)
         frame = Upright(T_world_map, record.up, record.on_floor)
-        return OccupancyMap(arrays[0], record.voxel, np.array(record.origin), frame, scale_from(record.scale))
+        return OccupancyMap(arrays[0], record.voxel, np.array(record.origin), frame, parse_scale(record.scale))

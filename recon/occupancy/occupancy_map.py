@@ -15,8 +15,8 @@ from splatnode.recon.occupancy.upright import Upright
 from splatnode.recon.result.scale import RELATIVE, Scale
 
 
-class State(IntEnum):
-    """What is known of a voxel."""
+class VoxelState(IntEnum):
+    """The state of a voxel: free, occupied, or not seen."""
 
     NOT_SEEN = 0
     FREE = 1  # rays of confirmed depth passed all of it
@@ -41,8 +41,8 @@ class OccupancyMap:
     @property
     def shares(self) -> dict[str, float]:
         """The share of all voxels in each state: `not_seen`, `free`, `occupied`."""
-        counts = np.bincount(self.states.ravel(), minlength=len(State))
-        return {state.name.lower(): float(counts[state] / self.states.size) for state in State}
+        counts = np.bincount(self.states.ravel(), minlength=len(VoxelState))
+        return {state.name.lower(): float(counts[state] / self.states.size) for state in VoxelState}
 
     def at(self, points: npt.ArrayLike) -> npt.NDArray[np.uint8]:
         """(M,) the states at points (M, 3) of the result's world; NOT_SEEN outside the map.
@@ -55,7 +55,7 @@ class OccupancyMap:
         T = self.upright.T_world_map
         index = np.floor(((world - T[:3, 3]) @ T[:3, :3] - self.origin) / self.voxel)
         inside = np.isfinite(index).all(1) & (index >= 0).all(1) & (index < self.states.shape).all(1)
-        found = np.full(len(world), State.NOT_SEEN, np.uint8)
+        found = np.full(len(world), VoxelState.NOT_SEEN, np.uint8)
         found[inside] = self.states[tuple(index[inside].astype(np.intp).T)]
         return found
 

@@ -17,7 +17,7 @@ DEPTH_ERROR = 0.02  # of a depth: as much confirmed depths may differ from each 
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class DepthObservation:
     """Confirmed depths of a camera, and how wrong they may be."""
 
     T_world_camera: npt.NDArray[np.float64]  # (4, 4)
@@ -36,12 +36,14 @@ class Sight:
         return in_camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
 
-def sights(cameras: Sequence[CameraEstimate], depths: Mapping[str, npt.NDArray[np.float16]]) -> list[Sight]:
-    """Of the cameras that have depths. Raises ValueError where a depth is not of its camera's photograph."""
-    return [_sight(camera, depths[camera.name]) for camera in cameras if camera.name in depths]
+def make_depth_observations(
+    cameras: Sequence[CameraEstimate], depths: Mapping[str, npt.NDArray[np.float16]]
+) -> list[DepthObservation]:
+    """Makes the depth observations of cameras with depths. Raises ValueError where a depth does not fit its camera."""
+    return [_make_depth_observation(camera, depths[camera.name]) for camera in cameras if camera.name in depths]
 
 
-def _sight(camera: CameraEstimate, depth: npt.NDArray[np.float16]) -> Sight:
+def _make_depth_observation(camera: CameraEstimate, depth: npt.NDArray[np.float16]) -> DepthObservation:
     reduction = max(1, round(camera.width / depth.shape[1]))
     if depth.shape != (camera.height // reduction, camera.width // reduction):
         raise ValueError(
@@ -51,4 +53,4 @@ def _sight(camera: CameraEstimate, depth: npt.NDArray[np.float16]) -> Sight:
     K = np.diag([1 / reduction, 1 / reduction, 1.0]) @ camera.K
     bounds = camera.bounds
     off = UNBOUNDED if bounds is None else bounds.centre_percent / 100.0 + math.radians(bounds.rotation_deg)
-    return Sight(camera.T_world_camera, K, depth.astype(np.float32), DEPTH_ERROR + off)
+    return DepthObservation(camera.T_world_camera, K, depth.astype(np.float32), DEPTH_ERROR + off)

@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.occupancy.layout import Layout
-from splatnode.recon.occupancy.sight import Sight
+from splatnode.recon.occupancy.sight import DepthObservation
 
 BLUR = 0.008  # of a depth, by which it may well be wrong: nine of ten are better
 LEAST_POINTS = 2  # pixels of confirmed depth in a voxel: a single one may be a blend of what is before and behind
 
 
-def surfaces(parts: Iterable[npt.NDArray[np.float64]], layout: Layout) -> npt.NDArray[np.bool_]:
+def find_surface_voxels(parts: Iterable[npt.NDArray[np.float64]], layout: Layout) -> npt.NDArray[np.bool_]:
     """(X, Y, Z) the voxels with at least LEAST_POINTS of all surface points (M, 3), in the map's frame.
 
     They come in parts, as of one camera each, so that a map of many cameras takes no more memory than one of a few.
@@ -28,7 +28,7 @@ def surfaces(parts: Iterable[npt.NDArray[np.float64]], layout: Layout) -> npt.ND
     return (counts >= LEAST_POINTS).reshape(layout.shape)
 
 
-def blurred(sight: Sight) -> npt.NDArray[np.float64]:
+def thicken_points(sight: DepthObservation) -> npt.NDArray[np.float64]:
     """(3 M, 3) world points of a camera: each a little nearer, where it is, and a little farther.
 
     So a surface beside a voxel's side is in both voxels, as which of them it is in cannot be known.

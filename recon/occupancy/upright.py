@@ -24,7 +24,7 @@ class Upright:
 
     @property
     def height(self) -> str:
-        """What heights count from, in words."""
+        """Says what heights count from."""
         return "z = 0 is the floor" if self.on_floor else "no floor was found: z = 0 is the height of the first camera"
 
 

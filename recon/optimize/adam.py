@@ -57,7 +57,7 @@ class Adam:
         gradients = {name: _gradient(name, group.param) for name, group in moving.items()}
         for group in moving.values():
             group.steps += 1
-        if all(dispatch.by_core(group.param) for group in moving.values()):
+        if all(dispatch.is_on_cpu(group.param) for group in moving.values()):
             self._step_natively(moving, gradients, factors)
             return
         self._step_by_torch(moving, gradients, factors)
@@ -84,7 +84,7 @@ class Adam:
     def _step_by_torch(
         self, moving: Mapping[str, _Group], gradients: Mapping[str, Tensor], factors: Mapping[str, Tensor]
     ) -> None:
-        """What the core does, on any device: a launch for each step of the calculation, of all parameters at once."""
+        """Steps as the core does, on any device: one launch for each operation, over all parameters at once."""
         given, groups = list(gradients.values()), list(moving.values())
         firsts, seconds = [group.first for group in groups], [group.second for group in groups]
         _EACH._foreach_lerp_(firsts, given, 1 - self.betas[0])
@@ -95,7 +95,7 @@ class Adam:
         _EACH._foreach_add_(spreads, [self.eps * root for root in roots])
         sizes = [-self._step_size(name, group) for name, group in moving.items()]
         sizes = [size * root for size, root in zip(sizes, roots, strict=True)]
-        moves = [_by_row(first, factors.get(name)) for name, first in zip(moving, firsts, strict=True)]
+        moves = [_scale_rows(first, factors.get(name)) for name, first in zip(moving, firsts, strict=True)]
         _EACH._foreach_addcdiv_([group.param for group in groups], moves, spreads, sizes)
 
     def follow(self, params: Mapping[str, Tensor], origin: Tensor) -> None:
@@ -111,8 +111,8 @@ class Adam:
             if param.shape != (len(origin), *group.param.shape[1:]):
                 shape = (len(origin), *group.param.shape[1:])
                 raise ValueError(f"{name} must be {shape} for these origins, got {tuple(param.shape)}")
-            first, second = (moment[origin].masked_fill_(_beside(fresh, moment), 0) for moment in group.moments)
-            self._groups[name] = _Group(_checked(name, param), first, second, group.steps)
+            first, second = (moment[origin].masked_fill_(_broadcast_rows(fresh, moment), 0) for moment in group.moments)
+            self._groups[name] = _Group(_check_param(name, param), first, second, group.steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,21 +165,21 @@ class _NativeGroup(ctypes.Structure):
     ]
 
 
-def _by_row(values: Tensor, factors: Tensor | None) -> Tensor:
-    return values if factors is None else values * _beside(factors.to(values), values)
+def _scale_rows(values: Tensor, factors: Tensor | None) -> Tensor:
+    return values if factors is None else values * _broadcast_rows(factors.to(values), values)
 
 
-def _beside(rows: Tensor, values: Tensor) -> Tensor:
+def _broadcast_rows(rows: Tensor, values: Tensor) -> Tensor:
     """`rows` (N,) in a shape that broadcasts with `values` (N, ...)."""
     return rows.view(-1, *[1] * (values.dim() - 1))
 
 
 def _new_group(name: str, param: Tensor) -> _Group:
-    zeros = torch.zeros_like(_checked(name, param), requires_grad=False)
+    zeros = torch.zeros_like(_check_param(name, param), requires_grad=False)
     return _Group(param, zeros, zeros.clone(), 0)
 
 
-def _checked(name: str, param: Tensor) -> Tensor:
+def _check_param(name: str, param: Tensor) -> Tensor:
     if param.dtype != torch.float32 or not param.is_contiguous() or param.dim() == 0:
         raise ValueError(
             f"{name} must be a contiguous float32 tensor with at least one dimension, "

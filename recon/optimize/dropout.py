@@ -14,15 +14,15 @@ import msgspec
 import torch
 from torch import Tensor
 
-from splatnode.recon.geometry import to_camera
-from splatnode.recon.result.sources import frame_of
+from splatnode.recon.geometry import transform_to_camera
+from splatnode.recon.result.sources import decode_frame_id
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import TrainingView
 
 MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are left out
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class DropoutConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
     sure: float = 0.6  # least confidence of stereo at which the uncertainty is 0
     until: float = 0.7  # share of the refinement after which no Gaussian is left out
@@ -31,7 +31,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Dropout:
     """Draws the Gaussians that each render leaves out."""
 
-    def __init__(self, config: Config, gaussians: Gaussians, views: Sequence[TrainingView], seed: int) -> None:
+    def __init__(self, config: DropoutConfig, gaussians: Gaussians, views: Sequence[TrainingView], seed: int) -> None:
         if not 0 <= config.share < 1:
             raise ValueError(f"dropout.share must be from 0 to below 1, got {config.share}")
         self._config, self._views = config, views
@@ -66,12 +66,12 @@ def uncertainty(gaussians: Gaussians, views: Sequence[TrainingView], sure: float
     device = gaussians.means.device
     result = torch.ones(len(gaussians), device=device)
     for view in views:
-        own = (frame_of(gaussians.source_frame) == view.frame_id).nonzero()[:, 0]
+        own = (decode_frame_id(gaussians.source_frame) == view.frame_id).nonzero()[:, 0]
         if view.pointmap is None:
             result[own] = 0.0
             continue
         T, K = view.T_world_camera.to(device), view.K.to(device)
-        x, y, z = (to_camera(gaussians.means[own], T) @ K.T).unbind(1)
+        x, y, z = (transform_to_camera(gaussians.means[own], T) @ K.T).unbind(1)
         z = z.clamp(min=1e-6)
         column = (x / z).clamp(0, view.width - 1).long()
         row = (y / z).clamp(0, view.height - 1).long()

@@ -22,7 +22,7 @@ from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class EnsembleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     members: Annotated[int, Meta(ge=1)] = 1  # scenes that are refined; 1: that one, and nothing after it
     # Steps of the refinement after them, on photographs as often as on pseudo views; nothing is pruned any more
     iterations: Annotated[int, Meta(ge=1)] = 400
@@ -32,16 +32,16 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def seed_of(member: int, seed: int) -> int:
-    """Of the random numbers of a member; the first one's are those of a scene by itself."""
+    """Returns the seed of a member; the first one's is that of a scene by itself."""
     return seed if member == 0 else int(np.random.SeedSequence((seed, member)).generate_state(1)[0])
 
 
 @torch.no_grad()
-def between(members: Sequence[Scene], config: Config, seed: int) -> list[TrainingView]:
+def render_between_views(members: Sequence[Scene], config: EnsembleConfig, seed: int) -> list[TrainingView]:
     """Views between the cameras of the first of the members: what they show there in the mean. None of one camera."""
     views, rng = members[0].views, np.random.default_rng(seed)
     count = min(config.pseudo_views * len(views), math.ceil(config.iterations / 2))
-    found = pseudo_views.between(views, count, off_path=config.off_path, rng=rng)
+    found = pseudo_views.sample_pseudo_views(views, count, off_path=config.off_path, rng=rng)
     return [
         TrainingView(
             name=f"between {number}",

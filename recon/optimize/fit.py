@@ -14,18 +14,18 @@ from torch import Tensor
 from splatnode.recon.geometry import exp_se3, twist_gradient
 from splatnode.recon.optimize import dropout, perceptual_loss, regularise
 from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
-from splatnode.recon.optimize.control.control import Control, Step
+from splatnode.recon.optimize.control.control import Control, OptimizerStep
 from splatnode.recon.optimize.own_axes import Shifts
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularise import Regularisation
-from splatnode.recon.optimize.training_image import TrainingImage, training_image
+from splatnode.recon.optimize.regularise import Regularizer
+from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.rasterize.render import Render
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView, fitted_pixels
+from splatnode.recon.scene.scene import Scene, TrainingView, compute_fit_masks
 
 if TYPE_CHECKING:
-    from splatnode.recon.optimize.refinement import Config
+    from splatnode.recon.optimize.refinement import RefinementConfig
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 _SCALES = {False: 1.0, True: 0.5}  # of the photographs' resolution, by whether it is halved
@@ -34,7 +34,7 @@ _PROCESSOR = torch.device("cpu")  # where the cameras are, whatever the Gaussian
 _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in as many steps as there are views
 
 
-class Fit:
+class Trainer:
     """Parameters, targets and optimisers of one refinement.
 
     The views of the scene are fitted with their cameras; those `beside` them have cameras that stay as they are.
@@ -43,7 +43,7 @@ class Fit:
     def __init__(
         self,
         scene: Scene,
-        config: Config,
+        config: RefinementConfig,
         seed: int,
         max_gaussians: int | None = None,
         beside: Sequence[TrainingView] = (),
@@ -66,7 +66,7 @@ class Fit:
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         views = (*scene.views, *beside)
-        fitted = fitted_pixels(scene.views)
+        fitted = compute_fit_masks(scene.views)
         shown = (*fitted, *(np.ones((view.height, view.width), bool) for view in beside))
         few = sum(view.width * view.height for view in views) <= _KEPT_PIXELS
         device = gaussians.means.device
@@ -74,7 +74,7 @@ class Fit:
         measures = (*(self._measure for _ in scene.views), *(None for _ in beside))
         self._images = {
             half: [
-                training_image(view, mask, scale, config.dssim, device, keep=few, measure=measure)
+                make_training_image(view, mask, scale, config.dssim, device, keep=few, measure=measure)
                 for view, mask, measure in zip(views, shown, measures, strict=True)
             ]
             for half, scale in _SCALES.items()
@@ -108,7 +108,7 @@ class Fit:
         if own:
             self._losses[self._measured] = loss.detach()
             self._measured += 1
-        weight = self._config.perceptual.in_step(self._done, progress)
+        weight = self._config.perceptual.weight_in_step(self._num_steps_done, progress)
         if image.perceptual is not None and weight:
             loss = loss + weight * image.perceptual(render.rgb)
         if own and self._regularisation is not None:
@@ -124,7 +124,7 @@ class Fit:
         self._gaussians.means.grad = None
 
     @property
-    def _done(self) -> int:
+    def _num_steps_done(self) -> int:
         """Steps of this refinement."""
         return self._iterations - self._scene.iterations
 
@@ -141,8 +141,8 @@ class Fit:
             return
         cameras = tuple(T.detach() for T in self._Ts_world_camera)
         change = self._control.after_step(
-            Step(
-                iteration=self._done,
+            OptimizerStep(
+                iteration=self._num_steps_done,
                 iterations=self._config.iterations,
                 progress=progress,
                 view=index,
@@ -159,16 +159,16 @@ class Fit:
                 self._shifts.follow(change.gaussians, change.origin)
             self._dropout.follow(change.gaussians)
 
-    def _further_losses(self, regularisation: Regularisation, index: int, render: Render, progress: float) -> Tensor:
+    def _further_losses(self, regularisation: Regularizer, index: int, render: Render, progress: float) -> Tensor:
         """The losses beside the photometric one on training view `index`, as rendered, and on a pseudo view.
 
         They are computed on the processor, where their networks and targets are.
         """
 
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
-            return render_gaussians(self._gaussians, view.camera, channels).on(_PROCESSOR)
+            return render_gaussians(self._gaussians, view.camera, channels).move_to_device(_PROCESSOR)
 
-        on_training_view = regularisation.training_loss(index, render.on(_PROCESSOR), progress)
+        on_training_view = regularisation.training_loss(index, render.move_to_device(_PROCESSOR), progress)
         parts = (on_training_view, regularisation.pseudo_loss(draw, progress))
         return sum((part for part in parts if part is not None), torch.zeros(()))
 
@@ -183,7 +183,7 @@ class Fit:
         return tuple(self._losses[: self._measured].tolist())
 
     def scene(self) -> Scene:
-        """What has been learnt so far."""
+        """Returns the scene as it is optimized so far."""
         views = tuple(
             replace(view, T_world_camera=T.detach().clone())
             for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
@@ -196,7 +196,7 @@ class Fit:
 
 
 def _leaves(gaussians: Gaussians, shifts: Shifts | None) -> dict[str, Tensor]:
-    """What Adam moves, by name: all parameters, but for the means where `shifts` moves them."""
+    """Returns the parameters that Adam moves, by name: all, but for the means where `shifts` moves them."""
     leaves = {name: getattr(gaussians, name).requires_grad_(True) for name in PARAMETERS}
     if shifts is not None:
         del leaves["means"]
@@ -204,13 +204,13 @@ def _leaves(gaussians: Gaussians, shifts: Shifts | None) -> dict[str, Tensor]:
 
 
 def _regularisation(
-    scene: Scene, fitted: Sequence[npt.NDArray[np.bool_]], config: regularise.Config, seed: int
-) -> Regularisation | None:
+    scene: Scene, fitted: Sequence[npt.NDArray[np.bool_]], config: regularise.RegularizerConfig, seed: int
+) -> Regularizer | None:
     """The losses beside the photometric one, in the pixels (h, w) that are `fitted`; None where all weights are 0.
 
     Raises ValueError where they would compare with what is known of a view, and nothing is.
     """
-    if not config.weighted:
+    if not config.active_losses:
         return None
     pointmaps = []
     for view in scene.views:
@@ -219,4 +219,4 @@ def _regularisation(
         T_world_camera = view.T_world_camera.double().numpy()
         pointmaps.append(replace(view.pointmap, T_world_camera=T_world_camera, K=view.K.double().numpy()))
     images = [view.image for view in scene.views]
-    return Regularisation(pointmaps, images, config, seed=seed, shown=fitted)
+    return Regularizer(pointmaps, images, config, seed=seed, shown=fitted)

@@ -17,10 +17,10 @@ import torch
 
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.optimize.point_render import PointRender, render_points
-from splatnode.recon.optimize.pseudo_views import PseudoView, between
+from splatnode.recon.optimize.pseudo_views import PseudoView, sample_pseudo_views
 from splatnode.recon.optimize.torch_threads import single_torch_thread
-from splatnode.recon.optimize.training_image import scaled
-from splatnode.recon.priors.pointmap import world_points
+from splatnode.recon.optimize.training_image import scale_intrinsics
+from splatnode.recon.priors.pointmap import compute_world_points
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
@@ -40,43 +40,43 @@ Array = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
-    """What stereo shows from a pseudo view."""
+class ExpectedView:
+    """A pseudo view as stereo predicts it."""
 
     camera: Camera
     loss: PhotometricLoss  # D-SSIM of a render, where there are points
 
 
-def expected(scene: Scene) -> tuple[Expected, ...]:
-    """What is expected between the training views of `scene`; empty with fewer than two that have a point map."""
+def make_expectations(scene: Scene) -> tuple[ExpectedView, ...]:
+    """Predicts views between the training views of `scene`; none with fewer than two point maps."""
     views = [view for view in scene.views if view.pointmap is not None]
-    found = between(views, _PSEUDO_VIEWS, off_path=_OFF_PATH, rng=np.random.default_rng(0))
+    found = sample_pseudo_views(views, _PSEUDO_VIEWS, off_path=_OFF_PATH, rng=np.random.default_rng(0))
     with single_torch_thread():
-        return tuple(_expected(views, view, scene.gaussians.means.device) for view in found)
+        return tuple(_make_expected_view(views, view, scene.gaussians.means.device) for view in found)
 
 
-def misfit(expectations: Sequence[Expected], gaussians: Gaussians) -> float:
+def misfit(expectations: Sequence[ExpectedView], gaussians: Gaussians) -> float:
     """The mean D-SSIM between what the Gaussians show and what is expected; 0 where nothing is expected."""
     with single_torch_thread():
-        losses = [float(each.loss(_rgb(gaussians, each.camera))) for each in expectations]
+        losses = [float(each.loss(_render_rgb(gaussians, each.camera))) for each in expectations]
     return sum(losses) / max(len(losses), 1)
 
 
-def _rgb(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
+def _render_rgb(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     rgb = render_gaussians(gaussians, camera).rgb
     assert rgb is not None  # it was asked for
     return rgb
 
 
-def _expected(views: Sequence[TrainingView], pseudo: PseudoView, device: torch.device) -> Expected:
+def _make_expected_view(views: Sequence[TrainingView], pseudo: PseudoView, device: torch.device) -> ExpectedView:
     centre = pseudo.T_world_camera[:3, 3]
     distances = [float(np.linalg.norm(view.T_world_camera[:3, 3].double().numpy() - centre)) for view in views]
     nearest = [views[i] for i in np.argsort(distances, kind="stable")[:_SEEN_FROM]]
     T_world_camera, K = pseudo.camera.T_world_camera, pseudo.camera.K
-    camera = Camera(T_world_camera, *scaled(K, pseudo.width, pseudo.height, 1 / _STEP))
+    camera = Camera(T_world_camera, *scale_intrinsics(K, pseudo.width, pseudo.height, 1 / _STEP))
     shown = _point_render(nearest, pseudo.T_world_camera, camera)
     weights = torch.from_numpy(shown.seen.astype(np.float32)).to(device)
-    return Expected(camera, PhotometricLoss(torch.from_numpy(shown.rgb).to(device), 1.0, weights))
+    return ExpectedView(camera, PhotometricLoss(torch.from_numpy(shown.rgb).to(device), 1.0, weights))
 
 
 def _point_render(
@@ -105,7 +105,7 @@ def _points(view: TrainingView) -> tuple[Array, Array, Array]:
     depth, confidence = pointmap.depth[::_STEP, ::_STEP], pointmap.confidence[::_STEP, ::_STEP]
     kept = (confidence >= _MIN_CONFIDENCE) & (depth > 0)
     T_world_camera, K = view.T_world_camera.double().numpy(), view.K.double().numpy()
-    points = world_points(depth, T_world_camera, K / np.array([[_STEP], [_STEP], [1.0]]))
+    points = compute_world_points(depth, T_world_camera, K / np.array([[_STEP], [_STEP], [1.0]]))
     image = cv2.resize(view.image, depth.shape[::-1], interpolation=cv2.INTER_AREA)
     normals = pointmap.normal[::_STEP, ::_STEP][kept] @ T_world_camera[:3, :3].T
     colours = image[kept].astype(np.float32)

@@ -33,7 +33,7 @@ class Shifts:
     def step(self, gaussians: Gaussians, rate: float) -> None:
         """Moves `gaussians.means`, which must have their gradient, by about `rate` standard deviations."""
         assert gaussians.means.grad is not None
-        offsets, turned = self._adam.params["offsets"], turning(gaussians)
+        offsets, turned = self._adam.params["offsets"], make_axis_rotation(gaussians)
         offsets.grad = turned(gaussians.means.grad, to_world=False)
         self._adam.lrs = {"offsets": rate}
         self._adam.step()
@@ -45,25 +45,25 @@ class Shifts:
         self._adam.follow({"offsets": _zeros(gaussians)}, origin)
 
 
-def along_axes(gradients: Tensor, gaussians: Gaussians) -> Tensor:
+def rotate_to_axes(gradients: Tensor, gaussians: Gaussians) -> Tensor:
     """(N, 3) the derivatives by offsets along the axes, of derivatives by positions `gradients` (N, 3)."""
-    return turning(gaussians)(gradients, to_world=False)
+    return make_axis_rotation(gaussians)(gradients, to_world=False)
 
 
-def in_world(offsets: Tensor, gaussians: Gaussians) -> Tensor:
+def rotate_to_world(offsets: Tensor, gaussians: Gaussians) -> Tensor:
     """(N, 3) the shifts in the world, of `offsets` (N, 3) along the axes in standard deviations."""
-    return turning(gaussians)(offsets, to_world=True)
+    return make_axis_rotation(gaussians)(offsets, to_world=True)
 
 
-def turning(gaussians: Gaussians) -> Callable[..., Tensor]:
+def make_axis_rotation(gaussians: Gaussians) -> Callable[..., Tensor]:
     """A function of vectors (N, 3) and of `to_world`, by which vectors along the axes of `gaussians` turn into it."""
     quats, log_scales = gaussians.quats.detach(), gaussians.log_scales.detach()
-    if dispatch.by_core(quats):
-        return partial(_turned_by_core, quats, log_scales)
-    return partial(turned_by_torch, axes_by_torch(quats, log_scales))
+    if dispatch.is_on_cpu(quats):
+        return partial(_rotate_by_core, quats, log_scales)
+    return partial(rotate_by_torch, axes_by_torch(quats, log_scales))
 
 
-def _turned_by_core(quats: Tensor, log_scales: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
+def _rotate_by_core(quats: Tensor, log_scales: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
     given = [tensor.to(torch.float32).contiguous() for tensor in (quats, log_scales, vectors.detach())]
     result = torch.empty_like(given[2])
     addresses = [ctypes.c_void_p(tensor.data_ptr()) for tensor in given]
@@ -77,8 +77,8 @@ def axes_by_torch(quats: Tensor, log_scales: Tensor) -> Tensor:
     return matrices_from_quats(quats) * log_scales.exp().clamp_max(LARGEST_EXTENT)[:, None, :]
 
 
-def turned_by_torch(axes: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
-    """What the core does, on any device."""
+def rotate_by_torch(axes: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
+    """Rotates as the core does, on any device."""
     beside = vectors[:, None, :] if to_world else vectors[:, :, None]
     return (axes * beside).sum(2 if to_world else 1)
 

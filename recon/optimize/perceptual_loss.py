@@ -20,15 +20,15 @@ from splatnode.recon.optimize.losses.loss import Schedule
 from splatnode.recon.optimize.losses.perceptual import Distance, LpipsDistance, load_alex
 
 
-class Config(Schedule, frozen=True, forbid_unknown_fields=True):
+class PerceptualLossConfig(Schedule, frozen=True, forbid_unknown_fields=True):
     """None by default. The weight is of each step, in the mean."""
 
     start: float = 0.5  # share of the iterations after which it counts
     every: Annotated[int, Meta(ge=1)] = 5  # steps from one in which it counts to the next one
 
-    def in_step(self, step: int, progress: float) -> float:
+    def weight_in_step(self, step: int, progress: float) -> float:
         """The weight in step `step`, counted from 0, at `progress` in [0, 1]; 0 where the loss is not computed."""
-        return 0.0 if step % self.every else self.every * self.at(progress)
+        return 0.0 if step % self.every else self.every * self.weight_at(progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +44,10 @@ class PerceptualLoss:
         return self.distance(rgb if self.shown is None else torch.where(self.shown, rgb, self.target))
 
 
-def load(config: Config, device: torch.device) -> LpipsDistance | None:
+def load(config: PerceptualLossConfig, device: torch.device) -> LpipsDistance | None:
     """The measure, on `device`; None where the weight is 0, or no weights of the network are there."""
     found = load_alex() if config.weight else None
-    return None if found is None else replace(found, network=found.network.on(device))
+    return None if found is None else replace(found, network=found.network.move_to_device(device))
 
 
 def perceptual_loss(
@@ -59,5 +59,5 @@ def perceptual_loss(
     """
     if measure is None or min(target.shape[:2]) < MIN_SIDE:
         return None
-    distance = measure.prepared(target) if keep_features else lambda rgb: measure.prepared(target)(rgb)
+    distance = measure.prepare_distance(target) if keep_features else lambda rgb: measure.prepare_distance(target)(rgb)
     return PerceptualLoss(distance, target, None if weights is None else (weights > 0)[..., None])

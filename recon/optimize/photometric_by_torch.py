@@ -19,24 +19,26 @@ from splatnode.recon.optimize.photometric_reference import C1, C2, WINDOW, windo
 
 
 @dataclass(frozen=True, eq=False)
-class Weights:
-    """What the two parts of the loss are multiplied by in each pixel of each colour, (H, W) each."""
+class LossWeights:
+    """The weights of the loss's two parts in each pixel of each colour, (H, W) each."""
 
     difference: Tensor  # of the absolute difference
     dissimilarity: Tensor  # of 1 - SSIM
     shown: Tensor | None  # False where a pixel is to be taken for the target's; None: nowhere
 
 
-def weights_of(target: Tensor, ssim_weight: float, weights: Tensor | None) -> Weights:
-    """Of a loss against `target` (3, H, W), with `weights` (H, W) of the pixels in both means; None: all alike."""
+def make_weights(target: Tensor, ssim_weight: float, weights: Tensor | None) -> LossWeights:
+    """Makes the weights of a loss against `target` (3, H, W) with pixel `weights` (H, W); None: all alike."""
     given = torch.ones_like(target[0]) if weights is None else weights.to(target.dtype)
     total = given.sum()
     unit = given / (3 * torch.where(total > 0, total, 1))
-    return Weights((1 - ssim_weight) * unit, ssim_weight * unit, None if weights is None else given > 0)
+    return LossWeights((1 - ssim_weight) * unit, ssim_weight * unit, None if weights is None else given > 0)
 
 
 @torch.no_grad()
-def evaluated(image: Tensor, target: Tensor, weights: Weights, differentiate: bool = True) -> tuple[Tensor, Tensor]:
+def evaluate_loss(
+    image: Tensor, target: Tensor, weights: LossWeights, differentiate: bool = True
+) -> tuple[Tensor, Tensor]:
     """The loss, scalar, and its gradient (3, H, W), a view of (H, W, 3), of an image and a target (3, H, W).
 
     Not to be differentiated, the gradient may be anything.
@@ -47,7 +49,7 @@ def evaluated(image: Tensor, target: Tensor, weights: Weights, differentiate: bo
     torch.add(image, target, out=both[0])
     torch.sub(image, target, out=both[1])
     torch.mul(both[:2], both[:2], out=both[2:])
-    blurred = _blurred(both)
+    blurred = _blur(both)
     pairs = image.new_empty(2, 2, *image.shape)  # S and D, V and W
     torch.mul(blurred[:2], blurred[:2], out=pairs[0])
     torch.sub(blurred[2:], pairs[0], out=pairs[1])
@@ -66,7 +68,7 @@ def evaluated(image: Tensor, target: Tensor, weights: Weights, differentiate: bo
     torch.add(others, derivatives[:, 0], out=derivatives[:, 1])
     derivatives[:, 0].sub_(others)
     derivatives[0].sub_(derivatives[1]).mul_(blurred[:2])
-    back = _blurred(derivatives.flatten(0, 1))
+    back = _blur(derivatives.flatten(0, 1))
     by_both = torch.addcmul(back[:2], both[:2], back[2:])
     gradient = torch.add(by_both[0], by_both[1])
     if weights.shown is not None:
@@ -75,7 +77,7 @@ def evaluated(image: Tensor, target: Tensor, weights: Weights, differentiate: bo
     return value, torch.add(signs, gradient, alpha=2, out=channels_last)
 
 
-def _blurred(images: Tensor) -> Tensor:
+def _blur(images: Tensor) -> Tensor:
     """(M, 3, H, W) under the window, with zeros beyond the border.
 
     Each plane is a channel of its own: torch has kernels for that, which compute in full precision.

@@ -40,13 +40,13 @@ class PhotometricLoss:
         self.target = _planar(target.detach())
         if not bool(torch.isfinite(self.target).all()):
             raise ValueError("target must be finite")
-        self._on_device: photometric_by_torch.Weights | None = None  # where torch computes
-        if not dispatch.by_core(self.target):
-            self._on_device = photometric_by_torch.weights_of(self.target, ssim_weight, self._weights)
+        self._on_device: photometric_by_torch.LossWeights | None = None  # where torch computes
+        if not dispatch.is_on_cpu(self.target):
+            self._on_device = photometric_by_torch.make_weights(self.target, ssim_weight, self._weights)
             return
         pixels = float(target.shape[0] * target.shape[1])
         self._total_weight = pixels if self._weights is None else float(self._weights.sum(dtype=torch.float64))
-        self._moments = self._computed_moments() if keep_moments else None
+        self._moments = self._compute_moments() if keep_moments else None
 
     def __call__(self, rgb: Tensor) -> Tensor:
         """The loss of `rgb` (H, W, 3), scalar."""
@@ -57,7 +57,7 @@ class PhotometricLoss:
             )
         return _Photometric.apply(rgb, self)
 
-    def _computed_moments(self) -> tuple[Tensor, Tensor]:
+    def _compute_moments(self) -> tuple[Tensor, Tensor]:
         """Mean and variance of the target in the window of each pixel, both (3, H, W)."""
         mean, variance = torch.empty_like(self.target), torch.empty_like(self.target)
         _, height, width = self.target.shape
@@ -68,7 +68,7 @@ class PhotometricLoss:
         """The loss of `rgb` (H, W, 3), scalar, and its gradient (3, H, W) where it is asked for."""
         if self._on_device is not None:
             image = rgb.to(torch.float32).permute(2, 0, 1)
-            value, gradient = photometric_by_torch.evaluated(image, self.target, self._on_device, differentiate)
+            value, gradient = photometric_by_torch.evaluate_loss(image, self.target, self._on_device, differentiate)
             return value.to(rgb.dtype), gradient
         planar = _planar(rgb)
         gradient = torch.empty_like(planar) if differentiate else None
@@ -77,7 +77,7 @@ class PhotometricLoss:
     def _evaluate_by_core(self, planar: Tensor, gradient: Tensor | None) -> float:
         """The loss of a planar (3, H, W) image; fills `gradient`, of the same shape, where given."""
         _, height, width = self.target.shape
-        mean, variance = self._moments or self._computed_moments()
+        mean, variance = self._moments or self._compute_moments()
         evaluate = library().core_photometric
         evaluate.restype = ctypes.c_double
         return evaluate(

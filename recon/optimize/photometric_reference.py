@@ -35,7 +35,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     An 11 x 11 Gaussian window of sigma 1.5 in each colour, zeros beyond the border, biased variances.
     """
     products = torch.stack([image, target, image * image, target * target, image * target])
-    mean, target_mean, squared, target_squared, product = _blurred(products)
+    mean, target_mean, squared, target_squared, product = _blur(products)
     variance, target_variance = squared - mean**2, target_squared - target_mean**2
     covariance = product - mean * target_mean
     return ((2 * mean * target_mean + C1) * (2 * covariance + C2)) / (
@@ -43,7 +43,7 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     )
 
 
-def _blurred(images: Tensor) -> Tensor:
+def _blur(images: Tensor) -> Tensor:
     """(M, 3, H, W) under the normalised Gaussian window, which is separable, with zeros beyond the border."""
     weights = window(images.dtype, images.device)
     planes = images.flatten(0, 1)[:, None]

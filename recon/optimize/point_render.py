@@ -14,7 +14,7 @@ _MIN_DEPTH = 1e-6  # z of a point in front of the camera
 
 @dataclass(frozen=True, eq=False)
 class PointRender:
-    """What the points show from a camera; `seen` says where there are any."""
+    """The points as a camera sees them; `seen` says where there are any."""
 
     rgb: Array  # (H, W, 3) in [0, 1], white where nothing is seen
     depth: Array  # (H, W) z in the camera frame of the frontmost point, 0 where nothing is seen
@@ -68,12 +68,12 @@ def render_points(
     total = np.bincount(pixel, weight, height * width)
     seen = total > 0
 
-    def blended(values: Array) -> Array:
+    def blend_values(values: Array) -> Array:
         sums = [np.bincount(pixel, weight * values[point, k], height * width) for k in range(3)]
         return (np.stack(sums, 1) / np.where(seen, total, 1.0)[:, None]).astype(np.float32)
 
-    rgb = np.where(seen[:, None], blended(colours), np.float32(1.0))
-    normal = blended(turned)
+    rgb = np.where(seen[:, None], blend_values(colours), np.float32(1.0))
+    normal = blend_values(turned)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return PointRender(
         rgb=rgb.reshape(height, width, 3),
@@ -88,8 +88,8 @@ def _candidates(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
     """(pixel, point, distance) of every pixel centre within `radius` of a projection (u, v), each of shape (C,)."""
     reach = int(np.ceil(radius - 0.5))
-    columns = [_reached(u, step, width) for step in range(-reach, reach + 1)]
-    rows = [_reached(v, step, height) for step in range(-reach, reach + 1)]
+    columns = [_find_neighbour_pixels(u, step, width) for step in range(-reach, reach + 1)]
+    rows = [_find_neighbour_pixels(v, step, height) for step in range(-reach, reach + 1)]
     pixels, members, distances = [], [], []
     for y, vertical, in_rows in rows:
         for x, horizontal, in_columns in columns:
@@ -101,7 +101,9 @@ def _candidates(
     return np.concatenate(pixels), np.concatenate(members), np.concatenate(distances)
 
 
-def _reached(at: Array, step: int, size: int) -> tuple[npt.NDArray[np.int64], Array, npt.NDArray[np.bool_]]:
+def _find_neighbour_pixels(
+    at: Array, step: int, size: int
+) -> tuple[npt.NDArray[np.int64], Array, npt.NDArray[np.bool_]]:
     """The pixels `step` beside those at (C,) along one axis, the squared distances of their centres, if they exist."""
     pixel = np.floor(at).astype(np.int64) + step
     return pixel, (pixel.astype(np.float32) + np.float32(0.5) - at) ** 2, (pixel >= 0) & (pixel < size)

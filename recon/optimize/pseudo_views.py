@@ -46,7 +46,7 @@ def interpolate(T_start: Array, T_end: Array, share: float) -> Array:
     return moved
 
 
-def path(Ts_world_camera: Sequence[Array]) -> list[int]:
+def order_cameras(Ts_world_camera: Sequence[Array]) -> list[int]:
     """The order that visits all cameras in small steps: the shortest of the greedy paths from each of them."""
     centres = np.array([T[:3, 3] for T in Ts_world_camera])
     steps = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
@@ -82,7 +82,7 @@ def pseudo_views(
         raise ValueError(
             f"pseudo views lie between training cameras: at least 2 are needed, got {len(Ts_world_camera)}"
         )
-    order = path(Ts_world_camera)
+    order = order_cameras(Ts_world_camera)
     steps = list(pairwise(order))
     views = []
     for index in range(count):
@@ -97,7 +97,7 @@ def pseudo_views(
     return views
 
 
-def between(
+def sample_pseudo_views(
     cameras: Sequence[Camera | TrainingView], count: int, *, off_path: float, rng: np.random.Generator
 ) -> list[PseudoView]:
     """`count` pseudo views between these cameras, as `pseudo_views` spreads them; none between fewer than two."""

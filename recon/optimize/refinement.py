@@ -16,7 +16,7 @@ from msgspec import Meta
 from splatnode.recon.optimize import dropout, ensemble, perceptual_loss, regularise
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.optimize.fit import PARAMETERS, Fit
+from splatnode.recon.optimize.fit import PARAMETERS, Trainer
 from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.result.sources import SHELL
 from splatnode.recon.scene.gaussians import Gaussians, logit
@@ -27,7 +27,7 @@ Rate = Annotated[float, Meta(ge=0, le=1)]
 MIN_SOFT = 100  # iterations below which a refinement begins with opacities as seeded
 
 
-class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LearningRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
 
     means: Rate = 0.4  # of positions, in `means_unit`
@@ -45,10 +45,10 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 # Of few steps: steps of a share of a Gaussian's extent take some hundred to settle. Chosen for a refinement of 500.
-CAUTIOUS = Rates(means=8e-4, means_unit="depth")
+CAUTIOUS = LearningRates(means=8e-4, means_unit="depth")
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RefinementConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The refinement of the preset `balanced`."""
 
     iterations: Annotated[int, Meta(ge=0)] = 500  # steps of the optimiser, one view each
@@ -59,25 +59,29 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Largest opacity of what photographs seeded, as the refinement of a begun scene starts: soft Gaussians settle more
     # freely, in a hundred steps and more, so they are left as seeded where a time limit may end it. null: as seeded
     first_opacity: Annotated[float, Meta(gt=0, lt=1)] | None = 0.1
-    perceptual: perceptual_loss.Config = perceptual_loss.Config()  # LPIPS of renders against photographs
-    dropout: dropout.Config = dropout.Config()
+    perceptual: perceptual_loss.PerceptualLossConfig = (
+        perceptual_loss.PerceptualLossConfig()
+    )  # LPIPS of renders against photographs
+    dropout: dropout.DropoutConfig = dropout.DropoutConfig()
     refine_poses: bool = True  # whether cameras are refined together with the Gaussians
-    rates: Rates = Rates()
-    regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
+    rates: LearningRates = LearningRates()
+    regularise: regularise.RegularizerConfig = (
+        regularise.RegularizerConfig()
+    )  # losses beside the photometric one; none by default
     # Density control, which adds and removes Gaussians; None: their number stays
     control: ControlChoice | None = ControlChoice("prune", prune.Config())
-    ensemble: ensemble.Config = ensemble.Config()
+    ensemble: ensemble.EnsembleConfig = ensemble.EnsembleConfig()
 
     @property
     def steps(self) -> int:
-        """Of all refinements together."""
+        """Returns the number of steps of all refinements together."""
         one = self.ensemble.members == 1
         return self.iterations if one else self.ensemble.members * self.iterations + self.ensemble.iterations
 
 
 def refine(
     scene: Scene,
-    config: Config,
+    config: RefinementConfig,
     *,
     seed: int,
     deadline: float | None = None,
@@ -95,13 +99,13 @@ def refine(
     Of an ensemble the first member is shown until there is a scene that agrees with all of them. Where the deadline
     leaves no time for the others, the first one is the end.
     """
-    run = partial(_refined, deadline=deadline, max_gaussians=max_gaussians, gone_on=gone_on)
+    run = partial(_run_refinement, deadline=deadline, max_gaussians=max_gaussians, gone_on=gone_on)
     if config.ensemble.members == 1:
         yield from run(scene, config, seed=seed)
         return
     started = time.monotonic()
     # Of LPIPS, which takes long, members do without: the refinement after them has it.
-    alone = msgspec.structs.replace(config, perceptual=perceptual_loss.Config())
+    alone = msgspec.structs.replace(config, perceptual=perceptual_loss.PerceptualLossConfig())
     first = yield from run(scene, alone, seed=seed)
     took = time.monotonic() - started
     if deadline and started + took * config.steps / max(config.iterations, 1) > deadline:
@@ -112,15 +116,15 @@ def refine(
     if deadline and time.monotonic() >= deadline:
         return
     with single_torch_thread():
-        beside = ensemble.between(members, config.ensemble, seed)
+        beside = ensemble.render_between_views(members, config.ensemble, seed)
     done = sum(member.iterations - scene.iterations for member in members)
     agreeing = replace(first, iterations=scene.iterations + done)
-    yield from run(agreeing, _as_agreement(config), seed=seed, done=done, beside=beside)
+    yield from run(agreeing, _make_agreement_config(config), seed=seed, done=done, beside=beside)
 
 
-def _refined(
+def _run_refinement(
     scene: Scene,
-    config: Config,
+    config: RefinementConfig,
     *,
     seed: int,
     deadline: float | None,
@@ -134,7 +138,7 @@ def _refined(
     Half of the steps are on the views `beside` those of the scene, if there are any.
     """
     with single_torch_thread():
-        fit = Fit(scene if deadline else _soft(scene, config), config, seed, max_gaussians, beside)
+        fit = Trainer(scene if deadline else _soften_initial_scene(scene, config), config, seed, max_gaussians, beside)
     order = np.random.default_rng(seed)
     own = np.arange(len(scene.views))
     turns = np.concatenate([np.resize(own, max(len(own), len(beside))), len(own) + np.arange(len(beside))])
@@ -159,8 +163,8 @@ def _refined(
     return end
 
 
-def _as_agreement(config: Config) -> Config:
-    """Of the refinement after an ensemble."""
+def _make_agreement_config(config: RefinementConfig) -> RefinementConfig:
+    """Returns the configuration of the refinement after an ensemble."""
     given, rates = config.ensemble, config.rates
     shorter = {name: given.rates * getattr(rates, name) for name in PARAMETERS}
     return msgspec.structs.replace(
@@ -174,18 +178,18 @@ def _as_agreement(config: Config) -> Config:
     )
 
 
-def _soft(scene: Scene, config: Config) -> Scene:
+def _soften_initial_scene(scene: Scene, config: RefinementConfig) -> Scene:
     """A begun scene with its first opacities, if there are steps enough for them to grow.
 
     How often it is looked at meanwhile does not count: that would make another scene of it.
     """
     if scene.iterations or config.first_opacity is None or config.iterations < MIN_SOFT:
         return scene
-    return replace(scene, gaussians=softened(scene.gaussians, config.first_opacity))
+    return replace(scene, gaussians=soften_opacities(scene.gaussians, config.first_opacity))
 
 
-def softened(gaussians: Gaussians, most: float) -> Gaussians:
-    """With opacities of at most `most`, but for the far shell's."""
+def soften_opacities(gaussians: Gaussians, most: float) -> Gaussians:
+    """Limits opacities to `most`, but for the far shell's."""
     logits = gaussians.logit_opacities
     soft = torch.where(gaussians.source_frame == SHELL, logits, logits.clamp_max(logit(most)))
     return replace(gaussians, logit_opacities=soft)

@@ -14,7 +14,7 @@ from torch import Tensor
 from splatnode.recon.networks.depth_anything import load_relative
 from splatnode.recon.optimize.point_render import PointRender, render_points
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.priors.monocular import with_monocular
+from splatnode.recon.priors.monocular import fit_monocular_depth
 from splatnode.recon.priors.pointmap import Pointmap
 
 
@@ -41,17 +41,17 @@ class Supervision:
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceTarget, ...]:
-        """Of the training views: depths of a monocular network where there is one, else of the point maps."""
-        return tuple(_from_pointmap(pointmap, self.min_confidence) for pointmap in self._completed[0])
+        """Returns the training views' surfaces: of a monocular network where there is one, else of point maps."""
+        return tuple(_make_pointmap_target(pointmap, self.min_confidence) for pointmap in self._depth_targets[0])
 
     @property
     def depth_source(self) -> str:
-        """Where the depths of `surfaces` come from, for the report."""
-        return self._completed[1]
+        """Returns the source of the depths of `surfaces`, for the report."""
+        return self._depth_targets[1]
 
     @cached_property
     def point_renders(self) -> tuple[PointRender, ...]:
-        """What the point cloud of all point maps shows from each pseudo view."""
+        """Renders the point cloud of all point maps from each pseudo view."""
         if not self.pseudo_views:
             return ()
         cloud = _cloud(self.pointmaps, self.images, self.min_confidence)
@@ -62,25 +62,25 @@ class Supervision:
 
     @cached_property
     def pseudo_surfaces(self) -> tuple[SurfaceTarget, ...]:
-        """Of the pseudo views: depth and normals of the point renders."""
-        return tuple(_from_points(shown) for shown in self.point_renders)
+        """Returns the surfaces of the pseudo views: depth and normals of the point renders."""
+        return tuple(_make_point_target(shown) for shown in self.point_renders)
 
     @cached_property
-    def _completed(self) -> tuple[Sequence[Pointmap], str]:
+    def _depth_targets(self) -> tuple[Sequence[Pointmap], str]:
         """The point maps with a monocular network's depth, except in views that contradict it, and the source."""
         network = load_relative()
         if network is None:
             return self.pointmaps, "multi-view depth"
         pairs = list(zip(self.pointmaps, self.images, strict=True))
-        completed = [with_monocular(pointmap, image, network) for pointmap, image in pairs]
+        completed = [fit_monocular_depth(pointmap, image, network) for pointmap, image in pairs]
         changed = sum(new is not old for new, (old, _) in zip(completed, pairs, strict=True))
         if self.shown is not None:  # a network sees depth in what a mask hides, too
-            completed = [pointmap.masked(shown) for pointmap, shown in zip(completed, self.shown, strict=True)]
+            completed = [pointmap.apply_mask(shown) for pointmap, shown in zip(completed, self.shown, strict=True)]
         source = f"depth of {network.name} (in {changed} of {len(pairs)} views, scaled by multi-view depth)"
         return completed, source
 
 
-def at_size(target: Tensor, render: Tensor) -> Tensor:
+def resample_target(target: Tensor, render: Tensor) -> Tensor:
     """`target` (h, w, ...) sampled at the pixels of `render` (H, W, ...), which has the same view at another size."""
     if target.shape == render.shape:
         return target
@@ -104,12 +104,12 @@ def _cloud(
     return np.concatenate(points), np.concatenate(colours), np.concatenate(normals)
 
 
-def _from_pointmap(pointmap: Pointmap, min_confidence: float) -> SurfaceTarget:
+def _make_pointmap_target(pointmap: Pointmap, min_confidence: float) -> SurfaceTarget:
     confident = (pointmap.confidence >= min_confidence) & (pointmap.depth > 0)
     weights = np.where(confident, pointmap.confidence, 0).astype(np.float32)
     return SurfaceTarget(*(torch.from_numpy(array) for array in (pointmap.depth, pointmap.normal, weights)))
 
 
-def _from_points(shown: PointRender) -> SurfaceTarget:
+def _make_point_target(shown: PointRender) -> SurfaceTarget:
     weights = shown.seen.astype(np.float32)
     return SurfaceTarget(*(torch.from_numpy(array) for array in (shown.depth, shown.normal, weights)))

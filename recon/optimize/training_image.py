@@ -33,7 +33,7 @@ class TrainingImage:
 
 
 @dataclass(frozen=True, eq=False)
-class _Exposed:
+class _ExposureCompensatedLoss:
     """A loss against a photograph whose exposure was taken out.
 
     A tone curve is no gain, so a part of the exposure is left in it: a gain a channel, the one that fits the render
@@ -57,7 +57,7 @@ class _Exposed:
         return torch.where(self.prior > 0, gains, 1.0)
 
 
-def training_image(
+def make_training_image(
     view: TrainingView,
     shown: npt.NDArray[np.bool_],
     scale: float,
@@ -75,7 +75,7 @@ def training_image(
     `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
     smaller image is compared only if all pixels that it covers are shown.
     """
-    K, width, height = scaled(view.K, view.width, view.height, scale)
+    K, width, height = scale_intrinsics(view.K, view.width, view.height, scale)
     image, weights = view.image, None
     if (width, height) != (view.width, view.height):
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
@@ -93,11 +93,11 @@ def training_image(
         told = told & torch.from_numpy(share == 0).to(device)
     known = target * told
     prior = _PRIOR * (known * known).sum((0, 1))
-    exposed = partial(_Exposed, target=target, told=told, prior=prior)
+    exposed = partial(_ExposureCompensatedLoss, target=target, told=told, prior=prior)
     return TrainingImage(K, width, height, exposed(loss), perceptual and exposed(perceptual))
 
 
-def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:
+def scale_intrinsics(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:
     """Intrinsics, width and height of the same view at `scale` of its resolution."""
     scaled_width, scaled_height = max(1, round(width * scale)), max(1, round(height * scale))
     factors = torch.tensor([[scaled_width / width], [scaled_height / height], [1.0]])

@@ -16,25 +16,25 @@ from splatnode.recon.priors import stereo
 from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
-from splatnode.recon.priors.registered_camera import modelled_K, searched_depths, sparse_points
+from splatnode.recon.priors.registered_camera import compute_depth_range, compute_modelled_K, select_sparse_points
 from splatnode.recon.registration.register import Registration
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    stereo: stereo.Config = stereo.Config()
+    stereo: stereo.StereoConfig = stereo.StereoConfig()
     seed: int = 0  # of the random planes that stereo begins with
     # Few sparse points lie on what is far, so stereo searches this many times farther than they reach; in inverse
     # depth, in which it samples, that is a small part of the range.
     far_margin: float = 8.0
 
 
-class DepthMaps(Protocol):
+class DepthEstimator(Protocol):
     """`stereo.depth_maps`, or another function with the same arguments and result."""
 
     def __call__(
         self,
         views: Sequence[stereo.StereoView],
-        config: stereo.Config,
+        config: stereo.StereoConfig,
         *,
         seed: int = ...,
         sparse: Sequence[stereo.SparsePoints | None] | None = ...,
@@ -46,54 +46,54 @@ class ClassicalPrior(Prior):
     """Depth by `recon.priors.stereo`, or by `depth_maps` in its place; matches by `matcher`, if there is one."""
 
     def __init__(
-        self, config: Config, depth_maps: DepthMaps = stereo.depth_maps, matcher: Matcher | None = None
+        self, config: Config, depth_maps: DepthEstimator = stereo.estimate_depth_maps, matcher: Matcher | None = None
     ) -> None:
         self._config, self._depth_maps, self.matcher = config, depth_maps, matcher
-        self.ends_early = depth_maps is stereo.depth_maps
+        self.ends_early = depth_maps is stereo.estimate_depth_maps
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
     ) -> tuple[Pointmap, ...]:
-        views, sparse = self._views(graph, registration)
+        views, sparse = self._make_views(graph, registration)
         maps = self._depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse, pause=pause)
-        return tuple(map(_pointmap, _keyframes(graph, registration), views, maps))
+        return tuple(map(_make_pointmap, _select_keyframes(graph, registration), views, maps))
 
     def further_pointmaps(
         self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
     ) -> tuple[Pointmap, ...]:
-        views, sparse = self._views(graph, registration)
-        keyframes = _keyframes(graph, registration)
-        depths = {i: _to_compare(known[each.name]) for i, each in enumerate(keyframes) if each.name in known}
+        views, sparse = self._make_views(graph, registration)
+        keyframes = _select_keyframes(graph, registration)
+        depths = {i: _select_depth(known[each.name]) for i, each in enumerate(keyframes) if each.name in known}
         found = []
         for i in (i for i, keyframe in enumerate(keyframes) if keyframe.name not in known):
-            depth_map = stereo.further_depth_map(
+            depth_map = stereo.estimate_further_depth_map(
                 views, i, depths, self._config.stereo, seed=self._config.seed, sparse=sparse[i]
             )
             depths[i] = depth_map.unchecked.astype(np.float32)
-            found.append(_pointmap(keyframes[i], views[i], depth_map))
+            found.append(_make_pointmap(keyframes[i], views[i], depth_map))
         return tuple(found)
 
-    def _views(
+    def _make_views(
         self, graph: ViewGraph, registration: Registration
     ) -> tuple[list[stereo.StereoView], list[stereo.SparsePoints]]:
         """The registered cameras as stereo takes them, and the registered points that each observes."""
         views, sparse = [], []
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
-            points = sparse_points(registration, camera, keyframe.scale)
-            near, far = searched_depths(registration, camera, points)
+            points = select_sparse_points(registration, camera, keyframe.scale)
+            near, far = compute_depth_range(registration, camera, points)
             near_far = (near, self._config.far_margin * far)
-            K, T_world_camera = modelled_K(graph, camera), camera.T_world_camera
+            K, T_world_camera = compute_modelled_K(graph, camera), camera.T_world_camera
             views.append(stereo.StereoView(keyframe.image, K, T_world_camera, near_far, keyframe.name))
             sparse.append(points)
         return views, sparse
 
 
-def _keyframes(graph: ViewGraph, registration: Registration) -> list[Keyframe]:
+def _select_keyframes(graph: ViewGraph, registration: Registration) -> list[Keyframe]:
     return [graph.keyframes[camera.index] for camera in registration.cameras]
 
 
-def _pointmap(keyframe: Keyframe, view: stereo.StereoView, depth_map: DepthMap) -> Pointmap:
+def _make_pointmap(keyframe: Keyframe, view: stereo.StereoView, depth_map: DepthMap) -> Pointmap:
     return Pointmap(
         name=keyframe.name,
         frame_id=keyframe.frame.frame_id,
@@ -106,7 +106,7 @@ def _pointmap(keyframe: Keyframe, view: stereo.StereoView, depth_map: DepthMap) 
     )
 
 
-def _to_compare(pointmap: Pointmap) -> npt.NDArray[np.float32]:
+def _select_depth(pointmap: Pointmap) -> npt.NDArray[np.float32]:
     """(h, w) the depth that further views are compared with."""
     return pointmap.depth if pointmap.unchecked is None else pointmap.unchecked.astype(np.float32)
 

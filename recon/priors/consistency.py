@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.core import library, pointer
-from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Transfer, transfer
-from splatnode.recon.workers import each
+from splatnode.recon.priors.patchmatch import Matching, Planes, PyramidLevel, Transfer, compute_transfer
+from splatnode.recon.workers import map_parallel
 
 Float32 = npt.NDArray[np.float32]
 
@@ -37,7 +37,7 @@ class Confidence:
 
 
 @dataclass(frozen=True)
-class Config:
+class ConsistencyConfig:
     max_error: float = 2.0  # forward-backward reprojection error of agreeing views, pixels
     max_relative_difference: float = 0.01  # largest difference of the depths of agreeing views, relative to the depth
     min_support: float = 0.12  # share of neighbours on the same plane that keeps a pixel which no other view confirms
@@ -48,7 +48,7 @@ class Config:
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What stereo knows of a view."""
+    """The depth map of a view, with normals and confidence."""
 
     depth: Float32  # (h, w) z in the camera frame, 0 where unknown
     normal: Float32  # (h, w, 3) camera frame, unit length, facing the camera, 0 where unknown
@@ -57,7 +57,7 @@ class DepthMap:
     unchecked: npt.NDArray[np.float16]  # (h, w) z before the check, 0 where unknown: what further views are checked by
 
 
-class _Other(ctypes.Structure):
+class _OtherView(ctypes.Structure):
     _fields_ = (
         ("planes", ctypes.c_void_p),
         ("width", ctypes.c_int32),
@@ -69,7 +69,7 @@ class _Other(ctypes.Structure):
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What the other views say about each pixel of a view."""
+    """The agreement of the other views with each pixel of a view."""
 
     inverse_depth: Float32  # (h, w) mean over the pixel and the views that agree with it
     num_consistent: npt.NDArray[np.uint8]  # (h, w) views that agree
@@ -90,29 +90,39 @@ class _Agreement(ctypes.Structure):
 
 
 def cross_check(
-    views: Sequence[Level],
+    views: Sequence[PyramidLevel],
     planes: Sequence[Planes],
     partners: Sequence[Sequence[int]],
     matching: Matching,
-    config: Config,
+    config: ConsistencyConfig,
 ) -> list[DepthMap]:
     """The depth maps of all views, each compared with those of its `partners`."""
 
-    def checked(view: Level, own: Planes, others: Sequence[int]) -> DepthMap:
-        agreeing = agreement(view, own, [views[i] for i in others], [planes[i] for i in others], config)
-        return depth_map(view, own, agreeing, matching, config)
+    def check_view(view: PyramidLevel, own: Planes, others: Sequence[int]) -> DepthMap:
+        agreeing = compute_agreement(view, own, [views[i] for i in others], [planes[i] for i in others], config)
+        return make_depth_map(view, own, agreeing, matching, config)
 
-    return each(checked, views, planes, partners)
+    return map_parallel(check_view, views, planes, partners)
 
 
-def agreement(
-    view: Level, planes: Planes, others: Sequence[Level], other_planes: Sequence[Planes], config: Config
+def compute_agreement(
+    view: PyramidLevel,
+    planes: Planes,
+    others: Sequence[PyramidLevel],
+    other_planes: Sequence[Planes],
+    config: ConsistencyConfig,
 ) -> Agreement:
-    """What `others` say about the planes of `view`."""
+    """Computes how `others` agree with the planes of `view`."""
     values = [np.ascontiguousarray(p.values, np.float32) for p in (planes, *other_planes)]
-    array = (_Other * len(others))(
+    array = (_OtherView * len(others))(
         *(
-            _Other(pointer(value), other.shape[1], other.shape[0], transfer(view, other), transfer(other, view))
+            _OtherView(
+                pointer(value),
+                other.shape[1],
+                other.shape[0],
+                compute_transfer(view, other),
+                compute_transfer(other, view),
+            )
             for other, value in zip(others, values[1:], strict=True)
         )
     )
@@ -125,13 +135,15 @@ def agreement(
     return result
 
 
-def depth_map(view: Level, planes: Planes, agreement: Agreement, matching: Matching, config: Config) -> DepthMap:
-    """What other views and the neighbours confirm of a view's planes, with normals and confidence."""
-    surface, support, contrast = supported(view, planes, agreement, matching, config)
+def make_depth_map(
+    view: PyramidLevel, planes: Planes, agreement: Agreement, matching: Matching, config: ConsistencyConfig
+) -> DepthMap:
+    """Makes the depth map that other views and neighbours support, with normals and confidence."""
+    surface, support, contrast = measure_support(view, planes, agreement, matching, config)
     confirmed = agreement.num_consistent > 0
     inverse_depth = np.where(confirmed, agreement.inverse_depth, surface.inverse_depth)
-    normal, cosine = normals(view, surface)
-    probability = confidence(support, contrast, cosine, agreement, config.confidence)
+    normal, cosine = compute_normals(view, surface)
+    probability = compute_confidence(support, contrast, cosine, agreement, config.confidence)
     known = (confirmed | (support >= config.min_support)) & (probability >= config.min_confidence) & (inverse_depth > 0)
     depth = np.divide(1.0, inverse_depth, out=np.zeros(view.shape, np.float32), where=known)
     return DepthMap(
@@ -139,18 +151,18 @@ def depth_map(view: Level, planes: Planes, agreement: Agreement, matching: Match
         normal * known[..., None],
         np.where(known, probability, np.float32(0)),
         np.where(known, agreement.num_consistent, 0).astype(np.uint8),
-        _unchecked(planes),
+        _compute_unchecked_depth(planes),
     )
 
 
-def _unchecked(planes: Planes) -> npt.NDArray[np.float16]:
+def _compute_unchecked_depth(planes: Planes) -> npt.NDArray[np.float16]:
     inverse_depth = planes.values[..., 0]
     depth = np.divide(1.0, inverse_depth, out=np.zeros(inverse_depth.shape, np.float32), where=inverse_depth > 0)
     return np.where(depth < np.finfo(np.float16).max, depth, 0).astype(np.float16)
 
 
-def supported(
-    view: Level, planes: Planes, agreement: Agreement, matching: Matching, config: Config
+def measure_support(
+    view: PyramidLevel, planes: Planes, agreement: Agreement, matching: Matching, config: ConsistencyConfig
 ) -> tuple[Planes, Float32, Float32]:
     """The planes with small holes filled from neighbours, and what tells right ones from wrong ones.
 
@@ -171,7 +183,7 @@ def supported(
     return Planes(filled, planes.costs), support, contrast
 
 
-def confidence(
+def compute_confidence(
     support: Float32, contrast: Float32, cosine: Float32, agreement: Agreement, model: Confidence
 ) -> Float32:
     """(h, w) about the probability that the depth is within 1 %."""
@@ -186,7 +198,7 @@ def confidence(
     return (1 / (1 + np.exp(-log_odds))).astype(np.float32)
 
 
-def normals(view: Level, planes: Planes) -> tuple[Float32, Float32]:
+def compute_normals(view: PyramidLevel, planes: Planes) -> tuple[Float32, Float32]:
     """(h, w, 3) unit normals in the camera frame, facing the camera; (h, w) cosines of their angles to the rays.
 
     Points with n . X = d have inverse depth n . ray / d, so n / d follows from the gradient of the inverse depth.

@@ -8,7 +8,7 @@ import numpy.typing as npt
 Map = npt.NDArray[np.float32]
 
 
-def normals_of_depth(depth: Map, K: npt.NDArray[np.float64], max_step: float = 0.1) -> Map:
+def compute_depth_normals(depth: Map, K: npt.NDArray[np.float64], max_step: float = 0.1) -> Map:
     """(H, W, 3) unit normals in the camera frame, facing the camera; 0 where they are not known.
 
     From the points of the neighbours on both sides (one side at borders and at steps of the depth by more than

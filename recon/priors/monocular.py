@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.networks.crop import Crop
-from splatnode.recon.priors.depth_normals import normals_of_depth
+from splatnode.recon.priors.depth_normals import compute_depth_normals
 from splatnode.recon.priors.pointmap import Pointmap
 
 Map = npt.NDArray[np.float32]
@@ -22,41 +22,41 @@ _ITERATIONS = 15  # of reweighted least squares: the line then moves no more
 _MIN_RESIDUAL = 1e-4  # of the median inverse depth: smaller residuals weigh no more
 
 
-def with_monocular(pointmap: Pointmap, image: npt.NDArray[np.uint8], network: Network) -> Pointmap:
+def fit_monocular_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8], network: Network) -> Pointmap:
     """`pointmap` with the depth and the normals of `network`, which gives inverse depths up to scale and offset.
 
     These two are fitted to the known depths. `image` (h, w, 3) is the view at modelled size. The confidence is 1 where
     the network's depth is known. A view of which too little is known, or that the network contradicts, stays.
     """
-    inverse = _at_image(*network(image), image.shape[:2])
+    inverse = _resample_to_image(*network(image), image.shape[:2])
     known = (pointmap.depth > 0) & (inverse > 0)
     if known.sum() < _MIN_KNOWN:
         return pointmap
-    slope, offset = _fitted(inverse[known], 1.0 / pointmap.depth[known], pointmap.confidence[known])
+    slope, offset = _fit_line(inverse[known], 1.0 / pointmap.depth[known], pointmap.confidence[known])
     if slope <= 0:
         return pointmap
     fitted = slope * inverse + offset
     usable = (inverse > 0) & (fitted > 1.0 / (_MAX_DEPTH * np.median(pointmap.depth[known])))
     depth = np.where(usable, 1.0 / np.where(usable, fitted, 1.0), 0.0).astype(np.float32)
     return replace(
-        pointmap, depth=depth, confidence=usable.astype(np.float32), normal=normals_of_depth(depth, pointmap.K)
+        pointmap, depth=depth, confidence=usable.astype(np.float32), normal=compute_depth_normals(depth, pointmap.K)
     )
 
 
-def _at_image(values: Map, crop: Crop, size: tuple[int, ...]) -> Map:
+def _resample_to_image(values: Map, crop: Crop, size: tuple[int, ...]) -> Map:
     """(h, w) at the size of the image that was cropped, from `values` (H, W) of the crop; 0 outside of it."""
     to_network = np.array([[crop.scale, 0, -crop.left], [0, crop.scale, -crop.top]])
     to_network[:, 2] += 0.5 * crop.scale - 0.5  # from centres at whole numbers to such
 
-    def warped(source: Map, interpolation: int, border: int) -> Map:
+    def warp(source: Map, interpolation: int, border: int) -> Map:
         flags = interpolation | cv2.WARP_INVERSE_MAP
         return np.asarray(cv2.warpAffine(source, to_network, (size[1], size[0]), None, flags, border), np.float32)
 
-    inside = warped(np.ones_like(values), cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
-    return inside * warped(values, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+    inside = warp(np.ones_like(values), cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+    return inside * warp(values, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
 
 
-def _fitted(x: Map, y: Map, weights: Map) -> tuple[float, float]:
+def _fit_line(x: Map, y: Map, weights: Map) -> tuple[float, float]:
     """Slope and offset of the line through points x, y (M,), by weighted least absolute deviations."""
     x64, y64, robust = x.astype(np.float64), y.astype(np.float64), weights.astype(np.float64) + 1e-6
     slope, offset = 0.0, float(np.median(y64))

@@ -42,7 +42,7 @@ class Search:
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class PyramidLevel:
     """A view at one resolution. The centre of the top-left pixel is (0.5, 0.5)."""
 
     grey: npt.NDArray[np.uint8]  # (h, w)
@@ -105,7 +105,7 @@ def make_level(
     T_world_camera: Float64,  # (4, 4)
     depth_range: tuple[float, float],
     level: int,
-) -> Level:
+) -> PyramidLevel:
     """The view at 1 / 2**level of its resolution."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
@@ -116,12 +116,12 @@ def make_level(
     packed = np.empty(grey.shape, np.int32)
     library().patchmatch_pack(pointer(grey), *size, pointer(packed))
     scale = np.diag([size[0] / width, size[1] / height, 1.0])
-    return Level(grey, packed, scale @ K, T_world_camera, depth_range)
+    return PyramidLevel(grey, packed, scale @ K, T_world_camera, depth_range)
 
 
-def improve(
-    view: Level,
-    sources: Sequence[Level],
+def improve_planes(
+    view: PyramidLevel,
+    sources: Sequence[PyramidLevel],
     planes: Planes,
     search: Search,
     matching: Matching,
@@ -151,7 +151,7 @@ def improve(
         *(
             _Source(
                 pointer(source.packed), pointer(depth), source.shape[1], source.shape[0],
-                transfer(view, source), transfer(source, view),
+                compute_transfer(view, source), compute_transfer(source, view),
             )
             for source, depth in zip(sources, depths, strict=True)
         )
@@ -169,7 +169,7 @@ def improve(
     return Planes(values, costs)
 
 
-def transfer(reference: Level, other: Level) -> Transfer:
+def compute_transfer(reference: PyramidLevel, other: PyramidLevel) -> Transfer:
     """The map from pixels and inverse depths of `reference` to pixels of `other`."""
     T_other_reference = np.linalg.inv(other.T_world_camera) @ reference.T_world_camera
     A = other.K @ T_other_reference[:3, :3] @ np.linalg.inv(reference.K)
@@ -177,20 +177,20 @@ def transfer(reference: Level, other: Level) -> Transfer:
     return Transfer((ctypes.c_float * 9)(*A.ravel()), (ctypes.c_float * 3)(*t))
 
 
-def resized(planes: Planes, view: Level) -> Planes:
+def resize_planes(planes: Planes, view: PyramidLevel) -> Planes:
     """The planes for the pixels of another resolution: each pixel takes the plane that its centre falls into."""
     height, width = planes.inverse_depth.shape
     if (height, width) == view.shape:
         return planes
-    rows, down, per_row = _nearest(height, view.shape[0])
-    columns, right, per_column = _nearest(width, view.shape[1])
+    rows, down, per_row = _find_nearest(height, view.shape[0])
+    columns, right, per_column = _find_nearest(width, view.shape[1])
     values = planes.values[rows[:, None], columns[None, :]]
     inverse_depth = values[..., 0] + values[..., 1] * right[None, :] + values[..., 2] * down[:, None]
     resized_values = np.stack([inverse_depth, values[..., 1] * per_column, values[..., 2] * per_row], -1)
     return Planes(resized_values.astype(np.float32), planes.costs[rows[:, None], columns[None, :]])
 
 
-def _nearest(size: int, new_size: int) -> tuple[npt.NDArray[np.intp], Float32, float]:
+def _find_nearest(size: int, new_size: int) -> tuple[npt.NDArray[np.intp], Float32, float]:
     """For each new pixel: the old pixel, the distance from its centre in old pixels; and old pixels per new pixel."""
     step = size / new_size
     centres = (np.arange(new_size) + 0.5) * step

@@ -25,9 +25,9 @@ class Pointmap:
     @property
     def points(self) -> npt.NDArray[np.float32]:
         """(h, w, 3) world points; the camera's centre where the depth is unknown."""
-        return world_points(self.depth, self.T_world_camera, self.K)
+        return compute_world_points(self.depth, self.T_world_camera, self.K)
 
-    def masked(self, keep: npt.NDArray[np.bool_]) -> Pointmap:
+    def apply_mask(self, keep: npt.NDArray[np.bool_]) -> Pointmap:
         """The point map with depth and confidence 0, which is unknown, outside the mask `keep` (h, w).
 
         It shares what the mask does not change: a hundred point maps at a time are most of the memory that is held.
@@ -36,15 +36,15 @@ class Pointmap:
             return self
         return replace(self, depth=self.depth * keep, confidence=self.confidence * keep)
 
-    def hidden(self, mask: npt.NDArray[np.bool_] | None) -> Pointmap:
+    def apply_image_mask(self, mask: npt.NDArray[np.bool_] | None) -> Pointmap:
         """As `masked` by the mask (h, w) of the photograph, whose pixels confirm and deny nothing either."""
         if mask is None:
             return self
         unchecked = None if self.unchecked is None else self.unchecked * mask
-        return replace(self.masked(mask), unchecked=unchecked)
+        return replace(self.apply_mask(mask), unchecked=unchecked)
 
 
-def world_points(
+def compute_world_points(
     depth: npt.NDArray[np.float32],  # (h, w) z in the camera frame
     T_world_camera: npt.NDArray[np.float64],  # (4, 4)
     K: npt.NDArray[np.float64],  # (3, 3)

@@ -44,7 +44,7 @@ class Prior(Protocol):
         return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)
 
 
-def without_hidden(pointmaps: Iterable[Pointmap], graph: ViewGraph) -> dict[str, Pointmap]:
+def apply_image_masks(pointmaps: Iterable[Pointmap], graph: ViewGraph) -> dict[str, Pointmap]:
     """The point maps by name, where nothing is known of what a mask hides."""
     masks = {keyframe.name: keyframe.mask for keyframe in graph.keyframes}
-    return {pointmap.name: pointmap.hidden(masks[pointmap.name]) for pointmap in pointmaps}
+    return {pointmap.name: pointmap.apply_image_mask(masks[pointmap.name]) for pointmap in pointmaps}

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.stereo import MIN_SPARSE_POINTS, SparsePoints, depth_range
+from splatnode.recon.priors.stereo import MIN_SPARSE_POINTS, SparsePoints, estimate_depth_range
 from splatnode.recon.registration.known_poses import axis_depths
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 
@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 _AROUND = 4.0  # times nearer and farther than where the cameras' axes meet: searched of a camera without points
 
 
-def modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
+def compute_modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
     """(3, 3) the intrinsics of a registered camera for its image at modelled size."""
     keyframe = graph.keyframes[camera.index]
 
@@ -23,7 +23,9 @@ def modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
     return np.array([[fx * sx, 0.0, cx * sx], [0.0, fy * sy, cy * sy], [0.0, 0.0, 1.0]])
 
 
-def sparse_points(registration: Registration, camera: RegisteredCamera, scale: tuple[float, float]) -> SparsePoints:
+def select_sparse_points(
+    registration: Registration, camera: RegisteredCamera, scale: tuple[float, float]
+) -> SparsePoints:
     """The registered points that a camera observes: their pixels at modelled size, and their depths.
 
     `scale` is modelled over full width and height, as `Keyframe.scale`.
@@ -35,17 +37,19 @@ def sparse_points(registration: Registration, camera: RegisteredCamera, scale: t
     return SparsePoints(registration.observed_pixels[mine] * scale, depths)
 
 
-def searched_depths(registration: Registration, camera: RegisteredCamera, points: SparsePoints) -> tuple[float, float]:
+def compute_depth_range(
+    registration: Registration, camera: RegisteredCamera, points: SparsePoints
+) -> tuple[float, float]:
     """(near, far) in which a camera's depth is searched: from its `points`; of too few, where others look, too.
 
     A camera that a given pose holds may have no points: those of the others count, and where the axes of cameras meet.
     """
     if int((points.depths > 0).sum()) >= MIN_SPARSE_POINTS or registration.given is None:
-        return depth_range(points.depths)
+        return estimate_depth_range(points.depths)
     T_camera_world = np.linalg.inv(camera.T_world_camera)
     depths = registration.points @ T_camera_world[2, :3] + T_camera_world[2, 3]
     if int((depths > 0).sum()) >= MIN_SPARSE_POINTS:
-        return depth_range(depths)
+        return estimate_depth_range(depths)
     Ts = np.stack([each.T_world_camera for each in registration.cameras])
     depths = axis_depths(np.swapaxes(Ts[:, :3, :3], 1, 2), Ts[:, :3, 3])
     middle = float(np.median(depths)) if len(depths) else 1.0  # the unit of length is the distance to the scene

@@ -18,7 +18,7 @@ Mask = npt.NDArray[np.bool_]
 OVERLAP_STEP = 8  # pixels between the points that tell how much two maps share
 
 
-def overlapping(pointmaps: Sequence[Pointmap], most: int) -> list[list[int]]:
+def find_overlapping(pointmaps: Sequence[Pointmap], most: int) -> list[list[int]]:
     """For each point map the others that share most with it, at most so many, in order.
 
     Two maps share the points of either that fall into the other's image; a point of OVERLAP_STEP squared is asked.
@@ -29,13 +29,13 @@ def overlapping(pointmaps: Sequence[Pointmap], most: int) -> list[list[int]]:
         pointmap.points[::OVERLAP_STEP, ::OVERLAP_STEP][pointmap.depth[::OVERLAP_STEP, ::OVERLAP_STEP] > 0]
         for pointmap in pointmaps
     ]
-    inside = np.array([[_num_inside(points, pointmap) for pointmap in pointmaps] for points in thinned])
+    inside = np.array([[_count_inside(points, pointmap) for pointmap in pointmaps] for points in thinned])
     shared = inside + inside.T
     np.fill_diagonal(shared, -1)
     return [sorted(np.argsort(-row, kind="stable")[:most].tolist()) for row in shared]
 
 
-def _num_inside(points: Float32, pointmap: Pointmap) -> int:
+def _count_inside(points: Float32, pointmap: Pointmap) -> int:
     """How many of the world's points (M, 3) fall into the point map's image."""
     height, width = pointmap.depth.shape
     T_camera_world = np.linalg.inv(pointmap.T_world_camera)
@@ -43,7 +43,7 @@ def _num_inside(points: Float32, pointmap: Pointmap) -> int:
     return int(((z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)).sum())
 
 
-def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
+def project_nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
     """(h, w) depth in the target of the nearest source point that falls into each target pixel; (h, w) its footprint.
 
     The footprint is the point's depth in the source over the focal length: how much of the surface a pixel covers.
@@ -56,7 +56,7 @@ def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
     return depth, footprint
 
 
-def explained(
+def find_explained(
     source: Pointmap, source_image: Image, target: Pointmap, target_image: Image, colour_tolerance: float
 ) -> tuple[Mask, Mask]:
     """(h, w) target pixels on which source points fall; (h, w) those of which one has the pixel's colour.
@@ -72,7 +72,7 @@ def explained(
     return falls > 0, alike > 0
 
 
-def hiding(source: Pointmap, target: Pointmap, tolerance: float) -> Mask:
+def find_hiding(source: Pointmap, target: Pointmap, tolerance: float) -> Mask:
     """(h, w) source pixels whose point lies before the target's surface by more than `tolerance` of its depth."""
     marks = np.zeros(source.depth.shape, np.uint8)
     call = _reprojection(source, target)

@@ -19,8 +19,16 @@ from splatnode.recon.deadline import OutOfTime
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS
 from splatnode.recon.priors import consistency
 from splatnode.recon.priors.consistency import DepthMap
-from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
-from splatnode.recon.workers import each
+from splatnode.recon.priors.patchmatch import (
+    Matching,
+    Planes,
+    PyramidLevel,
+    Search,
+    improve_planes,
+    make_level,
+    resize_planes,
+)
+from splatnode.recon.workers import map_parallel
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +43,7 @@ PROBES = 8, 6, 5  # columns, rows and depths of the grid that stands in for spar
 
 
 @dataclass(frozen=True)
-class Stage:
+class StereoStage:
     """One call of PatchMatch for every view."""
 
     level: int  # works at 1 / 2**level of the resolution
@@ -44,21 +52,21 @@ class Stage:
 
 
 DEFAULT_STAGES = (
-    Stage(2, Search(iterations=4, perturbation=4.0, random_starts=16), geometric=False),
-    Stage(2, Search(iterations=2, perturbation=1.0)),
-    Stage(1, Search(iterations=2, perturbation=1.0)),
-    Stage(0, Search(iterations=1, perturbation=0.5)),
+    StereoStage(2, Search(iterations=4, perturbation=4.0, random_starts=16), geometric=False),
+    StereoStage(2, Search(iterations=2, perturbation=1.0)),
+    StereoStage(1, Search(iterations=2, perturbation=1.0)),
+    StereoStage(0, Search(iterations=1, perturbation=0.5)),
 )
 
 
 @dataclass(frozen=True)
-class Config:
+class StereoConfig:
     num_sources: int = 4  # views that each view is compared with, at most
     num_checked: int = 8  # views that each view's depth is checked against, at most
     best_angle_deg: float = 12.0  # triangulation angle that matches best
-    stages: tuple[Stage, ...] = DEFAULT_STAGES
+    stages: tuple[StereoStage, ...] = DEFAULT_STAGES
     matching: Matching = field(default_factory=Matching)
-    consistency: consistency.Config = field(default_factory=consistency.Config)
+    consistency: consistency.ConsistencyConfig = field(default_factory=consistency.ConsistencyConfig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +99,9 @@ class SparsePoints:
     depths: Float64  # (M,) z in the camera frame
 
 
-def depth_maps(
+def estimate_depth_maps(
     views: Sequence[StereoView],
-    config: Config,
+    config: StereoConfig,
     *,
     seed: int = 0,
     sparse: Sequence[SparsePoints | None] | None = None,
@@ -108,22 +116,22 @@ def depth_maps(
     if len(known_points) != len(views):
         raise ValueError(f"sparse must have one entry a view, got {len(known_points)} for {len(views)} views")
     partners = [rank_partners(views, index, config, known_points[index]) for index in range(len(views))]
-    sources = [compared_with(ranked, config) for ranked in partners]
+    sources = [select_sources(ranked, config) for ranked in partners]
     finest = config.stages[-1].level
-    levels: dict[int, list[Level]] = {}
+    levels: dict[int, list[PyramidLevel]] = {}
     planes: list[Planes] = []
     for stream, stage in enumerate(config.stages):
         if stage.level not in levels:
-            levels[stage.level] = each(_level, views, [stage.level] * len(views))
+            levels[stage.level] = map_parallel(_make_level, views, [stage.level] * len(views))
         at_level = levels[stage.level]
         if not planes:
-            planes = each(_start_or_unknown, views, at_level, known_points)
-        planes = each(resized, planes, at_level)
+            planes = map_parallel(_initialize_or_unknown, views, at_level, known_points)
+        planes = map_parallel(resize_planes, planes, at_level)
         improved = list(planes)
         try:
             for i in (index for index, chosen in enumerate(sources) if chosen):
-                _ask(pause, may_end=stream >= NEEDED_STAGES)
-                improved[i] = improve(
+                _call_pause(pause, may_end=stream >= NEEDED_STAGES)
+                improved[i] = improve_planes(
                     at_level[i], [at_level[j] for j in sources[i]], planes[i], stage.search, config.matching,
                     known={n: planes[j].inverse_depth for n, j in enumerate(sources[i])} if stage.geometric else {},
                     seed=seed, stream=stream,
@@ -133,13 +141,13 @@ def depth_maps(
             break
         planes = improved
     if finest not in levels:
-        levels[finest] = each(_level, views, [finest] * len(views))
-    planes = each(resized, planes, levels[finest])
-    checked = [checked_against(ranked, config) for ranked in partners]
+        levels[finest] = map_parallel(_make_level, views, [finest] * len(views))
+    planes = map_parallel(resize_planes, planes, levels[finest])
+    checked = [select_check_views(ranked, config) for ranked in partners]
     return consistency.cross_check(levels[finest], planes, checked, config.matching, config.consistency)
 
 
-def _ask(pause: Callable[[], None], may_end: bool) -> None:
+def _call_pause(pause: Callable[[], None], may_end: bool) -> None:
     """Pauses; work that is needed goes on when time is over."""
     try:
         pause()
@@ -148,11 +156,11 @@ def _ask(pause: Callable[[], None], may_end: bool) -> None:
             raise
 
 
-def further_depth_map(
+def estimate_further_depth_map(
     views: Sequence[StereoView],
     index: int,
     depths: Mapping[int, Float32],
-    config: Config,
+    config: StereoConfig,
     *,
     seed: int = 0,
     sparse: SparsePoints | None = None,
@@ -164,21 +172,23 @@ def further_depth_map(
     views, no further view would ever find one.
     """
     partners = rank_partners(views, index, config, sparse)
-    sources = compared_with(partners, config)
+    sources = select_sources(partners, config)
     known = {n: depths[j] for n, j in enumerate(sources) if j in depths}
-    planes = estimate(views[index], [views[j] for j in sources], config, seed=seed, sparse=sparse, known=known)
+    planes = estimate_planes(views[index], [views[j] for j in sources], config, seed=seed, sparse=sparse, known=known)
     finest = config.stages[-1].level
     checked = [j for j, _ in partners if j in depths][: config.num_checked]
-    levels = {j: _level(views[j], finest) for j in (index, *checked)}
-    others = [resized(_flat(depths[j]), levels[j]) for j in checked]
-    agreeing = consistency.agreement(levels[index], planes, [levels[j] for j in checked], others, config.consistency)
-    return consistency.depth_map(levels[index], planes, agreeing, config.matching, config.consistency)
+    levels = {j: _make_level(views[j], finest) for j in (index, *checked)}
+    others = [resize_planes(_make_flat_planes(depths[j]), levels[j]) for j in checked]
+    agreeing = consistency.compute_agreement(
+        levels[index], planes, [levels[j] for j in checked], others, config.consistency
+    )
+    return consistency.make_depth_map(levels[index], planes, agreeing, config.matching, config.consistency)
 
 
-def estimate(
+def estimate_planes(
     view: StereoView,
     sources: Sequence[StereoView],
-    config: Config,
+    config: StereoConfig,
     *,
     seed: int = 0,
     sparse: SparsePoints | None = None,
@@ -188,14 +198,14 @@ def estimate(
 
     `known` gives the depth maps (h, w), 0 where unknown, of the sources with these positions that have one already.
     """
-    known_planes = {n: _flat(depth) for n, depth in (known or {}).items()}
+    known_planes = {n: _make_flat_planes(depth) for n, depth in (known or {}).items()}
     planes: Planes | None = None
     for stream, stage in enumerate(config.stages):
-        level, source_levels = _level(view, stage.level), [_level(source, stage.level) for source in sources]
-        planes = resized(planes, level) if planes else _start(view, level, sparse)
-        planes = improve(
+        level, source_levels = _make_level(view, stage.level), [_make_level(source, stage.level) for source in sources]
+        planes = resize_planes(planes, level) if planes else _initialize_planes(view, level, sparse)
+        planes = improve_planes(
             level, source_levels, planes, stage.search, config.matching,
-            known={n: resized(p, source_levels[n]).inverse_depth for n, p in known_planes.items()},
+            known={n: resize_planes(p, source_levels[n]).inverse_depth for n, p in known_planes.items()},
             seed=seed, stream=stream,
         )  # fmt: skip
     if planes is None:
@@ -203,18 +213,18 @@ def estimate(
     return planes
 
 
-def compared_with(partners: Sequence[tuple[int, float]], config: Config) -> list[int]:
-    """Of a view's ranked partners, those that it is compared with, best first; maybe none."""
+def select_sources(partners: Sequence[tuple[int, float]], config: StereoConfig) -> list[int]:
+    """Selects the views to match against from a view's ranked partners, best first; maybe none."""
     return [other for other, score in partners[: config.num_sources] if score > MIN_SOURCE_SCORE]
 
 
-def checked_against(partners: Sequence[tuple[int, float]], config: Config) -> list[int]:
-    """Of a view's ranked partners, those that its depth is checked against."""
+def select_check_views(partners: Sequence[tuple[int, float]], config: StereoConfig) -> list[int]:
+    """Selects the views that check the depth from a view's ranked partners."""
     return [other for other, _ in partners[: config.num_checked]]
 
 
 def rank_partners(
-    views: Sequence[StereoView], index: int, config: Config, sparse: SparsePoints | None = None
+    views: Sequence[StereoView], index: int, config: StereoConfig, sparse: SparsePoints | None = None
 ) -> list[tuple[int, float]]:
     """All other views with how well view `index` can be compared with them, in [0, 1], best first.
 
@@ -222,18 +232,20 @@ def rank_partners(
     small tells nothing, too large does not match. The probes are the sparse points, or a grid over the depth range.
     """
     view = views[index]
-    pixels, depths = (sparse.points, sparse.depths) if sparse is not None and len(sparse.points) else _probes(view)
+    pixels, depths = (sparse.points, sparse.depths) if sparse is not None and len(sparse.points) else _make_probes(view)
     rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(view.K).T
     world = (rays * depths[:, None]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
     scores = {
-        other: float((_inside(candidate, world) * _angle_score(view, candidate, world, config.best_angle_deg)).mean())
+        other: float(
+            (_is_inside(candidate, world) * _score_angles(view, candidate, world, config.best_angle_deg)).mean()
+        )
         for other, candidate in enumerate(views)
         if other != index
     }
     return sorted(scores.items(), key=lambda scored: -scored[1])
 
 
-def depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:
+def estimate_depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:
     """(near, far) to search, from the depths (M,) of sparse points of a view: robust extremes, widened by `margin`.
 
     Raises ValueError below MIN_SPARSE_POINTS positive depths.
@@ -247,21 +259,21 @@ def depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:
     return float(near / margin), float(far * margin)
 
 
-def _level(view: StereoView, level: int) -> Level:
+def _make_level(view: StereoView, level: int) -> PyramidLevel:
     return make_level(view.image, view.K, view.T_world_camera, view.depth_range, level)
 
 
-def _start_or_unknown(view: StereoView, level: Level, sparse: SparsePoints | None) -> Planes:
+def _initialize_or_unknown(view: StereoView, level: PyramidLevel, sparse: SparsePoints | None) -> Planes:
     """As `_start`; all unknown, which the log tells, where a library fails on this view's points."""
     try:
-        return _start(view, level, sparse)
+        return _initialize_planes(view, level, sparse)
     except LIBRARY_ERRORS as error:
         raise_shortage(error)
         log.warning("%s: stereo begins without its sparse points: %s", view.name, error)
-        return _start(view, level, None)
+        return _initialize_planes(view, level, None)
 
 
-def _start(view: StereoView, level: Level, sparse: SparsePoints | None) -> Planes:
+def _initialize_planes(view: StereoView, level: PyramidLevel, sparse: SparsePoints | None) -> Planes:
     """The depth of the nearest sparse point, facing the camera; all unknown where there are no sparse points."""
     values = np.zeros((*level.shape, 3), np.float32)
     if sparse is not None and len(sparse.points):
@@ -279,7 +291,7 @@ def _start(view: StereoView, level: Level, sparse: SparsePoints | None) -> Plane
     return Planes(values, np.zeros(level.shape, np.float32))
 
 
-def _probes(view: StereoView) -> tuple[Float64, Float64]:
+def _make_probes(view: StereoView) -> tuple[Float64, Float64]:
     """(M, 2) pixels and (M,) depths of a grid in the view's frustum, even in the logarithm of depth."""
     height, width = view.image.shape[:2]
     near, far = view.depth_range
@@ -289,7 +301,7 @@ def _probes(view: StereoView) -> tuple[Float64, Float64]:
     return np.stack([u.ravel(), v.ravel()], 1), z.ravel()
 
 
-def _inside(view: StereoView, world: Float64) -> npt.NDArray[np.bool_]:
+def _is_inside(view: StereoView, world: Float64) -> npt.NDArray[np.bool_]:
     """Which of the points (M, 3) fall into the view's image."""
     T_camera_world = np.linalg.inv(view.T_world_camera)
     x, y, z = view.K @ (T_camera_world[:3, :3] @ world.T + T_camera_world[:3, 3:])
@@ -297,7 +309,7 @@ def _inside(view: StereoView, world: Float64) -> npt.NDArray[np.bool_]:
     return (z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)
 
 
-def _angle_score(view: StereoView, other: StereoView, world: Float64, best_angle_deg: float) -> Float64:
+def _score_angles(view: StereoView, other: StereoView, world: Float64, best_angle_deg: float) -> Float64:
     """(M,) in [0, 1]: how well the angle at each point between the rays of two views suits matching.
 
     A Gaussian around the best angle, narrow below it, where depth is uncertain, and wide above it, where views differ.
@@ -309,7 +321,7 @@ def _angle_score(view: StereoView, other: StereoView, world: Float64, best_angle
     return np.exp(-0.5 * ((angle - best_angle_deg) / spread) ** 2)
 
 
-def _flat(depth: Float32) -> Planes:
+def _make_flat_planes(depth: Float32) -> Planes:
     """Planes of these depths (h, w), 0 where unknown, that face the camera."""
     inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
     return Planes(np.stack([inverse, np.zeros_like(depth), np.zeros_like(depth)], -1), np.zeros_like(depth))

@@ -15,7 +15,13 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.rasterize.check import check_input
-from splatnode.recon.rasterize.native import CHANNEL_BITS, RasterGradients, RasterImages, raster_forward, raster_input
+from splatnode.recon.rasterize.native import (
+    CHANNEL_BITS,
+    RasterGradients,
+    RasterImages,
+    make_raster_input,
+    raster_forward,
+)
 from splatnode.recon.rasterize.reference import CHANNELS, NEAR
 from splatnode.recon.rasterize.render import Render
 
@@ -51,7 +57,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh, T_world_camera, K, settings):
         width, height, channels, antialias, near = settings
-        source = raster_input(
+        source = make_raster_input(
             means.shape[0],
             sh.shape[1],
             [tensor.data_ptr() for tensor in (means, quats, scales, opacities, sh)],

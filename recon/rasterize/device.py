@@ -17,11 +17,11 @@ class DeviceUnavailable(RuntimeError):
     exit_code = 69
 
 
-def chosen(wanted: Device) -> torch.device:
+def choose_device(wanted: Device) -> torch.device:
     """The device to compute on. Raises DeviceUnavailable for a GPU that cannot be used, with the reason."""
     if wanted == "cpu":
         return torch.device("cpu")
-    obstacle = gsplat.obstacle()
+    obstacle = gsplat.find_unavailable_reason()
     if obstacle is None:
         return torch.device("cuda")
     if wanted == "cuda":
@@ -32,8 +32,8 @@ def chosen(wanted: Device) -> torch.device:
     return torch.device("cpu")
 
 
-def in_words(wanted: Device, device: torch.device) -> str:
+def format_device(wanted: Device, device: torch.device) -> str:
     """One line about `chosen(wanted)`, for the log."""
     if device.type == "cuda":
         return f"scenes are refined on {torch.cuda.get_device_name(device)}, by gsplat"
-    return "scenes are refined on the processor" + (f": {gsplat.obstacle()}" if wanted == "auto" else "")
+    return "scenes are refined on the processor" + (f": {gsplat.find_unavailable_reason()}" if wanted == "auto" else "")

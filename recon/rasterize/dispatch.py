@@ -13,7 +13,7 @@ from splatnode.recon.rasterize import cpu, gsplat
 from splatnode.recon.rasterize.render import Render
 
 
-def by_core(tensor: Tensor) -> bool:
+def is_on_cpu(tensor: Tensor) -> bool:
     """Whether the compiled core computes with this tensor."""
     return tensor.device.type == "cpu"
 
@@ -23,14 +23,14 @@ def rasterize(means: Tensor, *further: Any, **options: Any) -> Render:
 
     `gsplat.rasterize` says where the two differ. The camera may be on another device than the Gaussians are.
     """
-    return (cpu.rasterize if by_core(means) else gsplat.rasterize)(means, *further, **options)
+    return (cpu.rasterize if is_on_cpu(means) else gsplat.rasterize)(means, *further, **options)
 
 
-def rasterizer(device: torch.device) -> Callable[..., Render]:
+def make_rasterizer(device: torch.device) -> Callable[..., Render]:
     """A `rasterize` that computes on `device` and takes and gives tensors on the processor. It can be pickled."""
     return rasterize if device.type == "cpu" else partial(_rasterize_on, device)
 
 
 def _rasterize_on(device: torch.device, means: Tensor, *further: Any, **options: Any) -> Render:
     tensors = (each.to(device) if isinstance(each, Tensor) else each for each in further)
-    return rasterize(means.to(device), *tensors, **options).on(torch.device("cpu"))
+    return rasterize(means.to(device), *tensors, **options).move_to_device(torch.device("cpu"))

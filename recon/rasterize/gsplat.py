@@ -56,27 +56,29 @@ def rasterize(
     """
     check_input(means, quats, scales, opacities, sh, T_world_camera, K, width, height, channels, near, "cuda")
     if not len(means):
-        return _blank(sum(tensor.sum() for tensor in (means, quats, scales, opacities, sh)), channels, width, height)
+        return _render_blank(
+            sum(tensor.sum() for tensor in (means, quats, scales, opacities, sh)), channels, width, height
+        )
     T_world_camera, K = (tensor.to(means, non_blocking=True) for tensor in (T_world_camera, K))
-    placed = means, None, quats, scales, _inverted(T_world_camera)
+    placed = means, None, quats, scales, _invert_motion(T_world_camera)
     if K.requires_grad:
-        placed = _warped(means, quats, scales, T_world_camera, K)
-    splats = _projected(*placed, opacities, K.detach(), (width, height), antialias, near)
+        placed = _warp_gaussians(means, quats, scales, T_world_camera, K)
+    splats = _project_gaussians(*placed, opacities, K.detach(), (width, height), antialias, near)
     features = []
     if "rgb" in channels:
-        features.append(_colours(sh, means, T_world_camera, splats.radii))
+        features.append(_compute_colours(sh, means, T_world_camera, splats.radii))
     if "depth" in channels:
         features.append(splats.depths[0, :, None])
     if "normal" in channels:
-        features.append(_normals(means, quats, scales, T_world_camera))
+        features.append(_compute_normals(means, quats, scales, T_world_camera))
     if not features:
         features.append(torch.ones_like(means[:, :1]))
     blended = torch.cat(features, 1) if len(features) > 1 else features[0]
-    return _split(*_blend(splats, blended, width, height), channels)
+    return _split_channels(*_blend(splats, blended, width, height), channels)
 
 
-def obstacle() -> str | None:
-    """What keeps gsplat from computing on a GPU here, as the end of a sentence; None where nothing does.
+def find_unavailable_reason() -> str | None:
+    """Returns why gsplat cannot compute on a GPU here, as the end of a sentence; None where it can.
 
     The first time on a machine with a GPU this compiles gsplat's kernels, which takes minutes.
     """
@@ -91,11 +93,11 @@ def obstacle() -> str | None:
     return None
 
 
-def _package() -> Any:
+def _import_gsplat() -> Any:
     return import_module("gsplat")
 
 
-def intrinsics_warp(K: Tensor) -> Tensor:
+def compute_intrinsics_warp(K: Tensor) -> Tensor:
     """(3, 3) map of the camera frame that is the identity in value, with the gradient of projecting with `K`.
 
     With the intrinsics held at their value, moving x by (fx' / fx) x + ((cx' - cx) / fx) z moves the projection as
@@ -117,11 +119,11 @@ class _Splats:
     opacities: Tensor  # (1, N)
 
 
-def _warped(
+def _warp_gaussians(
     means: Tensor, quats: Tensor, scales: Tensor, T_world_camera: Tensor, K: Tensor
 ) -> tuple[Tensor, Tensor, None, None, Tensor]:
     """The Gaussians in the camera frame, warped, as `_projected` takes them: some times as many launches."""
-    R_world_camera, warp = T_world_camera[:3, :3], intrinsics_warp(K)
+    R_world_camera, warp = T_world_camera[:3, :3], compute_intrinsics_warp(K)
     means_camera = (means - T_world_camera[:3, 3]) @ R_world_camera
     scaled_axes = warp @ R_world_camera.T @ (matrices_from_quats(quats) * scales[:, None])
     covariances = (scaled_axes @ scaled_axes.mT).flatten(1)[:, [0, 1, 2, 4, 5, 8]]
@@ -129,7 +131,7 @@ def _warped(
     return means_camera @ warp.T, covariances, None, None, identity
 
 
-def _projected(
+def _project_gaussians(
     means: Tensor,  # (N, 3)
     covariances: Tensor | None,  # (N, 6) upper triangles; None: by what follows
     quats: Tensor | None,  # (N, 4)
@@ -141,8 +143,8 @@ def _projected(
     antialias: bool,
     near: float,
 ) -> _Splats:
-    """By gsplat. Nothing is drawn of what the guard leaves out."""
-    radii, centres, depths, conics, compensations = _package().fully_fused_projection(
+    """Projects the Gaussians by gsplat. Those outside the guard are not drawn."""
+    radii, centres, depths, conics, compensations = _import_gsplat().fully_fused_projection(
         means, covariances, quats, scales, T_camera_world[None], K[None], *size,
         eps2d=LOW_PASS, near_plane=near, calc_compensations=antialias, opacities=opacities,
     )  # fmt: skip
@@ -159,14 +161,14 @@ def _guard(size: tuple[int, int], dtype: torch.dtype, device: torch.device) -> t
     return -GUARD * sides, (1 + GUARD) * sides
 
 
-def _inverted(T: Tensor) -> Tensor:
+def _invert_motion(T: Tensor) -> Tensor:
     """The inverse of a rigid motion (4, 4): the transposed rotation after the shift back, in three launches."""
-    last, turn, one, shift = _parts_of_motion(T.dtype, T.device)
+    last, turn, one, shift = _make_motion_masks(T.dtype, T.device)
     return torch.addcmul(last, T.mT, turn) @ torch.addcmul(one, T, shift, value=-1)
 
 
 @lru_cache(maxsize=8)
-def _parts_of_motion(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _make_motion_masks(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(4, 4) each: the last diagonal element, where the rotation is, the identity, and where the shift is."""
     one = torch.eye(4)
     last, turn, shift = torch.zeros(3, 4, 4)
@@ -177,7 +179,7 @@ def _parts_of_motion(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, 
 
 def _blend(splats: _Splats, features: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """The features (N, D) in each pixel (H, W, D), and what is seen of Gaussians there (H, W)."""
-    gsplat = _package()
+    gsplat = _import_gsplat()
     across, down = math.ceil(width / _TILE), math.ceil(height / _TILE)
     _, places, which = gsplat.isect_tiles(splats.centres, splats.radii, splats.depths, _TILE, across, down)
     offsets = gsplat.isect_offset_encode(places, 1, across, down)
@@ -187,18 +189,20 @@ def _blend(splats: _Splats, features: Tensor, width: int, height: int) -> tuple[
     return accumulated.squeeze(0), alpha.view(height, width)
 
 
-def _colours(sh: Tensor, means: Tensor, T_world_camera: Tensor, radii: Tensor) -> Tensor:
+def _compute_colours(sh: Tensor, means: Tensor, T_world_camera: Tensor, radii: Tensor) -> Tensor:
     """(N, 3) colours max(0, 0.5 + SH) as the camera sees them; anything where a radius is 0."""
     if sh.shape[1] == 1:
         colours = torch.add(torch.tensor(0.5, dtype=sh.dtype), sh.squeeze(1), alpha=SH_C0)
     else:
         degree, directions = math.isqrt(sh.shape[1]) - 1, means - T_world_camera[:3, 3]
-        colours = 0.5 + _package().spherical_harmonics(degree, directions, sh, masks=(radii > 0).all(-1).squeeze(0))
+        colours = 0.5 + _import_gsplat().spherical_harmonics(
+            degree, directions, sh, masks=(radii > 0).all(-1).squeeze(0)
+        )
     # As `clamp(min=0)`, whose gradient passes at 0, too, but this takes one launch for its gradient instead of three.
     return functional.threshold(colours, -1e-30, 0.0)
 
 
-def _normals(means: Tensor, quats: Tensor, scales: Tensor, T_world_camera: Tensor) -> Tensor:
+def _compute_normals(means: Tensor, quats: Tensor, scales: Tensor, T_world_camera: Tensor) -> Tensor:
     """(N, 3) the axes of least scale in the camera frame, turned to face the camera, as `reference.normals`."""
     thinnest = scales.detach().argmin(1)[:, None, None].expand(-1, 3, 1)
     axes = matrices_from_quats(quats).gather(2, thinnest).squeeze(2)
@@ -208,7 +212,7 @@ def _normals(means: Tensor, quats: Tensor, scales: Tensor, T_world_camera: Tenso
     return (axes * signs) @ T_world_camera[:3, :3]
 
 
-def _split(accumulated: Tensor, alpha: Tensor, channels: Collection[str]) -> Render:
+def _split_channels(accumulated: Tensor, alpha: Tensor, channels: Collection[str]) -> Render:
     names = [name for name in _SIZES if name in channels]
     parts = accumulated.split([_SIZES[name] for name in names], -1) if len(names) > 1 else [accumulated]
     found = dict(zip(names, parts, strict=False))
@@ -218,7 +222,7 @@ def _split(accumulated: Tensor, alpha: Tensor, channels: Collection[str]) -> Ren
     return Render(found.get("rgb"), depth, found.get("normal"), alpha if "alpha" in channels else None)
 
 
-def _blank(anything: Tensor | int, channels: Collection[str], width: int, height: int) -> Render:
+def _render_blank(anything: Tensor | int, channels: Collection[str], width: int, height: int) -> Render:
     """An image of nothing, whose gradients are zeros."""
     plane = (0 * torch.as_tensor(anything)).expand(height, width)
     coloured = plane[..., None].expand(height, width, 3)

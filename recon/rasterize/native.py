@@ -50,7 +50,7 @@ class RasterGradients(ctypes.Structure):
 
 
 class Raster:
-    """What the core keeps of a rendered view for its gradient. Gives it back when nothing refers to it any more."""
+    """The core's state of a rendered view, for its gradient. It is released with its last reference."""
 
     def __init__(self, core: ctypes.CDLL, handle: ctypes.c_void_p):
         self.core = core
@@ -60,14 +60,14 @@ class Raster:
         self.core.core_raster_release(self.handle)
 
     def seconds(self) -> tuple[dict[str, float], dict[str, float]]:
-        """By stage, of the last forward and backward: seconds on the clock, and of all processors together."""
+        """Returns seconds by stage of the last forward and backward: wall clock, and summed over processors."""
         values = (ctypes.c_double * (2 * len(STAGES)))()
         self.core.core_raster_seconds(self.handle, values)
         clock, processors = values[: len(STAGES)], values[len(STAGES) :]
         return dict(zip(STAGES, clock, strict=True)), dict(zip(STAGES, processors, strict=True))
 
 
-def raster_input(
+def make_raster_input(
     num_gaussians: int,
     sh_bases: int,
     addresses: Sequence[int],  # of means, quats, scales, opacities and sh: float32, contiguous, alive while it is used

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.rasterize.render import Render
-from splatnode.recon.result.spherical_harmonics import terms
+from splatnode.recon.result.spherical_harmonics import compute_sh_terms
 
 CHANNELS = ("rgb", "depth", "normal", "alpha")
 LOW_PASS = 0.3  # px^2, added to the variance of every splat: none is thinner than a pixel
@@ -50,7 +50,7 @@ def rasterize(
     With `antialias` the opacity is lowered by what the low-pass filter added to the splat's area.
     """
     splats = project(means, quats, scales, opacities, sh, T_world_camera, K, width, height, antialias, near)
-    weights = blend_weights(splats, width, height)  # (H W, N)
+    weights = compute_blend_weights(splats, width, height)  # (H W, N)
     alpha = weights.sum(1)
     image = (height, width)
     rgb = depth = normal = None
@@ -93,9 +93,9 @@ def project(
     R_world_camera, centre = T_world_camera[:3, :3], T_world_camera[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means_camera = (means - centre) @ R_world_camera
-    seen = nearest_first(means_camera, K, width, height, near)
+    seen = sort_visible(means_camera, K, width, height, near)
     x, y, z = means_camera[seen].unbind(1)
-    axes = R_world_camera.T @ rotations(quats[seen])  # (M, 3, 3), columns in the camera frame
+    axes = R_world_camera.T @ compute_rotations(quats[seen])  # (M, 3, 3), columns in the camera frame
     zero = torch.zeros_like(z)
     jacobians = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], 1).view(-1, 2, 3)
     scaled = jacobians @ axes * scales[seen, None]  # (M, 2, 3)
@@ -110,14 +110,14 @@ def project(
         centres=torch.stack([fx * x / z + cx, fy * y / z + cy], 1),
         covariances=covariances,
         opacities=visible_opacities,
-        colours=colours(sh[seen], means[seen] - centre),
+        colours=compute_colours(sh[seen], means[seen] - centre),
         depths=z,
-        normals=normals(axes, scales[seen], means_camera[seen]),
+        normals=compute_normals(axes, scales[seen], means_camera[seen]),
     )
 
 
 @torch.no_grad()
-def nearest_first(means_camera: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
+def sort_visible(means_camera: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
     """(M,) which of the means (N, 3) in the camera frame are drawn: in front and inside the guard, sorted by depth."""
     x, y, z = means_camera.unbind(1)
     u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
@@ -126,7 +126,7 @@ def nearest_first(means_camera: Tensor, K: Tensor, width: int, height: int, near
     return seen[torch.argsort(z[seen], stable=True)]
 
 
-def blend_weights(splats: Splats, width: int, height: int) -> Tensor:
+def compute_blend_weights(splats: Splats, width: int, height: int) -> Tensor:
     """(H W, M) the part of every splat in every pixel: its alpha times what the nearer ones let through."""
     dtype, device = splats.centres.dtype, splats.centres.device
     rows = torch.arange(height, dtype=dtype, device=device) + 0.5
@@ -141,7 +141,7 @@ def blend_weights(splats: Splats, width: int, height: int) -> Tensor:
     return torch.where(before >= TRANSMITTANCE_MIN, alphas * before, 0)
 
 
-def rotations(quats: Tensor) -> Tensor:
+def compute_rotations(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotation matrices of quaternions (N, 4) wxyz of any length."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     return torch.stack(
@@ -154,19 +154,19 @@ def rotations(quats: Tensor) -> Tensor:
     ).view(-1, 3, 3)  # fmt: skip
 
 
-def colours(sh: Tensor, directions: Tensor) -> Tensor:
+def compute_colours(sh: Tensor, directions: Tensor) -> Tensor:
     """(N, 3) colours max(0, 0.5 + SH) of coefficients (N, B, 3) seen along `directions` (N, 3) of any length."""
-    basis = sh_basis(directions / directions.norm(dim=1, keepdim=True), sh.shape[1])
+    basis = compute_sh_basis(directions / directions.norm(dim=1, keepdim=True), sh.shape[1])
     return (0.5 + torch.einsum("nb,nbc->nc", basis, sh)).clamp(min=0)
 
 
-def sh_basis(directions: Tensor, bases: int) -> Tensor:
+def compute_sh_basis(directions: Tensor, bases: int) -> Tensor:
     """(N, B) real spherical harmonics of unit vectors (N, 3), in the order and with the signs of 3DGS."""
     x, y, z = directions.unbind(1)
-    return torch.stack(terms(x, y, z, bases), 1)
+    return torch.stack(compute_sh_terms(x, y, z, bases), 1)
 
 
-def normals(axes: Tensor, scales: Tensor, means_camera: Tensor) -> Tensor:
+def compute_normals(axes: Tensor, scales: Tensor, means_camera: Tensor) -> Tensor:
     """(N, 3) the axis of least scale (of equal ones the first), turned to face the camera."""
     first, second, third = scales.unbind(1)
     thinnest = torch.where((first <= second) & (first <= third), 0, torch.where(second <= third, 1, 2))

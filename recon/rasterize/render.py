@@ -17,7 +17,7 @@ class Render:
     normal: Tensor | None  # (H, W, 3) sum of w_k n_k in the camera frame, facing the camera (equation 4)
     alpha: Tensor | None  # (H, W) sum of w_k
 
-    def on(self, device: torch.device) -> Render:
+    def move_to_device(self, device: torch.device) -> Render:
         """The same image on `device`; gradients find their way back."""
         channels = (self.rgb, self.depth, self.normal, self.alpha)
         return Render(*(None if channel is None else channel.to(device) for channel in channels))

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.core import library, pointer
-from splatnode.recon.geometry import distortion, without_distortion
+from splatnode.recon.geometry import distortion, undistort_rays
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -47,17 +47,17 @@ class GivenPoses:
         return 1.0 / self.sigmas**2
 
     @property
-    def known(self) -> npt.NDArray[np.bool_]:
+    def is_held(self) -> npt.NDArray[np.bool_]:
         """(C,) whether a pose holds its camera."""
         return np.asarray(np.isfinite(self.sigmas).all(1))
 
-    def without(self, cameras: Sequence[int]) -> GivenPoses:
+    def release(self, cameras: Sequence[int]) -> GivenPoses:
         """Those of these cameras hold nothing any more."""
         sigmas = self.sigmas.copy()
         sigmas[list(cameras)] = np.inf
         return replace(self, sigmas=sigmas)
 
-    def relabelled(self, old: Index) -> GivenPoses:
+    def relabel(self, old: Index) -> GivenPoses:
         """Camera i has the pose of camera `old[i]`."""
         return GivenPoses(self.rotations[old], self.centres[old], self.sigmas[old])
 
@@ -85,7 +85,7 @@ class Problem:
         return np.ones(len(self.log_focals)) if self.log_aspects is None else np.exp(self.log_aspects)
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class BundleAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_px: float = 1.0  # scale of the Cauchy loss, pixels
     noise_px: float = 1.0  # standard deviation of an observation, pixels: its weight against the priors
     max_iterations: int = 40
@@ -93,8 +93,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Common:
-    """What lenses of one group have in common: each parameter is a common value plus a deviation of the lens.
+class CommonLensPrior:
+    """The prior that a group's lenses share: each parameter is a common value plus a lens's deviation.
 
     The sigmas of `LensPrior` then are those of the deviations; the common values have these, around the same means.
     They are eliminated: the prior of a group has the covariance own^2 I + common^2 1 1^T.
@@ -105,8 +105,8 @@ class Common:
 
 
 @dataclass(frozen=True, eq=False)
-class Ties:
-    """What holds lenses near others: the difference of their parameters has these sigmas around zero."""
+class LensTies:
+    """The ties between lenses: the difference of their parameters has these sigmas around zero."""
 
     to: Index  # (G,) the lens that each is near; -1: none
     sigmas: Array  # (G, 6) of the differences; 0: this parameter is not tied
@@ -121,8 +121,8 @@ class LensPrior:
     radial_sigmas: Array  # (G, 2) around zero
     shift_sigmas: Array  # (G,) pixels around the nominal principal point
     aspect_sigmas: Array | None = None  # (G,) of log aspect around zero; None: fixed
-    common: Common | None = None  # None: each lens is independent of the others, but for `ties`
-    ties: Ties | None = None
+    common: CommonLensPrior | None = None  # None: each lens is independent of the others, but for `ties`
+    ties: LensTies | None = None
 
     @property
     def means(self) -> Array:
@@ -148,7 +148,7 @@ class LensPrior:
         count = len(own)
         if self.common is None:
             alone = np.diag(np.where(free, 1.0 / np.where(free, own, 1.0) ** 2, 0.0).ravel())
-            return alone if self.ties is None else alone + self._of_ties(self.ties, free)
+            return alone if self.ties is None else alone + self._tie_information(self.ties, free)
         information = np.zeros((count, _LENS, count, _LENS))
         for group in np.unique(self.common.group_of):
             (members,) = np.nonzero(self.common.group_of == group)
@@ -162,7 +162,7 @@ class LensPrior:
         return information.reshape(count * _LENS, count * _LENS)
 
     @staticmethod
-    def _of_ties(ties: Ties, free: npt.NDArray[np.bool_]) -> Array:
+    def _tie_information(ties: LensTies, free: npt.NDArray[np.bool_]) -> Array:
         """(6 G, 6 G); one end of a tie may be fixed."""
         information = np.zeros((free.size, free.size))
         for lens, k in zip(*np.nonzero((ties.to[:, None] >= 0) & (ties.sigmas > 0) & free), strict=True):
@@ -176,7 +176,7 @@ class LensPrior:
         return information
 
 
-def without_points(
+def make_empty_problem(
     rotations: Array, translations: Array, lens_of_camera: Index, log_focals: Array, radials: Array, shifts: Array
 ) -> Problem:
     """A problem of cameras and lenses that has no points and observations yet. Shapes as in `Problem`."""
@@ -190,7 +190,7 @@ def focal_prior(log_focals: Array, sigmas: Array) -> LensPrior:
     return LensPrior(log_focals, sigmas, np.zeros((count, 2)), np.zeros(count))
 
 
-def with_pose(problem: Problem, camera: int, rotation: Array, translation: Array) -> Problem:
+def replace_pose(problem: Problem, camera: int, rotation: Array, translation: Array) -> Problem:
     """The problem with another pose of `camera`, world to camera."""
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
     rotations[camera], translations[camera] = rotation, translation
@@ -218,7 +218,7 @@ def normalise(problem: Problem, camera: Index, pixels: Array) -> Array:
     """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
     lens = problem.lens_of_camera[camera]
     distorted = (pixels - problem.shifts[lens]) / _focals(problem, lens)
-    return without_distortion(distorted, problem.radials[lens])
+    return undistort_rays(distorted, problem.radials[lens])
 
 
 def _focals(problem: Problem, lens: Index) -> Array:
@@ -233,7 +233,7 @@ def reprojection_errors(problem: Problem) -> Array:
     return np.where(depth > 0, np.linalg.norm(predicted - problem.pixels, axis=1), np.inf)
 
 
-def robust_cost(problem: Problem, config: Config) -> float:
+def robust_cost(problem: Problem, config: BundleAdjustmentConfig) -> float:
     """The Cauchy loss of all observations, pixels squared, without the priors."""
     squared = np.minimum(reprojection_errors(problem), _BEHIND_PX) ** 2
     return float(config.robust_px**2 * np.log1p(squared / config.robust_px**2).sum())
@@ -249,9 +249,9 @@ def noise_px(num_observations: int, num_points: int, median_error: float) -> flo
     return float(max(shrinkage * median_error / _RAYLEIGH_MEDIAN, _MIN_NOISE_PX))
 
 
-def adjust(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Problem:
+def adjust(problem: Problem, prior: LensPrior, config: BundleAdjustmentConfig, fixed_camera: int = 0) -> Problem:
     """The problem with parameters that minimise robust cost and priors; the pose of `fixed_camera` is fixed."""
-    problem = _copy(_by_point(problem))
+    problem = _copy(_sort_by_point(problem))
     native, _arrays = _native(problem, prior, config, fixed_camera)
     core = library()
     core.core_bundle_adjust.restype = ctypes.c_double
@@ -273,13 +273,13 @@ class Covariance:
         return np.stack([self.joint[block, block] for block in blocks])
 
 
-def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Covariance:
+def covariance(problem: Problem, prior: LensPrior, config: BundleAdjustmentConfig, fixed_camera: int = 0) -> Covariance:
     """Inverse of the normal equations at the minimum, times the variance `config.noise_px ** 2` of an observation.
 
     It is NaN where the normal equations are not finite. Rounding can make variances negative where the problem is
     nearly singular: `uncertainty.sigmas` takes both for unknown.
     """
-    problem = _by_point(problem)
+    problem = _sort_by_point(problem)
     native, _arrays = _native(problem, prior, config, fixed_camera)
     count, num_lenses = len(problem.rotations), len(problem.log_focals)
     information = np.empty((_POSE * count + _LENS * num_lenses,) * 2)
@@ -291,7 +291,7 @@ def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera:
         free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
         scaled = _scale_direction(problem, fixed_camera)
     else:
-        observed |= problem.given.known
+        observed |= problem.given.is_held
     free[_POSE * count :] = prior.free.ravel()
     free[: _POSE * count] &= np.repeat(observed, _POSE)
     (kept,) = np.nonzero(free)
@@ -327,7 +327,7 @@ def _scale_direction(problem: Problem, fixed_camera: int) -> Array:
     return np.concatenate([poses.ravel(), np.zeros(_LENS * len(problem.log_focals))])
 
 
-def _by_point(problem: Problem) -> Problem:
+def _sort_by_point(problem: Problem) -> Problem:
     """The same problem with its observations sorted by point, as the core needs them."""
     if (np.diff(problem.point_of) >= 0).all():
         return problem
@@ -366,7 +366,7 @@ class _Native(ctypes.Structure):
 
 
 def _native(
-    problem: Problem, prior: LensPrior, config: Config, fixed_camera: int
+    problem: Problem, prior: LensPrior, config: BundleAdjustmentConfig, fixed_camera: int
 ) -> tuple[_Native, list[npt.NDArray[np.generic]]]:
     """The problem as the core reads it, and the arrays that it points into, which must live as long."""
     first = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
@@ -380,7 +380,7 @@ def _native(
         *(np.ascontiguousarray(values, dtype=np.int32) for values in indices),
         *(np.ascontiguousarray(values, dtype=np.float64) for values in observed),
     ]
-    held = _held_by(problem, config)
+    held = _pack_known_poses(problem, config)
     native = _Native(
         *(pointer(array) for array in arrays),
         len(problem.rotations), len(problem.log_focals), len(problem.points),
@@ -390,7 +390,7 @@ def _native(
     return native, [*arrays, *held]
 
 
-def _held_by(problem: Problem, config: Config) -> list[Array]:
+def _pack_known_poses(problem: Problem, config: BundleAdjustmentConfig) -> list[Array]:
     """Rotations, centres and information of the given poses, as the core reads them; 0 where nothing is given."""
     if problem.given is None:
         count = len(problem.rotations)

@@ -24,19 +24,19 @@ from splatnode.recon.registration import (
     own_lenses,
     register,
 )
-from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.config import RegistrationConfig
 from splatnode.recon.registration.lenses import Grouping
-from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, PartialMap
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, PartialMap
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 Array = npt.NDArray[np.float64]
 
 
-def extended(
+def extend_registration(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
     start: Sequence[RegisteredCamera],
-    config: Config,
+    config: RegistrationConfig,
 ) -> Registration | None:
     """The cameras `start` and those of all keyframes that can be registered beside them; None where it fails.
 
@@ -46,21 +46,23 @@ def extended(
     if grouping is None:
         return None
     known = lenses.candidates(keyframes, grouping, pairs, config.lenses)
-    views, scaled = register.views_of(keyframes, grouping), register.in_lens_pixels(pairs, grouping)
+    views, scaled = register.make_views(keyframes, grouping), register.convert_to_lens_pixels(pairs, grouping)
     max_tracks = config.mapper.max_growing_tracks
     problem = mapping_problem.prepare(views, known, scaled, max_tracks, max_tracks)
-    first = _known_cameras(keyframes, grouping, known, start)
-    problem, first = _with_own_lenses(problem, first, keyframes, grouping, start)
+    first = _make_camera_map(keyframes, grouping, known, start)
+    problem, first = _add_own_lenses(problem, first, keyframes, grouping, start)
     settings = config.mapper.incremental
     partial = incremental.adjust_quickly(problem, first, incremental.SETTLED_TOLERANCE, settings)
     if len(partial.estimate.points) < settings.min_points:
         return None
-    finished = finishing.finish(problem, incremental.extend(problem, partial, settings), (), config.mapper.finishing)
+    finished = finishing.run_final_adjustment(
+        problem, incremental.extend(problem, partial, settings), (), config.mapper.finishing
+    )
     if finished is None:
         return None
     problem, finished = mapper.give_own_lenses(problem, finished, (), config.mapper)
-    found = mapper.as_map(problem, finished, settings.triangulation.max_error_px, len(known))
-    return register.in_first_camera(found, keyframes, grouping.scales, config)
+    found = mapper.make_map(problem, finished, settings.triangulation.max_error_px, len(known))
+    return register.make_registration(found, keyframes, grouping.scales, config)
 
 
 def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) -> Grouping | None:
@@ -76,7 +78,7 @@ def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) 
     return None
 
 
-def _known_cameras(
+def _make_camera_map(
     keyframes: Sequence[Keyframe], grouping: Grouping, known: Sequence[Lens], start: Sequence[RegisteredCamera]
 ) -> PartialMap:
     """A map of the known cameras without points, in the pixels of their lenses; only focal lengths are free."""
@@ -93,25 +95,27 @@ def _known_cameras(
         radials[lens] = camera.radial
         nominal = principal_point(keyframes[index].frame)
         shifts[lens] = grouping.scales[index] * (camera.principal - nominal)
-    estimate = bundle.without_points(rotations, translations, np.array(grouping.lens_of), log_focals, radials, shifts)
+    estimate = bundle.make_empty_problem(
+        rotations, translations, np.array(grouping.lens_of), log_focals, radials, shifts
+    )
     prior = bundle.focal_prior(log_focals, np.array([lens.sigma for lens in known]))
     return PartialMap(tuple(camera.index for camera in start), estimate, prior, np.zeros(0, np.int64))
 
 
-def _with_own_lenses(
-    problem: MappingProblem,
+def _add_own_lenses(
+    problem: MapperInput,
     first: PartialMap,
     keyframes: Sequence[Keyframe],
     grouping: Grouping,
     start: Sequence[RegisteredCamera],
-) -> tuple[MappingProblem, PartialMap]:
+) -> tuple[MapperInput, PartialMap]:
     """Both, with lenses of their own for the known cameras that have one."""
     registered = first.registered
     for camera in start:
         if not camera.own_lens:
             continue
         scale = grouping.scales[camera.index]
-        problem, first = own_lenses.with_focal(problem, first, camera.index, scale * camera.focal)
+        problem, first = own_lenses.add_lens(problem, first, camera.index, scale * camera.focal)
         radials, shifts = first.estimate.radials.copy(), first.estimate.shifts.copy()
         radials[-1] = camera.radial
         shifts[-1] = scale * (camera.principal - principal_point(keyframes[camera.index].frame))

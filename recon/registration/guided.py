@@ -33,16 +33,18 @@ _ASIDE = (-3.0, 3.0)  # band widths by which lines are moved to see what matches
 _ROWS = 512  # features that are compared at once
 
 
-def with_more(keyframes: Sequence[Keyframe], pairs: Mapping[Pair, TwoView], given: Given) -> dict[Pair, TwoView]:
+def add_guided_matches(
+    keyframes: Sequence[Keyframe], pairs: Mapping[Pair, TwoView], given: Given
+) -> dict[Pair, TwoView]:
     """The pairs, and matches along epipolar lines for those of two given poses that have few."""
-    known, centres = np.flatnonzero(given.poses.known).tolist(), given.poses.centres
+    known, centres = np.flatnonzero(given.poses.is_held).tolist(), given.poses.centres
     few = [(i, j) for i in known for j in known if i < j and ((i, j) not in pairs or len(pairs[i, j].matches) < _FEW)]
     few.sort(key=lambda pair: (float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])), pair))
     found = dict(pairs)
     for i, j in few[:_MOST_PAIRS]:
         matches = _along_lines(keyframes[i], keyframes[j], given, (i, j))
         if len(matches):
-            found[i, j] = _joined(found.get((i, j)), matches, keyframes[i], keyframes[j])
+            found[i, j] = _join_matches(found.get((i, j)), matches, keyframes[i], keyframes[j])
     return dict(sorted(found.items()))
 
 
@@ -50,7 +52,7 @@ def _along_lines(one: Keyframe, other: Keyframe, given: Given, pair: Pair) -> In
     """(M, 2) point numbers; none where as many match beside the lines."""
     descriptors, rays, points = [], [], []
     for keyframe in (one, other):
-        plain = keyframe.features.of_tilt(PLAIN)
+        plain = keyframe.features.select_tilt(PLAIN)
         chosen = plain.point_of[:_STRONGEST]
         descriptors.append(plain.descriptors[:_STRONGEST].astype(np.float32))
         points.append(chosen)
@@ -108,7 +110,7 @@ def _mutual(
     return found
 
 
-def _joined(known: TwoView | None, matches: Index, one: Keyframe, other: Keyframe) -> TwoView:
+def _join_matches(known: TwoView | None, matches: Index, one: Keyframe, other: Keyframe) -> TwoView:
     """The pair's matches and those of these, in which neither point has a match yet."""
     if known is not None:
         fresh = ~np.isin(matches[:, 0], known.matches[:, 0]) & ~np.isin(matches[:, 1], known.matches[:, 1])

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.geometry import align_cameras, spread
+from splatnode.recon.geometry import align_cameras, compute_rms_radius
 from splatnode.recon.registration.known_poses import Offset, has_pose
 from splatnode.recon.registration.register import Registration
 
@@ -38,7 +38,7 @@ def offset_of(keyframes: Sequence[Keyframe], registration: Registration) -> Offs
         return None
     sigmas = _IMAGES * np.array([(np.radians(pose.sigma_deg), pose.sigma_m) for pose in poses if pose])
     begun = align_cameras(scene, given)
-    middle, size = scene[:, :3, 3].mean(0), max(spread(given[:, :3, 3]), 1e-9)
+    middle, size = scene[:, :3, 3].mean(0), max(compute_rms_radius(given[:, :3, 3]), 1e-9)
 
     def offset(values: Array) -> Array:
         X = np.eye(4)

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.registration import bundle, epipolar, inliers, resection, triangulation
-from splatnode.recon.registration.mapping_problem import MappingProblem, Pair, PartialMap
+from splatnode.recon.registration.mapping_problem import MapperInput, Pair, PartialMap
 from splatnode.recon.registration.resection import Resection
 from splatnode.recon.registration.tracks import Tracks
-from splatnode.recon.workers import each
+from splatnode.recon.workers import map_parallel
 
 Array = npt.NDArray[np.float64]
 
@@ -29,9 +29,9 @@ _MIN_IMPROVEMENT = 1.05  # factor of the score by which another map must be bett
 _MIN_VIEWS = 3  # that must stay when doubtful ones are removed
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    resection: resection.Config = resection.Config()
-    triangulation: triangulation.Config = triangulation.Config()
+class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    resection: resection.ResectionConfig = resection.ResectionConfig()
+    triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
     robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
     min_points: int = 15  # points that a map needs
     candidates: int = 3  # views that are resected before the best of them is registered
@@ -40,7 +40,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pair_focal_sigma: float = 0.03
 
 
-def grow(problem: MappingProblem, focals: list[float], first: Pair, config: Config) -> PartialMap | None:
+def grow(problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig) -> PartialMap | None:
     """A map from the pair `first` on, with every view that can be registered; None where the pair gives too little.
 
     `focals` (one a lens) are in pixels.
@@ -49,7 +49,7 @@ def grow(problem: MappingProblem, focals: list[float], first: Pair, config: Conf
     return _repair(problem, extend(problem, partial, config), config) if partial else None
 
 
-def score(problem: MappingProblem, partial: PartialMap, zero_px: float) -> float:
+def score(problem: MapperInput, partial: PartialMap, zero_px: float) -> float:
     """The number of matches that the map explains, of all pairs; one with error e counts 1 - (e / zero_px)^2.
 
     `zero_px` is in pixels at REFERENCE_SIDE; matches with larger errors count 0.
@@ -59,12 +59,12 @@ def score(problem: MappingProblem, partial: PartialMap, zero_px: float) -> float
 
 
 def adjust(
-    problem: MappingProblem,
+    problem: MapperInput,
     partial: PartialMap,
     tracks: Tracks,
-    loss: bundle.Config,
+    loss: bundle.BundleAdjustmentConfig,
     tolerance: float,
-    config: triangulation.Config,
+    config: triangulation.TriangulationConfig,
 ) -> PartialMap:
     """The map with all points triangulated anew (see `retriangulate` for `tolerance`), then bundle-adjusted."""
     estimate, track_of_point = triangulation.retriangulate(
@@ -75,14 +75,20 @@ def adjust(
     return replace(partial, estimate=estimate, track_of_point=track_of_point)
 
 
-def adjust_quickly(problem: MappingProblem, partial: PartialMap, tolerance: float, config: Config) -> PartialMap:
+def adjust_quickly(
+    problem: MapperInput, partial: PartialMap, tolerance: float, config: IncrementalMapperConfig
+) -> PartialMap:
     """`adjust` with few tracks and few iterations, for after each view."""
     robust_px = config.robust_px * float(np.median(problem.scale))
-    loss = bundle.Config(robust_px=robust_px, max_iterations=_QUICK_ITERATIONS, tolerance=_QUICK_DECREASE)
+    loss = bundle.BundleAdjustmentConfig(
+        robust_px=robust_px, max_iterations=_QUICK_ITERATIONS, tolerance=_QUICK_DECREASE
+    )
     return adjust(problem, partial, problem.growing_tracks, loss, tolerance, config.triangulation)
 
 
-def _initialise(problem: MappingProblem, focals: list[float], first: Pair, config: Config) -> PartialMap | None:
+def _initialise(
+    problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig
+) -> PartialMap | None:
     """The map of the pair `first`: its first view is the world's origin, its baseline the unit of length."""
     count = len(problem.views)
     rotation, direction, num_inliers = epipolar.relative_pose(
@@ -95,7 +101,7 @@ def _initialise(problem: MappingProblem, focals: list[float], first: Pair, confi
         return None
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     rotations[first[1]], translations[first[1]] = rotation, direction
-    estimate = bundle.without_points(
+    estimate = bundle.make_empty_problem(
         rotations=rotations,
         translations=translations,
         lens_of_camera=np.array([view.lens for view in problem.views]),
@@ -110,7 +116,7 @@ def _initialise(problem: MappingProblem, focals: list[float], first: Pair, confi
     return replace(partial, prior=prior) if len(partial.estimate.points) >= config.min_points else None
 
 
-def extend(problem: MappingProblem, partial: PartialMap, config: Config) -> PartialMap:
+def extend(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> PartialMap:
     """The map with every further view that can be registered.
 
     Of the views that observe most of the map, the one with the highest inlier ratio comes next: a view that repeated
@@ -120,20 +126,20 @@ def extend(problem: MappingProblem, partial: PartialMap, config: Config) -> Part
     while len(partial.registered) + len(failed) < len(problem.views):
         candidates = _next_views(problem, partial, failed)[: config.candidates]
         resect = functools.partial(resection.resect, problem, partial, config=config.resection)
-        tried = dict(zip(candidates, each(resect, candidates), strict=True))
+        tried = dict(zip(candidates, map_parallel(resect, candidates), strict=True))
         found: dict[int, Resection] = {view: resected for view, resected in tried.items() if resected is not None}
         failed |= tried.keys() - found.keys()
         if not found:
             continue
         best = max(found, key=lambda view: (found[view].inlier_ratio, -view))
-        estimate = bundle.with_pose(partial.estimate, best, found[best].rotation, found[best].translation)
+        estimate = bundle.replace_pose(partial.estimate, best, found[best].rotation, found[best].translation)
         larger = replace(partial, estimate=estimate, registered=(*partial.registered, best))
         partial = adjust_quickly(problem, larger, _NEW_VIEW_TOLERANCE, config)
         failed.clear()  # The new view brings new points, from which others may now be resected.
     return partial
 
 
-def _next_views(problem: MappingProblem, partial: PartialMap, failed: set[int]) -> list[int]:
+def _next_views(problem: MapperInput, partial: PartialMap, failed: set[int]) -> list[int]:
     """The views that are not registered and have not failed; those that observe most of the map's points first."""
     tracks = problem.growing_tracks
     in_map = np.isin(tracks.track_of, partial.track_of_point)
@@ -142,12 +148,12 @@ def _next_views(problem: MappingProblem, partial: PartialMap, failed: set[int]) 
     return sorted(waiting, key=lambda view: (-counts[view], view))
 
 
-def _repair(problem: MappingProblem, partial: PartialMap, config: Config) -> PartialMap:
+def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> PartialMap:
     """The map after views with low inlier ratios have been removed and resected, where that raises the score.
 
     First all of them at once, because misplaced views may support each other; then one after the other.
     """
-    doubtful = _doubtful(problem, partial, config)
+    doubtful = _find_doubtful_views(problem, partial, config)
     for group in [doubtful, *([view] for view in doubtful)]:
         rest = tuple(view for view in partial.registered if view not in group)
         if not group or len(rest) < _MIN_VIEWS:
@@ -162,8 +168,8 @@ def _repair(problem: MappingProblem, partial: PartialMap, config: Config) -> Par
     return partial
 
 
-def _doubtful(problem: MappingProblem, partial: PartialMap, config: Config) -> list[int]:
+def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> list[int]:
     """The registered views with an inlier ratio below `min_view_ratio`, the lowest first."""
     ratios = inliers.inlier_ratios(problem, partial, config.triangulation.max_error_px)
-    of_view = {view: inliers.pooled_ratio(ratios, problem.pairs, view) for view in partial.registered}
+    of_view = {view: inliers.compute_pooled_ratio(ratios, problem.pairs, view) for view in partial.registered}
     return sorted((view for view in of_view if of_view[view] < config.min_view_ratio), key=lambda view: of_view[view])

@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.registration import epipolar
-from splatnode.recon.registration.mapping_problem import MappingProblem, Pair, Pairs, PartialMap
+from splatnode.recon.registration.mapping_problem import MapperInput, Pair, Pairs, PartialMap
 
 Array = npt.NDArray[np.float64]
 
 
-def pair_errors(problem: MappingProblem, partial: PartialMap) -> dict[Pair, Array]:
+def pair_errors(problem: MapperInput, partial: PartialMap) -> dict[Pair, Array]:
     """Sampson errors of the matches of all pairs of registered views, pixels at REFERENCE_SIDE."""
     return {
         (i, j): epipolar.sampson_errors(partial.estimate, (i, j), pair) / problem.scale[i]
@@ -22,12 +22,12 @@ def pair_errors(problem: MappingProblem, partial: PartialMap) -> dict[Pair, Arra
     }
 
 
-def inlier_ratios(problem: MappingProblem, partial: PartialMap, max_error_px: float) -> dict[Pair, float]:
+def inlier_ratios(problem: MapperInput, partial: PartialMap, max_error_px: float) -> dict[Pair, float]:
     """The share of each pair's matches with Sampson errors below `max_error_px`, pixels at REFERENCE_SIDE."""
     return {pair: float((errors < max_error_px).mean()) for pair, errors in pair_errors(problem, partial).items()}
 
 
-def pooled_ratio(ratios: Mapping[Pair, float], pairs: Pairs, view: int | None = None) -> float:
+def compute_pooled_ratio(ratios: Mapping[Pair, float], pairs: Pairs, view: int | None = None) -> float:
     """The share of inliers among all matches of the pairs with `ratios`, or of those with `view`; 0 without any."""
     chosen = {pair: ratio for pair, ratio in ratios.items() if view is None or view in pair}
     num_matches = sum(len(pairs[pair].matches) for pair in chosen)

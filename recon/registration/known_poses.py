@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.geometry import spread
+from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.registration import bundle
 
 Array = npt.NDArray[np.float64]
@@ -59,7 +59,7 @@ class GivenWorld:
 
 @dataclass(frozen=True, eq=False)
 class Offset:
-    """What is wrong with all given poses alike: T_given = T_true @ T_true_given, as of a wrong hand-eye calibration."""
+    """The error that all given poses share: T_given = T_true @ T_true_given, as of a wrong hand-eye calibration."""
 
     T_camera_given: Array  # (4, 4) metres
     turn_sigma: float  # standard deviation about the axis in which it is least known, radians
@@ -74,7 +74,7 @@ class Offset:
         return float(np.degrees(np.arccos(np.clip((np.trace(self.T_camera_given[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
 
 
-def given_by(keyframes: Sequence[Keyframe], offset: Offset | None = None) -> Given | None:
+def collect_known_poses(keyframes: Sequence[Keyframe], offset: Offset | None = None) -> Given | None:
     """The poses of those keyframes whose lens is told; None where fewer than two hold a scale.
 
     They must be farther apart than they are unsure. `offset` is taken out of them.
@@ -92,7 +92,7 @@ def given_by(keyframes: Sequence[Keyframe], offset: Offset | None = None) -> Giv
         u, _, vt = np.linalg.svd(T[:3, :3])  # what comes is a rotation but for rounding
         rotations[i], centres[i] = (u @ vt).T, T[:3, 3]
         sigmas[i] = np.radians(pose.sigma_deg), pose.sigma_m
-    apart = spread(centres[known])
+    apart = compute_rms_radius(centres[known])
     if apart <= np.median(sigmas[known, 1]):
         return None
     origin, metres = centres[known].mean(0), max(apart, _LEAST_SPREAD)
@@ -113,7 +113,7 @@ def distance(problem: bundle.Problem, registered: Sequence[int]) -> float:
         return float(np.median(bundle.project(problem)[1]))
     found = axis_depths(problem.rotations[list(registered)], bundle.centres(problem)[list(registered)])
     centres = bundle.centres(problem)[list(registered)]
-    return float(np.median(found)) if len(found) else _FAR_OFF * max(spread(centres), _LEAST_SPREAD)
+    return float(np.median(found)) if len(found) else _FAR_OFF * max(compute_rms_radius(centres), _LEAST_SPREAD)
 
 
 _ENOUGH_POINTS = 5  # to know how far away a scene is

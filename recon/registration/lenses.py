@@ -27,7 +27,7 @@ CORNER = 0.6  # distance of a corner from the middle, over the longer side: that
 _ROUNDING_PX = 1.0  # difference of the shorter sides of two frames of one shape: sizes are whole pixels
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LensGroupingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     exif_sigma: float = 0.05  # of log focal, from EXIF: nominal focal lengths are rounded, and focusing changes them
     voted_sigma: float = 0.3  # of log focal, when pairs of frames voted for it
     # Largest difference of log focals, adjusted for each size of frames of one shape by itself, with which all have one
@@ -86,7 +86,10 @@ def _nominal(keyframe: Keyframe) -> tuple[str, int] | None:
 
 
 def candidates(
-    keyframes: Sequence[Keyframe], grouping: Grouping, pairs: Mapping[tuple[int, int], TwoView], config: Config
+    keyframes: Sequence[Keyframe],
+    grouping: Grouping,
+    pairs: Mapping[tuple[int, int], TwoView],
+    config: LensGroupingConfig,
 ) -> list[Lens]:
     """For each lens, the focal length that came with its frames, else those that the pairs of its frames vote for."""
     found = []
@@ -109,10 +112,10 @@ def candidates(
 def sizes_disagree(
     estimate: bundle.Problem,
     prior: bundle.LensPrior,
-    loss: bundle.Config,
+    loss: bundle.BundleAdjustmentConfig,
     fixed_camera: int,
     grouping: Grouping,
-    config: Config,
+    config: LensGroupingConfig,
 ) -> bool:
     """Whether frames that share a lens get different focal lengths when each of their sizes has a lens of its own.
 

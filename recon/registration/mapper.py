@@ -23,7 +23,7 @@ from splatnode.recon.registration import (
     resection,
     triangulation,
 )
-from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, Pair, Pairs, PartialMap, View
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, Pair, Pairs, PartialMap
 from splatnode.recon.registration.patch_image import PatchImage
 
 _MAX_SPLITS = 4  # rounds in which views get lenses of their own
@@ -33,16 +33,16 @@ _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss o
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    incremental: incremental.Config = incremental.Config()
-    finishing: finishing.Config = finishing.Config()
+class MapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    incremental: incremental.IncrementalMapperConfig = incremental.IncrementalMapperConfig()
+    finishing: finishing.FinalAdjustmentConfig = finishing.FinalAdjustmentConfig()
     max_growing_tracks: int = 350  # tracks of a view, while views are added; more take time and change no decision
     max_final_tracks: int = 1500  # tracks of a view, in the last adjustment
     max_attempts: int = 6  # combinations of first pair and focal length that are tried
     score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
     same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map
     same_focal: float = 0.02  # largest difference of the log focals of two such attempts
-    own_lenses: own_lenses.Config = own_lenses.Config()
+    own_lenses: own_lenses.OwnLensesConfig = own_lenses.OwnLensesConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +52,13 @@ class Map:
     views: tuple[int, ...]  # the registered ones; the first is the camera that adjustments fixed
     estimate: bundle.Problem
     prior: bundle.LensPrior
-    loss: bundle.Config
+    loss: bundle.BundleAdjustmentConfig
     inlier_ratios: dict[Pair, float]  # the share of each pair's matches that agree with the poses
     median_angle_deg: float  # of the points' triangulation angles
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
     num_common: int  # lenses that views were taken to share: those from this number on are of single views
 
-    def relabelled(self, number: Sequence[int]) -> Map:
+    def relabel(self, number: Sequence[int]) -> Map:
         """The same map with the views relabelled: new = number[old], a permutation."""
         old, new = np.argsort(number), np.asarray(number)
         relabelled = replace(
@@ -66,7 +66,7 @@ class Map:
             rotations=self.estimate.rotations[old],
             translations=self.estimate.translations[old],
             lens_of_camera=self.estimate.lens_of_camera[old],
-            given=None if self.estimate.given is None else self.estimate.given.relabelled(old),
+            given=None if self.estimate.given is None else self.estimate.given.relabel(old),
             camera_of=new[self.estimate.camera_of],
         )
         ratios = {
@@ -81,10 +81,10 @@ class Map:
 
 
 def build_map(
-    views: Sequence[View],
+    views: Sequence[MapperView],
     lenses: Sequence[Lens],
     pairs: Pairs,
-    config: Config,
+    config: MapperConfig,
     images: Sequence[PatchImage] = (),
     pause: Callable[[], None] = lambda: None,
 ) -> Map | None:
@@ -100,7 +100,7 @@ def build_map(
         partial = incremental.grow(problem, focals, first, config.incremental)
         if partial is None:
             continue
-        found_again = bool(attempts) and _same(max(attempts, key=_score)[1], partial, config)
+        found_again = bool(attempts) and _is_same_map(max(attempts, key=_score)[1], partial, config)
         attempts.append((incremental.score(problem, partial, config.score_px), partial))
         if found_again and len(partial.registered) == len(views):
             break
@@ -108,40 +108,40 @@ def build_map(
         return None
     pause()
     _, best = max(attempts, key=_score)
-    finished = finishing.finish(problem, best, images, config.finishing)
+    finished = finishing.run_final_adjustment(problem, best, images, config.finishing)
     if finished is None:
         return None
     problem, finished = give_own_lenses(problem, finished, images, config, pause)
-    return as_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
+    return make_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
 
 
 def give_own_lenses(
-    problem: MappingProblem,
-    finished: finishing.Finished,
+    problem: MapperInput,
+    finished: finishing.FinalMap,
     images: Sequence[PatchImage],
-    config: Config,
+    config: MapperConfig,
     pause: Callable[[], None] = lambda: None,
-) -> tuple[MappingProblem, finishing.Finished]:
+) -> tuple[MapperInput, finishing.FinalMap]:
     """Both, with lenses of their own for the views that refute the common one.
 
     First for views that hardly fit and fit better with another focal length, then for those whose observations say so.
     """
-    searches = [_with_other_focals, _with_coarse_lenses]
+    searches = [_try_other_focals, _try_coarse_lenses]
     for _ in range(_MAX_SPLITS):
         pause()
         before = finished
-        for search in searches if _doubted(problem, finished.map, config) else ():
+        for search in searches if _find_doubtful_views(problem, finished.map, config) else ():
             found = search(problem, finished.map, config)
-            again = None if found is None else finishing.finish(*found, images, config.finishing)
+            again = None if found is None else finishing.run_final_adjustment(*found, images, config.finishing)
             if found is None or again is None:
                 continue
             if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
                 problem, finished = found[0], again
-        searches = [_with_other_focals]
-        freed = own_lenses.free(problem, finished.map, finished.loss, config.own_lenses)
-        if freed.refuted.any() or freed.displaced.any():
-            apart, partial = own_lenses.split(problem, finished.map, freed, config.own_lenses)
-            again = finishing.finish(apart, partial, images, config.finishing)
+        searches = [_try_other_focals]
+        freed = own_lenses.free_lenses(problem, finished.map, finished.loss, config.own_lenses)
+        if freed.refuting_views.any() or freed.displaced.any():
+            apart, partial = own_lenses.split_lenses(problem, finished.map, freed, config.own_lenses)
+            again = finishing.run_final_adjustment(apart, partial, images, config.finishing)
             if again is not None:
                 problem, finished = apart, again
         if finished is before:
@@ -149,39 +149,39 @@ def give_own_lenses(
     return problem, finished
 
 
-def _doubted(problem: MappingProblem, partial: PartialMap, config: Config) -> list[int]:
+def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> list[int]:
     """The views that are not registered, or whose matches hardly fit; those first that fit least."""
     ratios = inliers.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
     of_view = {
-        view: inliers.pooled_ratio(ratios, problem.pairs, view) if view in partial.registered else 0.0
+        view: inliers.compute_pooled_ratio(ratios, problem.pairs, view) if view in partial.registered else 0.0
         for view in range(len(problem.views))
     }
     return sorted((view for view in of_view if of_view[view] < _DOUBTED_RATIO), key=lambda view: (of_view[view], view))
 
 
-def _with_coarse_lenses(
-    problem: MappingProblem, partial: PartialMap, config: Config
-) -> tuple[MappingProblem, PartialMap] | None:
+def _try_coarse_lenses(
+    problem: MapperInput, partial: PartialMap, config: MapperConfig
+) -> tuple[MapperInput, PartialMap] | None:
     """Both, with own lenses as a coarse search finds them; None where it finds none."""
     scale = float(np.median(problem.scale))
     noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
-    loss = bundle.Config(robust_px=scale * _COARSE_ROBUST_PX, noise_px=noise_px)
-    freed = own_lenses.free(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
-    if not (freed.refuted.any() or freed.displaced.any()):
+    loss = bundle.BundleAdjustmentConfig(robust_px=scale * _COARSE_ROBUST_PX, noise_px=noise_px)
+    freed = own_lenses.free_lenses(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
+    if not (freed.refuting_views.any() or freed.displaced.any()):
         return None
-    problem, partial = own_lenses.split(problem, partial, freed, config.own_lenses)
+    problem, partial = own_lenses.split_lenses(problem, partial, freed, config.own_lenses)
     partial = incremental.adjust_quickly(problem, partial, incremental.SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None
     return problem, incremental.extend(problem, partial, config.incremental)
 
 
-def _with_other_focals(
-    problem: MappingProblem, partial: PartialMap, config: Config
-) -> tuple[MappingProblem, PartialMap] | None:
+def _try_other_focals(
+    problem: MapperInput, partial: PartialMap, config: MapperConfig
+) -> tuple[MapperInput, PartialMap] | None:
     """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits."""
     zoomed = {}
-    for view in _doubted(problem, partial, config)[:_MAX_DOUBTED]:
+    for view in _find_doubtful_views(problem, partial, config)[:_MAX_DOUBTED]:
         # Points that the view helped to place where it does not belong must not speak for it.
         registered = tuple(each for each in partial.registered if each != view)
         if len(registered) < 2:
@@ -196,14 +196,14 @@ def _with_other_focals(
     if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
         return None
     for view, focal in zoomed.items():
-        problem, partial = own_lenses.with_focal(problem, partial, view, focal)
+        problem, partial = own_lenses.add_lens(problem, partial, view, focal)
     partial = incremental.adjust_quickly(problem, partial, incremental.SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None
     return problem, incremental.extend(problem, partial, config.incremental)
 
 
-def _score_of(problem: MappingProblem, partial: PartialMap, config: Config) -> float:
+def _score_of(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> float:
     return incremental.score(problem, partial, config.score_px)
 
 
@@ -211,7 +211,7 @@ def _score(attempt: tuple[float, PartialMap]) -> float:
     return attempt[0]
 
 
-def _same(one: PartialMap, other: PartialMap, config: Config) -> bool:
+def _is_same_map(one: PartialMap, other: PartialMap, config: MapperConfig) -> bool:
     """Whether two attempts registered the same views with the same poses and focal lengths."""
     if set(one.registered) != set(other.registered):
         return False
@@ -240,7 +240,7 @@ def _first_pairs(pairs: Pairs) -> list[Pair]:
     return sorted(pairs, key=lambda key: (-strength(key), key))
 
 
-def as_map(problem: MappingProblem, finished: finishing.Finished, max_error_px: float, num_common: int) -> Map:
+def make_map(problem: MapperInput, finished: finishing.FinalMap, max_error_px: float, num_common: int) -> Map:
     """The finished map with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
     partial, estimate = finished.map, finished.map.estimate
     angles = triangulation.largest_angles(

@@ -19,7 +19,7 @@ Pairs = Mapping[Pair, TwoView]
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class MapperView:
     """A frame as the mapper sees it."""
 
     points: Array  # (M, 2) feature pixels relative to the principal point
@@ -29,7 +29,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """What is known of a lens before its views are mapped."""
+    """A lens as it is known before its views are mapped."""
 
     focals: tuple[float, ...]  # candidates in pixels, the most likely first
     sigma: float  # of log focal around the candidate; 0: it is calibrated
@@ -37,10 +37,10 @@ class Lens:
 
 
 @dataclass(frozen=True, eq=False)
-class MappingProblem:
-    """What all attempts at a map share: C views, G lenses, verified pairs and tracks."""
+class MapperInput:
+    """The input that all attempts at a map share: C views, G lenses, verified pairs and tracks."""
 
-    views: tuple[View, ...]
+    views: tuple[MapperView, ...]
     lenses: tuple[Lens, ...]
     pairs: Pairs  # by the positions of their views (i < j)
     scale: Array  # (C,) longer side of each view over REFERENCE_SIDE, at which thresholds in pixels hold
@@ -59,11 +59,11 @@ class PartialMap:
 
 
 def prepare(
-    views: Sequence[View], lenses: Sequence[Lens], pairs: Pairs, max_growing_tracks: int, max_final_tracks: int
-) -> MappingProblem:
+    views: Sequence[MapperView], lenses: Sequence[Lens], pairs: Pairs, max_growing_tracks: int, max_final_tracks: int
+) -> MapperInput:
     """The mapping problem of `views`, with about so many tracks a view while views are added, and in the end."""
     every = tracks.build([view.points for view in views], pairs)
-    return MappingProblem(
+    return MapperInput(
         views=tuple(views),
         lenses=tuple(lenses),
         pairs=pairs,

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.registration import bundle, triangulation
-from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, PartialMap
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, PartialMap
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -35,7 +35,7 @@ _MORE = 1.001  # times a sigma: rounding does not make one larger
 _ITERATIONS, _DECREASE = 15, 1e-4  # of the adjustments but the last
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Standard deviations of an image's deviations from the common lens, where nothing refutes that it is common
     focal_sigma: float = 0.004  # of log focal
     shift_sigma: float = 0.0015  # of the principal point, as a share of the longer side
@@ -54,7 +54,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Freed:
+class PerViewLensMap:
     """A map in which each view has a lens of its own, near the common one of its group."""
 
     estimate: bundle.Problem  # with C lenses, one a view
@@ -65,18 +65,18 @@ class Freed:
     displaced: Flags  # (C,) views of groups whose common principal point or aspect is not what it was taken for
 
     @property
-    def refuted(self) -> Flags:
+    def refuting_views(self) -> Flags:
         """(C,) views that refute the common lens."""
         return np.asarray(self.stays.any(axis=1))
 
 
-def free(
-    problem: MappingProblem,
+def free_lenses(
+    problem: MapperInput,
     partial: PartialMap,
-    loss: bundle.Config,
-    config: Config,
-    coarse: triangulation.Config | None = None,
-) -> Freed:
+    loss: bundle.BundleAdjustmentConfig,
+    config: OwnLensesConfig,
+    coarse: triangulation.TriangulationConfig | None = None,
+) -> PerViewLensMap:
     """The map adjusted with a lens for each view, and which views refute that theirs is common.
 
     `loss` has the noise of an observation, by which deviations are weighed. With `coarse` points are triangulated anew
@@ -92,7 +92,7 @@ def free(
     least = _least_common(partial.prior, groups, sides, config)
     common = np.maximum(least, _sigmas(0.0, config.widest_shift, 0.0, sides, config.widest_aspect))
     common[~shared[groups]] = least[~shared[groups]]
-    estimate, kept = _with_own_lenses(partial.estimate), 2.0 / config.refuted_at
+    estimate, kept = _expand_lenses(partial.estimate), 2.0 / config.refuted_at
     quick = msgspec.structs.replace(loss, max_iterations=_ITERATIONS, tolerance=_DECREASE)
     middles, sizes = np.zeros_like(own), np.zeros_like(own)
     prior = _prior(partial.prior, groups, own, common)
@@ -104,11 +104,11 @@ def free(
         estimate = bundle.adjust(estimate, prior, loss if turn == _ROUNDS - 1 else quick, partial.registered[0])
         middles = _common_parameters(estimate, prior, registered)
         # What is `refuted_at` standard errors from its mean, or farther, stays under such a prior
-        sizes = kept * _pooled(_parameters(estimate) - middles)
+        sizes = kept * _pool_deviations(_parameters(estimate) - middles)
         if coarse is not None and turn < _WIDE_ROUNDS:
             continue
         own = np.where(own > 0, np.maximum(sizes, floors), 0.0)
-        offset = kept * _pooled(middles)
+        offset = kept * _pool_deviations(middles)
         for k in (_SHIFT, _ASPECT):
             common[:, k] = np.where(common[:, k] > 0, np.maximum(offset[:, k], least[:, k]), 0.0)
         if turn < _ROUNDS - 1:
@@ -116,7 +116,9 @@ def free(
     stays = (sizes > floors) & (own > 0) & registered[:, None]
     widths = _widths(stays, sizes / kept, groups, registered, partial.prior.sigmas == 0)
     displaced = (common > _MORE * least)[:, 3:].any(1)
-    return Freed(estimate, prior, stays | (widths > 0), widths, middles, displaced & shared[groups] & registered)
+    return PerViewLensMap(
+        estimate, prior, stays | (widths > 0), widths, middles, displaced & shared[groups] & registered
+    )
 
 
 def _widths(stays: Flags, sizes: Array, groups: Index, registered: Flags, calibrated: Flags) -> Array:
@@ -129,11 +131,11 @@ def _widths(stays: Flags, sizes: Array, groups: Index, registered: Flags, calibr
     return widths
 
 
-def split(
-    problem: MappingProblem, partial: PartialMap, freed: Freed, config: Config
-) -> tuple[MappingProblem, PartialMap]:
+def split_lenses(
+    problem: MapperInput, partial: PartialMap, freed: PerViewLensMap, config: OwnLensesConfig
+) -> tuple[MapperInput, PartialMap]:
     """Both, with lenses of their own for the refuted views, and everything where the freed map has it."""
-    (views,) = np.nonzero(freed.refuted)
+    (views,) = np.nonzero(freed.refuting_views)
     groups, found = partial.estimate.lens_of_camera, freed.estimate
     lens_of = groups.copy()
     lens_of[views] = len(problem.lenses) + np.arange(len(views))
@@ -164,7 +166,7 @@ def split(
     )
     known = partial.prior.ties
     to, tied = (np.full(len(common), -1), np.zeros_like(common)) if known is None else (known.to, known.sigmas)
-    ties = bundle.Ties(
+    ties = bundle.LensTies(
         to=np.concatenate([to, groups[views]]),
         sigmas=np.concatenate([tied, np.where(freed.stays[views], _WIDER * freed.widths[views], floors)]),
     )
@@ -183,7 +185,7 @@ def split(
     return problem, replace(partial, estimate=estimate, prior=prior)
 
 
-def near(prior: bundle.LensPrior, lens: int, config: Config) -> int:
+def find_common_lens(prior: bundle.LensPrior, lens: int, config: OwnLensesConfig) -> int:
     """The common lens whose focal length and distortion a lens has; the lens itself where these are its own."""
     if prior.ties is None or prior.ties.to[lens] < 0:
         return lens
@@ -193,8 +195,8 @@ def near(prior: bundle.LensPrior, lens: int, config: Config) -> int:
     return int(prior.ties.to[lens])
 
 
-def uncertain(
-    problem: bundle.Problem, prior: bundle.LensPrior, sides: Array, config: Config
+def widen_lens_priors(
+    problem: bundle.Problem, prior: bundle.LensPrior, sides: Array, config: OwnLensesConfig
 ) -> tuple[bundle.Problem, bundle.LensPrior]:
     """The same map with what is not known of lenses: each view may deviate from the lens that it shares.
 
@@ -214,10 +216,10 @@ def uncertain(
     alone = ~shared[groups][:, None] | ((tied == 0) & (common > 0))
     own = np.where(alone, common, tied)
     common = np.where(alone, 0.0, prior.own_sigmas[groups])
-    return _with_own_lenses(problem), _prior(prior, groups, own, common)
+    return _expand_lenses(problem), _prior(prior, groups, own, common)
 
 
-def _with_own_lenses(estimate: bundle.Problem) -> bundle.Problem:
+def _expand_lenses(estimate: bundle.Problem) -> bundle.Problem:
     groups = estimate.lens_of_camera
     return replace(
         estimate,
@@ -237,7 +239,7 @@ def _sigmas(focal: float, shift: float, radial: float, sides: Array, aspect: flo
     return sigmas
 
 
-def _least_common(prior: bundle.LensPrior, groups: Index, sides: Array, config: Config) -> Array:
+def _least_common(prior: bundle.LensPrior, groups: Index, sides: Array, config: OwnLensesConfig) -> Array:
     """(C, 6) sigmas of what the views of a group have in common, where nothing speaks against what is known of it."""
     least = _sigmas(config.calibrated_focal, config.calibrated_shift, 0.0, sides, config.aspect_sigma)
     return np.maximum(prior.own_sigmas[groups], least)
@@ -250,7 +252,7 @@ def _prior(of_groups: bundle.LensPrior, groups: Index, own: Array, common: Array
         radial_sigmas=own[:, 1:3],
         shift_sigmas=own[:, 3],
         aspect_sigmas=own[:, _ASPECT],
-        common=bundle.Common(groups, common),
+        common=bundle.CommonLensPrior(groups, common),
     )
 
 
@@ -274,16 +276,14 @@ def _common_parameters(estimate: bundle.Problem, prior: bundle.LensPrior, regist
     return middles
 
 
-def _pooled(deviations: Array) -> Array:
+def _pool_deviations(deviations: Array) -> Array:
     """(C, 6) sizes of the deviations; both coordinates of a principal point count as one."""
     sizes = np.abs(deviations)
     sizes[:, _SHIFT] = np.sqrt((deviations[:, _SHIFT] ** 2).mean(1))[:, None]
     return sizes
 
 
-def with_focal(
-    problem: MappingProblem, partial: PartialMap, view: int, focal: float
-) -> tuple[MappingProblem, PartialMap]:
+def add_lens(problem: MapperInput, partial: PartialMap, view: int, focal: float) -> tuple[MapperInput, PartialMap]:
     """Both, with a lens of its own of this focal length (pixels) for a view, which the map then does not have."""
     number, before, prior = len(problem.lenses), partial.estimate, partial.prior
     lens_of = before.lens_of_camera.copy()
@@ -304,7 +304,7 @@ def with_focal(
         aspect_sigmas=None if prior.aspect_sigmas is None else np.append(prior.aspect_sigmas, 0.0),
         ties=None
         if prior.ties is None
-        else bundle.Ties(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
+        else bundle.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
     )
     views = tuple(replace(each, lens=number) if index == view else each for index, each in enumerate(problem.views))
     problem = replace(problem, views=views, lenses=(*problem.lenses, Lens((focal,), _OWN_SIGMA)))

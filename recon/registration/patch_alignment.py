@@ -19,7 +19,7 @@ Grey = npt.NDArray[np.float32]
 MAX_RADIUS = 12  # pixels; `kMaxRadius` of recon/core/align.cpp
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PatchAlignmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     radius: int = 8  # of a patch, pixels; at most 12
     max_iterations: int = 20  # of Gauss-Newton, at most
 
@@ -39,7 +39,7 @@ class Patches:
 
 
 @dataclass(frozen=True, eq=False)
-class Aligned:
+class AlignedPatches:
     """The M patches after alignment."""
 
     target: Array  # (M, 2) pixels
@@ -48,7 +48,7 @@ class Aligned:
     sigma: Array  # (M,) standard deviation of the position along its worst direction, pixels; infinite where it failed
 
 
-def align(images: Sequence[Grey], patches: Patches, config: Config) -> Aligned:
+def align(images: Sequence[Grey], patches: Patches, config: PatchAlignmentConfig) -> AlignedPatches:
     """Aligns the patches with their targets, by an affine warp and a gain and offset of the grey levels.
 
     `images` are (H, W) float32, grey levels of 0 to 255. With `max_iterations` 0 nothing moves: the result has the
@@ -71,7 +71,7 @@ def align(images: Sequence[Grey], patches: Patches, config: Config) -> Aligned:
     arrays = (*indices, reference, target, affine, correlation, sigma)
     native = _Patches(*(array.ctypes.data for array in arrays), count, config.radius, config.max_iterations)
     library().core_align(ctypes.byref(native_images), ctypes.byref(native))
-    return Aligned(*(result.astype(np.float64) for result in (target, affine, correlation, sigma)))
+    return AlignedPatches(*(result.astype(np.float64) for result in (target, affine, correlation, sigma)))
 
 
 class _Images(ctypes.Structure):

@@ -14,7 +14,7 @@ from splatnode.recon.registration.patch_alignment import Grey
 Array = npt.NDArray[np.float64]
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PatchImageConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_longer_side: int = 1600  # larger images are shrunk, pixels
     blur_px: float = 0.7  # sigma of the smoothing, after shrinking: interpolation errs less in a smooth image
 
@@ -28,20 +28,20 @@ class PatchImage:
     principal: Array  # (2,) nominal principal point, pixels of the frame
     size: Array  # (2,) width and height of the frame, pixels
 
-    def to_grey(self, pixels: Array) -> Array:
+    def map_to_grey(self, pixels: Array) -> Array:
         """(M, 2) pixels of the grey image, from `pixels` (M, 2) of the frame relative to its principal point."""
         return (pixels + self.principal) * self.scale
 
-    def from_grey(self, pixels: Array) -> Array:
+    def map_from_grey(self, pixels: Array) -> Array:
         """(M, 2) the inverse of `to_grey`."""
         return pixels / self.scale - self.principal
 
-    def of_resized(self, scale: float) -> PatchImage:
+    def rescale(self, scale: float) -> PatchImage:
         """The same image, as that of the frame resized by this factor."""
         return PatchImage(self.grey, self.scale / scale, scale * self.principal, scale * self.size)
 
 
-def patch_image(image: npt.NDArray[np.uint8], principal: Array, config: Config) -> PatchImage:
+def patch_image(image: npt.NDArray[np.uint8], principal: Array, config: PatchImageConfig) -> PatchImage:
     """The patch image of a frame's `image` (H, W, 3) RGB with its principal point (2,) in pixels."""
     height, width = image.shape[:2]
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)

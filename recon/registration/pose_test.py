@@ -39,13 +39,13 @@ class Residual:
 
 
 def residuals(problem: bundle.Problem, given: bundle.GivenPoses, covariance: bundle.Covariance) -> dict[int, Residual]:
-    """Of each camera that `given` has a pose of and `covariance` is finite for.
+    """Computes the residual of each camera that `given` has a pose of and `covariance` is finite for.
 
     Where `problem.given` holds a camera, its residual is against all others; where not, against the images alone.
     """
-    held = np.zeros(len(given.sigmas), bool) if problem.given is None else problem.given.known
+    held = np.zeros(len(given.sigmas), bool) if problem.given is None else problem.given.is_held
     blocks, found = covariance.cameras, {}
-    for camera in np.flatnonzero(given.known).tolist():
+    for camera in np.flatnonzero(given.is_held).tolist():
         if not np.isfinite(blocks[camera]).all() or not blocks[camera].any():
             continue
         turn, shift, by_pose = deviation(problem, given, camera)

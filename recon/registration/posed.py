@@ -8,22 +8,22 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.geometry import spread
+from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, guided, known_poses, lenses, mapping_problem, posed_mapping
-from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.config import RegistrationConfig
 from splatnode.recon.registration.known_poses import Given, GivenWorld, Offset
 from splatnode.recon.registration.posed_mapping import PosedMap
 from splatnode.recon.registration.register import (
     Registration,
-    in_first_camera,
-    in_lens_pixels,
-    in_order_of_content,
+    convert_to_lens_pixels,
+    make_registration,
+    make_views,
     patch_images,
-    relabelled,
-    views_of,
+    relabel_pairs,
+    sort_by_content,
 )
-from splatnode.recon.registration.uncertainty import by_pose
+from splatnode.recon.registration.uncertainty import differentiate_by_pose
 
 Pairs = Mapping[tuple[int, int], TwoView]
 
@@ -31,7 +31,7 @@ Pairs = Mapping[tuple[int, int], TwoView]
 def register_posed(
     keyframes: Sequence[Keyframe],
     pairs: Pairs,
-    config: Config,
+    config: RegistrationConfig,
     pause: Callable[[], None] = lambda: None,
     offset: Offset | None = None,
 ) -> Registration | None:
@@ -40,21 +40,21 @@ def register_posed(
     None where given poses cannot hold a map: fewer than two have a pose and a lens that are told, or the images
     contradict as many of them as they confirm. `offset` is taken out of all poses. `pairs` and `pause`: see `register`.
     """
-    order = in_order_of_content(keyframes)
+    order = sort_by_content(keyframes)
     ordered, rank = [keyframes[index] for index in order], np.argsort(order)
-    given = known_poses.given_by(ordered, offset)
+    given = known_poses.collect_known_poses(ordered, offset)
     if given is None:
         return None
     grouping = lenses.group(ordered, across_sizes=True)
-    matched = guided.with_more(ordered, relabelled(pairs, rank), given)
+    matched = guided.add_guided_matches(ordered, relabel_pairs(pairs, rank), given)
     pause()
-    views = views_of(ordered, grouping)
+    views = make_views(ordered, grouping)
     known = lenses.candidates(ordered, grouping, matched, config.lenses)
     settings = config.mapper
     problem = mapping_problem.prepare(
         views,
         known,
-        in_lens_pixels(matched, grouping),
+        convert_to_lens_pixels(matched, grouping),
         settings.max_growing_tracks,
         settings.max_final_tracks,
     )
@@ -62,8 +62,8 @@ def register_posed(
     built = posed_mapping.build_map(problem, focals, given, images, settings, pause)
     if built is None:
         return None
-    moved = replace(built, map=built.map.relabelled(order))
-    found = in_first_camera(moved.map, keyframes, [grouping.scales[i] for i in rank], config)
+    moved = replace(built, map=built.map.relabel(order))
+    found = make_registration(moved.map, keyframes, [grouping.scales[i] for i in rank], config)
     return replace(found, given=_world(moved, found, given, order, offset))
 
 
@@ -77,9 +77,9 @@ def _world(
     estimate, views = built.map.estimate, [camera.index for camera in found.cameras]
     first, unit = views[0], _unit(built, found)
     to_first, from_first = estimate.rotations[first], estimate.translations[first]
-    held = [] if estimate.given is None else [view for view in views if estimate.given.known[view]]
+    held = [] if estimate.given is None else [view for view in views if estimate.given.is_held[view]]
     covariance = bundle.covariance(estimate, built.map.prior, built.map.loss, -1)
-    turns, moves = by_pose(estimate.rotations[views], estimate.translations[views])
+    turns, moves = differentiate_by_pose(estimate.rotations[views], estimate.translations[views])
     rows = (6 * np.array(views)[:, None] + np.arange(6)).ravel()
     joint = covariance.joint[np.ix_(rows, rows)]
     blocks = [slice(3 * i, 3 * i + 3) for i in range(len(views))]
@@ -93,7 +93,7 @@ def _world(
         scale=given.metres / unit,
         rotation=to_first.T,
         translation=given.origin - given.metres * to_first.T @ from_first,
-        scale_sigma=float(np.median(sigmas) / (spread(centres) * np.sqrt(len(held)))),
+        scale_sigma=float(np.median(sigmas) / (compute_rms_radius(centres) * np.sqrt(len(held)))),
         deviations=tuple(replace(each, index=order[each.index]) for each in built.deviations),
         offset=offset,
         turn_covariances=np.stack([turn @ joint @ turn.T + of_turn for turn, _ in in_world]),

@@ -25,7 +25,7 @@ from splatnode.recon.registration import (
     resection,
 )
 from splatnode.recon.registration.known_poses import Deviation, Given
-from splatnode.recon.registration.mapping_problem import MappingProblem, PartialMap
+from splatnode.recon.registration.mapping_problem import MapperInput, PartialMap
 from splatnode.recon.registration.patch_image import PatchImage
 
 Array = npt.NDArray[np.float64]
@@ -54,11 +54,11 @@ class PosedMap:
 
 
 def build_map(
-    problem: MappingProblem,
+    problem: MapperInput,
     focals: Sequence[float],
     given: Given,
     images: Sequence[PatchImage],
-    config: mapper.Config,
+    config: mapper.MapperConfig,
     pause: Callable[[], None] = lambda: None,
 ) -> PosedMap | None:
     """The map of all views with a given pose, and of the others that images place; None where too few poses hold.
@@ -66,40 +66,42 @@ def build_map(
     `focals` (one a lens) are in pixels.
     """
     config = _less_sure(config)
-    partial = _settled(problem, _start(problem, focals, given), _first_tolerance(problem, focals, given), config)
+    partial = _adjust_until_settled(
+        problem, _start(problem, focals, given), _first_tolerance(problem, focals, given), config
+    )
     pause()
-    partial = _without_undecided(problem, _let_go(problem, partial, config), config)
-    partial = _tested(problem, partial, given, config)
+    partial = _release_undecided_pairs(problem, _let_go(problem, partial, config), config)
+    partial = _test_poses(problem, partial, given, config)
     pause()
     if partial is None:
         return None
     if len(partial.estimate.points) >= config.incremental.min_points:
         partial = incremental.extend(problem, partial, config.incremental)
-    finished = _finished(problem, partial, images, config)
+    finished = _finish_map(problem, partial, images, config)
     for _ in range(_ROUNDS):
         pause()
-        again = _tested(problem, finished.map, given, config, finished.loss)
+        again = _test_poses(problem, finished.map, given, config, finished.loss)
         if again is None:
             return None
         if again is finished.map:
             break
-        finished = _finished(problem, again, images, config)
-    finished = _without_unseen(finished)
+        finished = _finish_map(problem, again, images, config)
+    finished = _remove_unseen_cameras(finished)
     return PosedMap(
-        mapper.as_map(problem, finished, config.incremental.triangulation.max_error_px, len(problem.lenses)),
+        mapper.make_map(problem, finished, config.incremental.triangulation.max_error_px, len(problem.lenses)),
         _deviations(finished, given),
     )
 
 
-def _less_sure(config: mapper.Config) -> mapper.Config:
+def _less_sure(config: mapper.MapperConfig) -> mapper.MapperConfig:
     correlated = _LESS_SURE**2 * config.finishing.correlated
     return msgspec.structs.replace(config, finishing=msgspec.structs.replace(config.finishing, correlated=correlated))
 
 
-def _start(problem: MappingProblem, focals: Sequence[float], given: Given) -> PartialMap:
+def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> PartialMap:
     """The map of the given poses alone, without points."""
     poses, log_focals = given.poses, np.log(focals)
-    estimate = bundle.without_points(
+    estimate = bundle.make_empty_problem(
         rotations=poses.rotations.copy(),
         translations=-np.einsum("cij,cj->ci", poses.rotations, poses.centres),
         lens_of_camera=np.array([view.lens for view in problem.views]),
@@ -108,13 +110,13 @@ def _start(problem: MappingProblem, focals: Sequence[float], given: Given) -> Pa
         shifts=np.zeros((len(problem.lenses), 2)),
     )
     prior = bundle.focal_prior(log_focals, np.array([lens.sigma for lens in problem.lenses]))
-    known = tuple(np.flatnonzero(poses.known).tolist())
+    known = tuple(np.flatnonzero(poses.is_held).tolist())
     return PartialMap(known, replace(estimate, given=poses), prior, np.zeros(0, np.int64))
 
 
-def _first_tolerance(problem: MappingProblem, focals: Sequence[float], given: Given) -> float:
-    """Of observations, as a multiple of the largest error: what the poses' sigmas move points by, in the worst view."""
-    known = np.flatnonzero(given.poses.known)
+def _first_tolerance(problem: MapperInput, focals: Sequence[float], given: Given) -> float:
+    """Returns how far the poses' sigmas move points in the worst view, as a multiple of the largest error."""
+    known = np.flatnonzero(given.poses.is_held)
     lenses = [problem.views[i].lens for i in known]
     turns = given.poses.sigmas[known, 0] * np.array(focals)[lenses] / problem.scale[known]
     # Positions that are known as well as orientations move points as much: how far the scene is is not known yet.
@@ -122,12 +124,14 @@ def _first_tolerance(problem: MappingProblem, focals: Sequence[float], given: Gi
     return float(np.clip(most, incremental.SETTLED_TOLERANCE, _MOST_TOLERANCE))
 
 
-def _settled(problem: MappingProblem, partial: PartialMap, tolerance: float, config: mapper.Config) -> PartialMap:
+def _adjust_until_settled(
+    problem: MapperInput, partial: PartialMap, tolerance: float, config: mapper.MapperConfig
+) -> PartialMap:
     """The map with points, adjusted while observations may have smaller and smaller errors."""
     scale = float(np.median(problem.scale))
     while True:
         robust_px = max(config.incremental.robust_px, tolerance / incremental.SETTLED_TOLERANCE) * scale
-        loss = bundle.Config(robust_px=robust_px, noise_px=_NOISE_PX * scale)
+        loss = bundle.BundleAdjustmentConfig(robust_px=robust_px, noise_px=_NOISE_PX * scale)
         settings = config.incremental.triangulation
         partial = incremental.adjust(problem, partial, problem.growing_tracks, loss, tolerance, settings)
         if tolerance <= incremental.SETTLED_TOLERANCE:
@@ -135,62 +139,68 @@ def _settled(problem: MappingProblem, partial: PartialMap, tolerance: float, con
         tolerance = max(tolerance / 3.0, incremental.SETTLED_TOLERANCE)
 
 
-def _held(partial: PartialMap) -> list[int]:
+def _find_held_views(partial: PartialMap) -> list[int]:
     """The views whose given pose holds them."""
     given = partial.estimate.given
-    return [] if given is None else [view for view in partial.registered if given.known[view]]
+    return [] if given is None else [view for view in partial.registered if given.is_held[view]]
 
 
-def _without(partial: PartialMap, views: Sequence[int]) -> PartialMap:
+def _release_poses(partial: PartialMap, views: Sequence[int]) -> PartialMap:
     """The map in which the given poses of these hold nothing."""
     given = partial.estimate.given
     if given is None:
         raise AssertionError("given poses hold the map")
-    return replace(partial, estimate=replace(partial.estimate, given=given.without(views)))
+    return replace(partial, estimate=replace(partial.estimate, given=given.release(views)))
 
 
-def _let_go(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> PartialMap:
+def _let_go(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> PartialMap:
     """The map without the poses of views whose matches hardly fit, and fit another pose much better."""
     tried: set[int] = set()
-    while len(_held(partial)) > _LEAST_HELD:
-        doubted = [view for view in _doubted(problem, partial, config) if view not in tried]
+    while len(_find_held_views(partial)) > _LEAST_HELD:
+        doubted = [view for view in _find_doubtful_views(problem, partial, config) if view not in tried]
         if not doubted:
             break
         tried.add(doubted[0])
-        freed = _replaced(problem, partial, doubted[0], config) or _refuted(problem, partial, doubted[0], config)
+        freed = _place_by_matches(problem, partial, doubted[0], config) or _place_refuted_view(
+            problem, partial, doubted[0], config
+        )
         if freed is not None:
             partial = freed
             tried.clear()
     return partial
 
 
-def _doubted(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> list[int]:
+def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> list[int]:
     """The views that a given pose holds and few of whose matches fit; those first that fit least."""
     ratios = inliers.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
-    of_view = {view: inliers.pooled_ratio(ratios, problem.pairs, view) for view in _held(partial)}
+    of_view = {view: inliers.compute_pooled_ratio(ratios, problem.pairs, view) for view in _find_held_views(partial)}
     matched = {view for pair in ratios for view in pair}
     return sorted(
         (view for view, ratio in of_view.items() if ratio < _DOUBTED_RATIO and view in matched), key=of_view.__getitem__
     )
 
 
-def _replaced(problem: MappingProblem, partial: PartialMap, view: int, config: mapper.Config) -> PartialMap | None:
+def _place_by_matches(
+    problem: MapperInput, partial: PartialMap, view: int, config: mapper.MapperConfig
+) -> PartialMap | None:
     """The map with `view` where its matches place it; None where no more of them fit then."""
     rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
-    rest = _settled(problem, _without(rest, [view]), incremental.SETTLED_TOLERANCE, config)
+    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental.SETTLED_TOLERANCE, config)
     if len(rest.estimate.points) < config.incremental.min_points:
         return None
     found = resection.resect(problem, rest, view, config.incremental.resection)
     if found is None:
         return None
-    estimate = bundle.with_pose(rest.estimate, view, found.rotation, found.translation)
+    estimate = bundle.replace_pose(rest.estimate, view, found.rotation, found.translation)
     freed = replace(rest, estimate=estimate, registered=partial.registered)
-    freed = _settled(problem, freed, 2.0 * incremental.SETTLED_TOLERANCE, config)
+    freed = _adjust_until_settled(problem, freed, 2.0 * incremental.SETTLED_TOLERANCE, config)
     before, after = (_observations(each)[view] for each in (partial, freed))
     return freed if after > _MORE * before + _MORE_POINTS else None
 
 
-def _refuted(problem: MappingProblem, partial: PartialMap, view: int, config: mapper.Config) -> PartialMap | None:
+def _place_refuted_view(
+    problem: MapperInput, partial: PartialMap, view: int, config: mapper.MapperConfig
+) -> PartialMap | None:
     """The map with `view` where one pair places it, where its pairs with views that others confirm refute its pose.
 
     For views of which too little is seen by two others: nothing but the pair tells how far away they are.
@@ -202,11 +212,11 @@ def _refuted(problem: MappingProblem, partial: PartialMap, view: int, config: ma
         return None
     best = max(refuting, key=lambda pair: (len(problem.pairs[pair].matches), pair))
     rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
-    rest = _settled(problem, _without(rest, [view]), incremental.SETTLED_TOLERANCE, config)
-    return replace(_beside(problem, rest, view, best, config), registered=partial.registered)
+    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental.SETTLED_TOLERANCE, config)
+    return replace(_place_by_pair(problem, rest, view, best, config), registered=partial.registered)
 
 
-def _without_undecided(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> PartialMap:
+def _release_undecided_pairs(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> PartialMap:
     """The map without both views of a pair that refutes one of their poses, where nothing tells which.
 
     As it is where most of the poses would be gone with them.
@@ -215,21 +225,23 @@ def _without_undecided(problem: MappingProblem, partial: PartialMap, config: map
     confirmed = {each for pair, said in says.items() if said > 0 for each in pair}
     undecided = [pair for pair, said in says.items() if said < 0 and not set(pair) & confirmed]
     views = {each for pair in undecided for each in pair}
-    held = set(_held(partial))
+    held = set(_find_held_views(partial))
     if not views or len(held - views) < _LEAST_HELD or 2 * len(held - views) <= len(held):
         return partial
-    moved = _without(replace(partial, registered=tuple(v for v in partial.registered if v not in views)), sorted(views))
+    moved = _release_poses(
+        replace(partial, registered=tuple(v for v in partial.registered if v not in views)), sorted(views)
+    )
     for pair in undecided:
         for view in pair:
-            found = _beside(problem, partial, view, pair, config).estimate
+            found = _place_by_pair(problem, partial, view, pair, config).estimate
             pose = found.rotations[view], found.translations[view]
-            moved = replace(moved, estimate=bundle.with_pose(moved.estimate, view, *pose))
-    return _settled(problem, moved, incremental.SETTLED_TOLERANCE, config)
+            moved = replace(moved, estimate=bundle.replace_pose(moved.estimate, view, *pose))
+    return _adjust_until_settled(problem, moved, incremental.SETTLED_TOLERANCE, config)
 
 
-def _pairs_say(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> dict[tuple[int, int], int]:
-    """Of pairs of views that given poses hold: 1 where the matches agree with these, -1 where with others, else 0."""
-    held, found = set(_held(partial)), {}
+def _pairs_say(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> dict[tuple[int, int], int]:
+    """Judges pairs of held views: 1 where the matches agree with the poses, -1 where with others, else 0."""
+    held, found = set(_find_held_views(partial)), {}
     limit = config.incremental.triangulation.max_error_px
     for (i, j), pair in problem.pairs.items():
         if not {i, j} <= held or len(pair.matches) < _TELLING_MATCHES:
@@ -245,7 +257,7 @@ def _pairs_say(problem: MappingProblem, partial: PartialMap, config: mapper.Conf
 
 
 def _relative(
-    problem: MappingProblem, partial: PartialMap, pair: tuple[int, int], config: mapper.Config
+    problem: MapperInput, partial: PartialMap, pair: tuple[int, int], config: mapper.MapperConfig
 ) -> tuple[Array, Array, int]:
     """The pose of the second view of `pair` in the first one, and how many matches agree, by these alone."""
     i, j = pair
@@ -254,8 +266,8 @@ def _relative(
     return epipolar.relative_pose(problem.pairs[pair], float(focals[0]), float(focals[1]), limit)
 
 
-def _beside(
-    problem: MappingProblem, partial: PartialMap, view: int, pair: tuple[int, int], config: mapper.Config
+def _place_by_pair(
+    problem: MapperInput, partial: PartialMap, view: int, pair: tuple[int, int], config: mapper.MapperConfig
 ) -> PartialMap:
     """The map with `view` where the matches of `pair` alone place it, as far from the other view as it was."""
     estimate, (first, second) = partial.estimate, pair
@@ -268,7 +280,7 @@ def _beside(
     else:
         turned = rotation.T @ estimate.rotations[second]
         shifted = rotation.T @ (estimate.translations[second] - move)
-    return replace(partial, estimate=bundle.with_pose(estimate, view, turned, shifted))
+    return replace(partial, estimate=bundle.replace_pose(estimate, view, turned, shifted))
 
 
 def _observations(partial: PartialMap) -> npt.NDArray[np.int64]:
@@ -276,53 +288,59 @@ def _observations(partial: PartialMap) -> npt.NDArray[np.int64]:
     return np.bincount(partial.estimate.camera_of, minlength=len(partial.estimate.rotations))
 
 
-def _tested(
-    problem: MappingProblem,
+def _test_poses(
+    problem: MapperInput,
     partial: PartialMap,
     given: Given,
-    config: mapper.Config,
-    loss: bundle.Config | None = None,
+    config: mapper.MapperConfig,
+    loss: bundle.BundleAdjustmentConfig | None = None,
 ) -> PartialMap | None:
     """The map without the given poses that it contradicts, and with those again that it does not; None: too few hold.
 
     What is returned is `partial` where nothing changes.
     """
-    loss = loss or bundle.Config(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+    loss = loss or bundle.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
     while len(partial.estimate.points):
         found = _residuals(partial, given, loss)
-        held = set(_held(partial))
+        held = set(_find_held_views(partial))
         worst = min(held & found.keys(), key=lambda view: found[view].probability, default=None)
         if worst is None or found[worst].probability >= pose_test.LEAST_PROBABILITY:
             break
-        partial = _settled(problem, _without(partial, [worst]), 2.0 * incremental.SETTLED_TOLERANCE, config)
-        loss = bundle.Config(noise_px=_NOISE_PX * float(np.median(problem.scale)))
-    return partial if len(_held(partial)) >= _LEAST_HELD and _most_hold(partial, given) else None
+        partial = _adjust_until_settled(
+            problem, _release_poses(partial, [worst]), 2.0 * incremental.SETTLED_TOLERANCE, config
+        )
+        loss = bundle.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+    return partial if len(_find_held_views(partial)) >= _LEAST_HELD and _most_hold(partial, given) else None
 
 
 def _most_hold(partial: PartialMap, given: Given) -> bool:
-    return 2 * len(_held(partial)) > int(given.poses.known.sum())
+    return 2 * len(_find_held_views(partial)) > int(given.poses.is_held.sum())
 
 
-def _residuals(partial: PartialMap, given: Given, loss: bundle.Config) -> dict[int, pose_test.Residual]:
+def _residuals(partial: PartialMap, given: Given, loss: bundle.BundleAdjustmentConfig) -> dict[int, pose_test.Residual]:
     covariance = bundle.covariance(partial.estimate, partial.prior, loss, -1)
     return pose_test.residuals(partial.estimate, given.poses, covariance)
 
 
-def _finished(
-    problem: MappingProblem, partial: PartialMap, images: Sequence[PatchImage], config: mapper.Config
-) -> finishing.Finished:
+def _finish_map(
+    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: mapper.MapperConfig
+) -> finishing.FinalMap:
     """The map after its last adjustment; as it is where there are too few points for one."""
-    finished = finishing.finish(problem, partial, images, config.finishing) if len(partial.estimate.points) else None
+    finished = (
+        finishing.run_final_adjustment(problem, partial, images, config.finishing)
+        if len(partial.estimate.points)
+        else None
+    )
     if finished is not None:
         return finished
     errors = bundle.reprojection_errors(partial.estimate) / problem.scale[partial.estimate.camera_of]
-    loss = bundle.Config(noise_px=_NOISE_PX * float(np.median(problem.scale)))
-    return finishing.Finished(partial, loss, float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0)
+    loss = bundle.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+    return finishing.FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0)
 
 
-def _without_unseen(finished: finishing.Finished) -> finishing.Finished:
+def _remove_unseen_cameras(finished: finishing.FinalMap) -> finishing.FinalMap:
     """The map without cameras that nothing holds: neither a given pose nor enough observations."""
-    partial, held = finished.map, set(_held(finished.map))
+    partial, held = finished.map, set(_find_held_views(finished.map))
     estimate = partial.estimate
     seen_by = np.bincount(estimate.point_of, minlength=len(estimate.points))
     by_three = estimate.camera_of[seen_by[estimate.point_of] >= 3]
@@ -344,11 +362,11 @@ def _without_unseen(finished: finishing.Finished) -> finishing.Finished:
     return replace(finished, map=replace(partial, registered=kept, estimate=rest))
 
 
-def _deviations(finished: finishing.Finished, given: Given) -> tuple[Deviation, ...]:
-    """Of the given poses that do not hold their cameras."""
-    held, found = set(_held(finished.map)), []
+def _deviations(finished: finishing.FinalMap, given: Given) -> tuple[Deviation, ...]:
+    """Lists the given poses that do not hold their cameras."""
+    held, found = set(_find_held_views(finished.map)), []
     residuals = _residuals(finished.map, given, finished.loss) if len(finished.map.estimate.points) else {}
-    for view in np.flatnonzero(given.poses.known).tolist():
+    for view in np.flatnonzero(given.poses.is_held).tolist():
         if view in held:
             continue
         turn, shift, _ = pose_test.deviation(finished.map.estimate, given.poses, view)

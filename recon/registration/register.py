@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
-from splatnode.recon.geometry import without_distortion
+from splatnode.recon.geometry import undistort_rays
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, known_poses, lenses, mapper, own_lenses, uncertainty
-from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.config import RegistrationConfig
 from splatnode.recon.registration.known_poses import GivenWorld
 from splatnode.recon.registration.lenses import Grouping
-from splatnode.recon.registration.mapping_problem import View
+from splatnode.recon.registration.mapping_problem import MapperView
 from splatnode.recon.registration.patch_image import PatchImage, patch_image
 
 Array = npt.NDArray[np.float64]
@@ -52,7 +52,7 @@ class RegisteredCamera:
 
     def normalise(self, pixels: Array) -> Array:
         """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the frame at full size."""
-        return without_distortion((pixels - self.principal) / self.focals, np.tile(self.radial, (len(pixels), 1)))
+        return undistort_rays((pixels - self.principal) / self.focals, np.tile(self.radial, (len(pixels), 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Registration:
 def register(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
-    config: Config,
+    config: RegistrationConfig,
     pause: Callable[[], None] = lambda: None,
 ) -> Registration | None:
     """The cameras of as many keyframes as can be registered together, or None when no two can.
@@ -84,34 +84,34 @@ def register(
     """
     if not pairs:
         return None
-    order = in_order_of_content(keyframes)
+    order = sort_by_content(keyframes)
     ordered = [keyframes[index] for index in order]
     rank = np.argsort(order)
-    built = _build(ordered, relabelled(pairs, rank), config, pause)
+    built = _build(ordered, relabel_pairs(pairs, rank), config, pause)
     if built is None:
         return None
     found, grouping = built
-    return in_first_camera(found.relabelled(order), keyframes, [grouping.scales[i] for i in rank], config)
+    return make_registration(found.relabel(order), keyframes, [grouping.scales[i] for i in rank], config)
 
 
-def in_order_of_content(keyframes: Sequence[Keyframe]) -> list[int]:
+def sort_by_content(keyframes: Sequence[Keyframe]) -> list[int]:
     """Positions of the keyframes in the order in which they are registered, which is not that of their arrival."""
     return sorted(range(len(keyframes)), key=lambda index: content_key(keyframes[index]))
 
 
-def relabelled(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
+def relabel_pairs(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
     """The pairs, sorted, with keyframes relabelled: keyframe i becomes keyframe `new[i]`."""
     found = {}
     for (i, j), pair in pairs.items():
         first, second = int(new[i]), int(new[j])
-        found[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
+        found[min(first, second), max(first, second)] = pair if first < second else pair.swap()
     return dict(sorted(found.items()))
 
 
 def _build(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
-    config: Config,
+    config: RegistrationConfig,
     pause: Callable[[], None],
 ) -> tuple[mapper.Map, Grouping] | None:
     """The map, in the pixels of its lenses, and their grouping: one lens for all sizes unless the map disagrees."""
@@ -129,29 +129,29 @@ def _map(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
     grouping: Grouping,
-    config: Config,
+    config: RegistrationConfig,
     pause: Callable[[], None],
 ) -> mapper.Map | None:
     """The map of keyframes with the lenses of `grouping`, in the pixels of these."""
     images = patch_images(keyframes, grouping, config)
     known = lenses.candidates(keyframes, grouping, pairs, config.lenses)
-    views, scaled = views_of(keyframes, grouping), in_lens_pixels(pairs, grouping)
+    views, scaled = make_views(keyframes, grouping), convert_to_lens_pixels(pairs, grouping)
     return mapper.build_map(views, known, scaled, config.mapper, images, pause)
 
 
-def patch_images(keyframes: Sequence[Keyframe], grouping: Grouping, config: Config) -> list[PatchImage]:
+def patch_images(keyframes: Sequence[Keyframe], grouping: Grouping, config: RegistrationConfig) -> list[PatchImage]:
     """The keyframes' images in the pixels of their lenses, by which observations become exact."""
     settings = config.mapper.finishing.subpixel.patch_image
     return [
-        patch_image(keyframe.frame.image, principal_point(keyframe.frame), settings).of_resized(grouping.scales[i])
+        patch_image(keyframe.frame.image, principal_point(keyframe.frame), settings).rescale(grouping.scales[i])
         for i, keyframe in enumerate(keyframes)
     ]
 
 
-def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
+def make_views(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[MapperView]:
     """The keyframes as the mapper sees them, in the pixels of their lenses."""
     return [
-        View(
+        MapperView(
             points=grouping.scales[i] * (keyframe.features.points - principal_point(keyframe.frame)),
             lens=grouping.lens_of[i],
             longer_side=grouping.longer_side,
@@ -160,13 +160,15 @@ def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
     ]
 
 
-def in_lens_pixels(pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping) -> dict[tuple[int, int], TwoView]:
+def convert_to_lens_pixels(
+    pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping
+) -> dict[tuple[int, int], TwoView]:
     """The pairs in the pixels of their frames' lenses."""
-    return {(i, j): pair.scaled(grouping.scales[i], grouping.scales[j]) for (i, j), pair in pairs.items()}
+    return {(i, j): pair.rescale(grouping.scales[i], grouping.scales[j]) for (i, j), pair in pairs.items()}
 
 
-def in_first_camera(
-    found: mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float], config: Config
+def make_registration(
+    found: mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float], config: RegistrationConfig
 ) -> Registration:
     """The map in the frame of the first registered keyframe, scaled to a median point depth of 1.
 
@@ -175,7 +177,7 @@ def in_first_camera(
     estimate = found.estimate
     order = sorted(found.views)
     sides = np.array([scale * longer_side(k.frame) for scale, k in zip(scales, keyframes, strict=True)])
-    doubted, prior = own_lenses.uncertain(estimate, found.prior, sides, config.mapper.own_lenses)
+    doubted, prior = own_lenses.widen_lens_priors(estimate, found.prior, sides, config.mapper.own_lenses)
     covariance = bundle.covariance(doubted, prior, found.loss, found.views[0])
     unit = 1.0 / max(known_poses.distance(estimate, order), _MIN_DEPTH)
     rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
@@ -200,7 +202,7 @@ def in_first_camera(
                 centre_sigma_rel=float(centre_sigmas[position]),
                 centre_covariance=covariances[position],
                 aspect=float(estimate.aspects[lens]),
-                near_lens=own_lenses.near(found.prior, int(lens), config.mapper.own_lenses),
+                near_lens=own_lenses.find_common_lens(found.prior, int(lens), config.mapper.own_lenses),
                 displaced=bool(found.prior.shift_sigmas[lens] > _DISPLACED * sides[i]),
                 focal_sigma=float(focal_sigmas[i]),
                 own_lens=bool(lens >= found.num_common),

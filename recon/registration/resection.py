@@ -17,7 +17,7 @@ from splatnode.recon import poselib
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, epipolar
 from splatnode.recon.registration.cross_product import cross
-from splatnode.recon.registration.mapping_problem import MappingProblem, Pair, PartialMap
+from splatnode.recon.registration.mapping_problem import MapperInput, Pair, PartialMap
 from splatnode.recon.registration.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
@@ -37,7 +37,7 @@ _MORE_POINTS = 1.1  # times as many points must fit with another focal length
 _MIN_SCALE_RATIO = 0.4  # share of the points that may fix the length of a translation which must agree on it
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ResectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_error_px: float = 2.5  # largest error of an exact match, pixels at REFERENCE_SIDE
     min_points: int = 15  # 2D-3D inliers that a proposed pose needs
     min_inlier_ratio: float = 0.2  # share of the 2D-3D correspondences that must be inliers
@@ -64,7 +64,7 @@ class Correspondences:
     tracks: Index  # (M,)
 
 
-def resect(problem: MappingProblem, partial: PartialMap, view: int, config: Config) -> Resection | None:
+def resect(problem: MapperInput, partial: PartialMap, view: int, config: ResectionConfig) -> Resection | None:
     """The proposed pose of `view` with most inliers, or None when no proposal has enough."""
     correspondences = _correspondences(partial, problem.growing_tracks, view)
     neighbours = {
@@ -77,7 +77,7 @@ def resect(problem: MappingProblem, partial: PartialMap, view: int, config: Conf
     for rotation, translation in _proposals(problem, partial, correspondences, view, neighbours, config):
         errors = reprojection_errors(correspondences, rotation, translation, focal)
         num_inliers = int((errors < _POINT_TOLERANCE * limit).sum())
-        proposed = bundle.with_pose(partial.estimate, view, rotation, translation)
+        proposed = bundle.replace_pose(partial.estimate, view, rotation, translation)
         for other, pair in neighbours.items():
             errors = epipolar.sampson_errors(proposed, _pair(view, other), pair)
             num_inliers += int((errors < _PAIR_TOLERANCE * limit).sum())
@@ -86,7 +86,7 @@ def resect(problem: MappingProblem, partial: PartialMap, view: int, config: Conf
     return best
 
 
-def own_focal(problem: MappingProblem, partial: PartialMap, view: int, config: Config) -> float | None:
+def own_focal(problem: MapperInput, partial: PartialMap, view: int, config: ResectionConfig) -> float | None:
     """The focal length (pixels) with which most of the map's points fit a pose of `view`, where it is not its lens'.
 
     None where the lens' own focal length, which is tried first, fits nearly as many.
@@ -135,12 +135,12 @@ def _straight(estimate: bundle.Problem, view: int, pixels: Array) -> Array:
 
 
 def _proposals(
-    problem: MappingProblem,
+    problem: MapperInput,
     partial: PartialMap,
     correspondences: Correspondences,
     view: int,
     neighbours: Mapping[int, TwoView],
-    config: Config,
+    config: ResectionConfig,
 ) -> Iterator[tuple[Array, Array]]:
     """Poses by PnP from all correspondences, then from those that one neighbour observes too.
 
@@ -163,7 +163,7 @@ def _proposals(
     for other, chosen in zip(strongest, shared, strict=True):
         if chosen.sum() >= config.min_scale_points:
             points, rays = correspondences.points[chosen], correspondences.pixels[chosen] / focals[view]
-            beside = _beside_neighbour(partial, view, other, neighbours[other], points, rays, limit, config)
+            beside = _estimate_by_neighbour(partial, view, other, neighbours[other], points, rays, limit, config)
             if beside is not None:
                 yield beside
 
@@ -173,7 +173,7 @@ def _pnp(
     chosen: Flags,
     focal: float,
     limit: float,
-    config: Config,
+    config: ResectionConfig,
     tolerance: float = _POINT_TOLERANCE,
 ) -> tuple[Array, Array, int] | None:
     """Rotation, translation and number of inliers from the `chosen` correspondences; None for too few inliers."""
@@ -191,7 +191,7 @@ def _pnp(
     return np.asarray(pose.R), np.asarray(pose.t), num_inliers
 
 
-def _beside_neighbour(
+def _estimate_by_neighbour(
     partial: PartialMap,
     view: int,
     other: int,
@@ -199,7 +199,7 @@ def _beside_neighbour(
     points: Array,  # (M, 3) that both observe
     rays: Array,  # (M, 2) where `view` observes them, at depth 1
     limit: float,
-    config: Config,
+    config: ResectionConfig,
 ) -> tuple[Array, Array] | None:
     """The pose of `view` by its relative pose to the view `other`; None for too few inliers of either part."""
     estimate = partial.estimate

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
-from splatnode.capture.lenses.undistort import SQUARE_TOLERANCE, undistorted
-from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image, modelled_mask
+from splatnode.capture.lenses.undistort import SQUARE_TOLERANCE, undistort_frame
+from splatnode.recon.frames.keyframe import Features, Keyframe, resize_image, resize_mask
 from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.lenses import LEAST_SHIFT
@@ -30,7 +30,7 @@ Array = npt.NDArray[np.float64]
 _DETAIL = 2  # times the modelled size: what is straightened, so that resampling twice costs no sharpness
 
 
-def straightened(graph: ViewGraph, registration: Registration) -> tuple[ViewGraph, Registration]:
+def undistort_keyframes(graph: ViewGraph, registration: Registration) -> tuple[ViewGraph, Registration]:
     """Both, as if pinholes had taken the photographs whose lens bends lines enough to be sure of it (LEAST_SHIFT).
 
     So are photographs whose pixels are not square.
@@ -40,7 +40,7 @@ def straightened(graph: ViewGraph, registration: Registration) -> tuple[ViewGrap
     """
     lenses = {}
     for camera in registration.cameras:
-        lens = _estimated(camera, graph.keyframes[camera.index].frame)
+        lens = _make_intrinsics(camera, graph.keyframes[camera.index].frame)
         if abs(corner_shift(lens)) > LEAST_SHIFT or abs(camera.aspect - 1.0) > SQUARE_TOLERANCE:
             lenses[camera.index] = lens
     if not lenses:
@@ -48,14 +48,16 @@ def straightened(graph: ViewGraph, registration: Registration) -> tuple[ViewGrap
     keyframes = list(graph.keyframes)
     try:
         for index, lens in lenses.items():
-            keyframes[index] = straight(keyframes[index], lens)
+            keyframes[index] = undistort_keyframe(keyframes[index], lens)
     except ValueError as error:
         log.warning("the photographs stay as they are: the estimated lens cannot be: %s", error)
         return graph, registration
-    return replace(graph, keyframes=tuple(keyframes)), _seen_by(keyframes, registration)
+    return replace(graph, keyframes=tuple(keyframes)), _undistort_observations(keyframes, registration)
 
 
-def with_lenses(registration: Registration, graph: ViewGraph, known: Mapping[str, Intrinsics | None]) -> Registration:
+def apply_known_lenses(
+    registration: Registration, graph: ViewGraph, known: Mapping[str, Intrinsics | None]
+) -> Registration:
     """The registration with lenses that are `known`, by keyframe, of all cameras that share them.
 
     What continues an estimate has fewer points, which tell less of a lens than those that it was estimated from before.
@@ -78,27 +80,27 @@ def with_lenses(registration: Registration, graph: ViewGraph, known: Mapping[str
     return replace(registration, cameras=tuple(cameras))
 
 
-def straight(keyframe: Keyframe, lens: Intrinsics) -> Keyframe:
+def undistort_keyframe(keyframe: Keyframe, lens: Intrinsics) -> Keyframe:
     """The keyframe as a pinhole would have seen it. Raises ValueError where `lens` folds its picture over."""
     height, width = keyframe.image.shape[:2]
-    image = modelled_image(keyframe.frame.image, _DETAIL * max(width, height))
+    image = resize_image(keyframe.frame.image, _DETAIL * max(width, height))
     mask = keyframe.frame.mask
-    mask = None if mask is None else modelled_mask(mask, *image.shape[:2])
-    frame = undistorted(replace(keyframe.frame, image=image, mask=mask, intrinsics=lens))
+    mask = None if mask is None else resize_mask(mask, *image.shape[:2])
+    frame = undistort_frame(replace(keyframe.frame, image=image, mask=mask, intrinsics=lens))
     shown = frame.image
     if shown.shape[:2] != (height, width):
         shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
-    points = straight_pixels(keyframe.features.points, lens, _pinhole(frame))
-    return Keyframe(frame, shown, _moved(keyframe.features, points), lens, keyframe.moving)
+    points = undistort_pixels(keyframe.features.points, lens, _pinhole(frame))
+    return Keyframe(frame, shown, _replace_points(keyframe.features, points), lens, keyframe.moving)
 
 
-def straight_pixels(pixels: Array, lens: Intrinsics, pinhole: Intrinsics) -> Array:
+def undistort_pixels(pixels: Array, lens: Intrinsics, pinhole: Intrinsics) -> Array:
     """(M, 2) where `pinhole` shows what `lens` shows at `pixels` (M, 2), each in pixels of its own picture."""
     return opencv.project(opencv.unproject(pixels, lens), pinhole) if len(pixels) else pixels
 
 
 def corner_shift(lens: Intrinsics | None) -> float:
-    """By how much the distortion moves the corner that is farthest from the principal point, over the longer side.
+    """Returns how far distortion moves the corner farthest from the principal point, over the longer side.
 
     Above 0 away from that point; 0 without a lens.
     """
@@ -119,14 +121,14 @@ def radial_of(lens: Intrinsics | None) -> tuple[float, float]:
     return first, second
 
 
-def _estimated(camera: RegisteredCamera, frame: Frame) -> Intrinsics:
+def _make_intrinsics(camera: RegisteredCamera, frame: Frame) -> Intrinsics:
     cx, cy = (float(value) for value in camera.principal)
     radial = (*camera.radial.tolist(), 0.0, 0.0) if camera.radial.any() else ()
     fx, fy = (float(value) for value in camera.focals)
     return Intrinsics(frame.width, frame.height, fx, fy, cx, cy, "estimated", radial)
 
 
-def _seen_by(keyframes: list[Keyframe], registration: Registration) -> Registration:
+def _undistort_observations(keyframes: list[Keyframe], registration: Registration) -> Registration:
     """The registration of these keyframes, some of which are straight, in their pixels."""
     pixels, inside = registration.observed_pixels.copy(), np.ones(len(registration.observed_by), bool)
     cameras = []
@@ -136,7 +138,7 @@ def _seen_by(keyframes: list[Keyframe], registration: Registration) -> Registrat
             cameras.append(camera)
             continue
         pinhole, own = _pinhole(keyframe.frame), registration.observed_by == camera.index
-        pixels[own] = straight_pixels(pixels[own], keyframe.lens, pinhole)
+        pixels[own] = undistort_pixels(pixels[own], keyframe.lens, pinhole)
         inside[own] = np.all((pixels[own] >= 0) & (pixels[own] < (pinhole.width, pinhole.height)), axis=1)
         principal = np.array([pinhole.cx, pinhole.cy])
         cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=np.zeros(2), aspect=1.0))
@@ -155,5 +157,5 @@ def _pinhole(frame: Frame) -> Intrinsics:
     return frame.intrinsics
 
 
-def _moved(features: Features, points: Array) -> Features:
+def _replace_points(features: Features, points: Array) -> Features:
     return Features(points, features.descriptors, features.point_of, features.tilt)

@@ -26,9 +26,9 @@ _PARALLEL = 0.7  # component of a unit vector below which its axis is clearly no
 _MIN_ALONG_NORMAL = 1e-12  # component of a ray along a surface's normal, in place of 0: the surface is seen edge-on
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    patch_alignment: patch_alignment.Config = patch_alignment.Config()
-    patch_image: patch_image.Config = patch_image.Config()
+class SubpixelConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    patch_alignment: patch_alignment.PatchAlignmentConfig = patch_alignment.PatchAlignmentConfig()
+    patch_image: patch_image.PatchImageConfig = patch_image.PatchImageConfig()
     # Angles that are tried, of the surface's normal from the direction to the reference
     slants_deg: tuple[float, ...] = (0.0, 50.0)
     directions: int = 6  # that are tried for a slanted normal, evenly around
@@ -50,7 +50,7 @@ class _Observations:
 
 
 def refine(
-    problem: bundle.Problem, registered: Sequence[int], images: Sequence[PatchImage], config: Config
+    problem: bundle.Problem, registered: Sequence[int], images: Sequence[PatchImage], config: SubpixelConfig
 ) -> bundle.Problem:
     """The problem with aligned observations, sorted by point.
 
@@ -59,7 +59,7 @@ def refine(
     reference = _references(problem)
     matched = _others(problem, reference)
     normals = _best_normals(problem, reference, matched, images, config)
-    predicted = _predicted(problem, reference, registered, images, config)
+    predicted = _predict_observations(problem, reference, registered, images, config)
     observations = _Observations(
         *(
             np.concatenate([getattr(part, name) for part in (matched, predicted)])
@@ -67,7 +67,7 @@ def refine(
         )
     )
     aligned = _align(problem, reference, observations, normals[observations.point], images, config.patch_alignment)
-    pixels = _per_image(images, observations.camera, aligned.target, PatchImage.from_grey)
+    pixels = _per_image(images, observations.camera, aligned.target, PatchImage.map_from_grey)
     longer_side = np.array([image.size.max() for image in images])[observations.camera]
     moved_px = np.linalg.norm(pixels - observations.pixels, axis=1) * REFERENCE_SIDE / longer_side
     good = (
@@ -106,12 +106,12 @@ def _others(problem: bundle.Problem, reference: Index) -> _Observations:
     return _Observations(problem.camera_of[others], problem.point_of[others], problem.pixels[others])
 
 
-def _predicted(
+def _predict_observations(
     problem: bundle.Problem,
     reference: Index,
     registered: Sequence[int],
     images: Sequence[PatchImage],
-    config: Config,
+    config: SubpixelConfig,
 ) -> _Observations:
     """Projections of points into registered views that do not observe them but see them from a similar direction."""
     unobserved = np.zeros((len(problem.points), len(problem.rotations)), bool)
@@ -130,14 +130,18 @@ def _predicted(
 
 
 def _best_normals(
-    problem: bundle.Problem, reference: Index, matched: _Observations, images: Sequence[PatchImage], config: Config
+    problem: bundle.Problem,
+    reference: Index,
+    matched: _Observations,
+    images: Sequence[PatchImage],
+    config: SubpixelConfig,
 ) -> Array:
     """(P, 3) the surface normal, of those tried, with the highest summed correlation of a point's matched patches."""
     towards = bundle.centres(problem)[problem.camera_of[reference]] - problem.points
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     unmoved = msgspec.structs.replace(config.patch_alignment, max_iterations=0)
     best, chosen = np.full(len(towards), -1.0), towards
-    for candidates in _slanted(towards, config.slants_deg, config.directions):
+    for candidates in _slant_directions(towards, config.slants_deg, config.directions):
         correlation = _align(problem, reference, matched, candidates[matched.point], images, unmoved).correlation
         total = np.bincount(matched.point, np.maximum(correlation, 0.0), minlength=len(towards))
         better = total > best
@@ -145,7 +149,7 @@ def _best_normals(
     return chosen
 
 
-def _slanted(towards: Array, slants_deg: Sequence[float], directions: int) -> list[Array]:
+def _slant_directions(towards: Array, slants_deg: Sequence[float], directions: int) -> list[Array]:
     """Unit vectors `towards` (P, 3) slanted by each angle into so many directions; by an angle of 0 once."""
     helper = np.where(np.abs(towards[:, :1]) < _PARALLEL, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     across = np.cross(towards, helper)
@@ -165,8 +169,8 @@ def _align(
     observations: _Observations,
     normals: Array,  # (S, 3)
     images: Sequence[PatchImage],
-    config: patch_alignment.Config,
-) -> patch_alignment.Aligned:
+    config: patch_alignment.PatchAlignmentConfig,
+) -> patch_alignment.AlignedPatches:
     """Aligns the reference patch of each observed point, warped as a plane with its normal, with the observation."""
     observed = reference[observations.point]
     source = problem.camera_of[observed]
@@ -174,9 +178,9 @@ def _align(
     affine = plane_affines(problem, problem.points[observations.point], normals, source, observations.camera)
     patches = Patches(
         reference_image=source,
-        reference=_per_image(images, source, problem.pixels[observed], PatchImage.to_grey),
+        reference=_per_image(images, source, problem.pixels[observed], PatchImage.map_to_grey),
         target_image=observations.camera,
-        target=_per_image(images, observations.camera, observations.pixels, PatchImage.to_grey),
+        target=_per_image(images, observations.camera, observations.pixels, PatchImage.map_to_grey),
         affine=affine * (scale[observations.camera] / scale[source])[:, None, None],
     )
     return patch_alignment.align([image.grey for image in images], patches, config)

@@ -21,7 +21,7 @@ Index32 = npt.NDArray[np.int32]
 _ROUNDS = 3  # of triangulation: the worst observation of a track is left out twice at most
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TriangulationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_error_px: float = 2.5  # reprojection error of a kept observation, pixels at REFERENCE_SIDE
     min_angle_deg: float = 1.0  # triangulation angle: the widest between two rays of a kept point
 
@@ -32,7 +32,7 @@ def triangulate(matrices: Array, rays: Array, camera_of: Index, track_of: Index,
     `rays` (O, 2) are normalised image coordinates, `matrices` (C, 3, 4) world to camera. A point with fewer than two
     observations, or at infinity, is NaN.
     """
-    cameras, (rays,), first = _by_point(camera_of, track_of, num_tracks, rays)
+    cameras, (rays,), first = _sort_by_point(camera_of, track_of, num_tracks, rays)
     matrices, points = np.ascontiguousarray(matrices), np.empty((num_tracks, 3))
     native = pointer(matrices), pointer(rays), pointer(cameras), pointer(first), num_tracks, pointer(points)
     library().core_triangulate(*native)
@@ -44,14 +44,14 @@ def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: In
 
     `centres` (C, 3) are those of the cameras.
     """
-    cameras, _, first = _by_point(camera_of, track_of, len(points))
+    cameras, _, first = _sort_by_point(camera_of, track_of, len(points))
     centres, points, cosines = np.ascontiguousarray(centres), np.ascontiguousarray(points), np.empty(len(points))
     native = pointer(centres), pointer(points), pointer(cameras), pointer(first), len(points), pointer(cosines)
     library().core_widest_angles(*native)
     return np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
 
-def _by_point(
+def _sort_by_point(
     camera_of: Index, point_of: Index, num_points: int, *values: Array
 ) -> tuple[Index32, list[Array], Index32]:
     """The cameras and `values` of observations in the order of their points, and where those of each point begin."""
@@ -67,7 +67,7 @@ def retriangulate(
     all_tracks: Tracks,
     registered: Sequence[int],
     scale: Array,
-    config: Config,
+    config: TriangulationConfig,
     tolerance: float,
 ) -> tuple[bundle.Problem, Index]:
     """The problem with all points that the registered cameras agree on, and the tracks of these (P,).

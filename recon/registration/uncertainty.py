@@ -61,7 +61,7 @@ def centre_covariances(problem: bundle.Problem, covariance: bundle.Covariance, r
 
 @dataclass(frozen=True, eq=False)
 class _Errors:
-    """What the errors of C poses after the best similarity are made of."""
+    """The errors of C poses after the best similarity, by their parts."""
 
     joint: Array  # (6 C, 6 C) covariance of the poses' parameters
     turns: Array  # (3 C, 6 C) derivatives of the orientations in the world
@@ -78,19 +78,19 @@ def _errors(problem: bundle.Problem, covariance: bundle.Covariance, registered: 
     count = len(members)
     if not all(np.isfinite(values).all() for values in (joint, rotations, translations)):
         return None
-    turns, moves = by_pose(rotations, translations)
+    turns, moves = differentiate_by_pose(rotations, translations)
     centres = np.stack([-R.T @ t for R, t in zip(rotations, translations, strict=True)])
     centred = centres - centres.mean(0)
     spread = max(float(np.sqrt((centred**2).sum(1).mean())), _MIN_SPREAD)
     # The similarity may rotate all cameras alike, and translate, rotate and scale all centres.
     translated = np.tile(np.eye(3), (count, 1))
     rotated = np.concatenate([cross_matrix(centre[None])[0] for centre in centred])
-    turns = _without(translated) @ turns
-    moves = _without(np.column_stack([translated, rotated / spread, centred.ravel() / spread])) @ moves
+    turns = _make_null_projection(translated) @ turns
+    moves = _make_null_projection(np.column_stack([translated, rotated / spread, centred.ravel() / spread])) @ moves
     return _Errors(joint, turns, moves, spread)
 
 
-def by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:
+def differentiate_by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:
     """Derivatives (3 C, 6 C) of the orientations and centres in the world by the poses' parameters."""
     count = len(rotations)
     turns, moves = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
@@ -112,7 +112,7 @@ def _variances(by: Array, joint: Array) -> Array:
     return np.where(variances < -_ROUNDING * magnitudes, variances, variances.clip(0.0))
 
 
-def _without(directions: Array) -> Array:
+def _make_null_projection(directions: Array) -> Array:
     """The projection that takes out what the columns of `directions` span."""
     u, s, _ = np.linalg.svd(directions, full_matrices=False)
     basis = u[:, s > _MIN_SINGULAR * s.max()]

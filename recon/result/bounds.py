@@ -32,9 +32,9 @@ class Bounds:
     focal_percent: float  # of the focal length
     axes: Axes  # of the ellipsoid that holds the centre: semi-axes in the world's frame and unit, the longest first
 
-    def widened(self, factor: float) -> Bounds:
+    def widen(self, factor: float) -> Bounds:
         """Every bound `factor` times as wide."""
-        wider = self.scaled(factor)
+        wider = self.rescale(factor)
         return replace(
             wider,
             rotation_deg=factor * self.rotation_deg,
@@ -42,12 +42,12 @@ class Bounds:
             focal_percent=factor * self.focal_percent,
         )
 
-    def scaled(self, factor: float) -> Bounds:
+    def rescale(self, factor: float) -> Bounds:
         """The same in a world whose unit is `factor` times smaller."""
-        return replace(self, centre=self.centre * factor, axes=as_axes(factor * np.array(self.axes)))
+        return replace(self, centre=self.centre * factor, axes=make_axes(factor * np.array(self.axes)))
 
 
-def widest(bounds: Iterable[Bounds]) -> Bounds | None:
+def find_widest(bounds: Iterable[Bounds]) -> Bounds | None:
     """The widest bound of each kind, with the ellipsoid of the widest centre; None without any."""
     every = list(bounds)
     if not every:
@@ -61,12 +61,12 @@ def widest(bounds: Iterable[Bounds]) -> Bounds | None:
     )
 
 
-def ball(radius: float) -> Axes:
+def make_ball(radius: float) -> Axes:
     """The semi-axes of a ball."""
     return ((radius, 0.0, 0.0), (0.0, radius, 0.0), (0.0, 0.0, radius))
 
 
-def axes_of(covariance: Array, centre: float) -> Axes:
+def compute_axes(covariance: Array, centre: float) -> Axes:
     """The semi-axes of the ellipsoid of 95 % for a centre whose errors are shorter than `centre` with 95 %.
 
     `covariance` (3, 3) gives its shape, `centre` its size: the ellipsoid is that of a normal distribution with a
@@ -75,38 +75,38 @@ def axes_of(covariance: Array, centre: float) -> Axes:
     dimensions must be wider to hold as much. A ball, too, where `covariance` is not finite or has no size.
     """
     if not (np.isfinite(covariance).all() and np.isfinite(centre)):
-        return ball(centre)
+        return make_ball(centre)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     variances = values[::-1].clip(0.0)
     if variances[0] <= (_NEGLIGIBLE * centre) ** 2:
-        return ball(centre)
-    lengths = centre * np.sqrt(_CHI2_95_OF_3 * variances / _squared_length_95(variances))
+        return make_ball(centre)
+    lengths = centre * np.sqrt(_CHI2_95_OF_3 * variances / _compute_squared_length_95(variances))
     directions = vectors.T[::-1]
     largest = directions[np.arange(3), np.abs(directions).argmax(1)]
-    return as_axes(lengths[:, None] * directions * np.sign(largest)[:, None])
+    return make_axes(lengths[:, None] * directions * np.sign(largest)[:, None])
 
 
-def covariance(axes: Axes) -> Array:
+def compute_covariance(axes: Axes) -> Array:
     """(3, 3) of the normal distribution whose 95 % ellipsoid has these semi-axes."""
     rows = np.array(axes)
     return rows.T @ rows / _CHI2_95_OF_3
 
 
-def length_95(covariance: Array) -> float:
+def compute_length_95(covariance: Array) -> float:
     """The length that an error with `covariance` (3, 3) keeps below with 95 %; infinite where that is not finite."""
     if not np.isfinite(covariance).all():
         return math.inf
     variances = np.linalg.eigvalsh((covariance + covariance.T) / 2.0).clip(0.0)
-    return math.sqrt(_squared_length_95(variances)) if variances.any() else 0.0
+    return math.sqrt(_compute_squared_length_95(variances)) if variances.any() else 0.0
 
 
-def as_axes(rows: Array) -> Axes:
+def make_axes(rows: Array) -> Axes:
     """The rows (3, 3) as axes."""
     first, second, third = ((float(x), float(y), float(z)) for x, y, z in rows)
     return first, second, third
 
 
-def _squared_length_95(variances: Array) -> float:
+def _compute_squared_length_95(variances: Array) -> float:
     """The 95 % quantile of the squared length of a normal vector with `variances` (3,) along its axes.
 
     As of the scaled chi-squared variable with the same mean and variance (Satterthwaite, 1946), whose quantile is

@@ -14,8 +14,8 @@ _RIGID = 1e-2  # largest difference of a rotation times its transpose from the i
 _EXACT = 1e-6  # by which what is 0 or 1 in every such matrix may differ from it
 
 
-def camera_problem(T_world_camera: Array, K: Array, width: int, height: int) -> str:
-    """What the camera should be and is not; empty where nothing is wrong with it."""
+def find_camera_problem(T_world_camera: Array, K: Array, width: int, height: int) -> str:
+    """Describes what is wrong with the camera; empty where nothing is."""
     if T_world_camera.shape != (4, 4) or K.shape != (3, 3):
         return f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}"
     if not (np.abs(T_world_camera) <= MAX_COORDINATE).all() or not (np.abs(K) <= MAX_COORDINATE).all():

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.export.quaternions import matrices_from_quats, quats_from_matrices
 from splatnode.recon.result.snapshot import GaussianArrays
 
@@ -31,41 +31,41 @@ _LEAST_OPAQUE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class DetailLevel:
     """Coarse Gaussians, and how far away they suffice."""
 
     gaussians: GaussianArrays
     side: float  # of the voxels, in the scene's unit
 
-    def from_distance(self, focal_px: float) -> float:
+    def compute_min_distance(self, focal_px: float) -> float:
         """How far away a camera of this focal length must be for errors below a pixel."""
         return focal_px * self.side
 
 
-def levels(gaussians: GaussianArrays, most: int = 2) -> tuple[Level, ...]:
+def make_detail_levels(gaussians: GaussianArrays, most: int = 2) -> tuple[DetailLevel, ...]:
     """At most `most` levels, each with a quarter of the Gaussians of the one before, or fewer, finest first.
 
     What is large, as a far shell, stays in all of them and is not counted. There are fewer levels where the scene is
     small or merges no further.
     """
-    found: list[Level] = []
-    finer, side = gaussians, _first_side(gaussians)
+    found: list[DetailLevel] = []
+    finer, side = gaussians, _choose_first_side(gaussians)
     large = int((gaussians.scales.max(1) > _LARGE * side).sum()) if len(gaussians) else 0
     while len(found) < most and len(finer) - large >= FEWER * FEWEST:
         wanted = large + (len(finer) - large) // FEWER
         for _ in range(_MOST_STEPS):
-            coarse = coarser(gaussians, side)
+            coarse = merge_by_voxel(gaussians, side)
             if len(coarse) <= wanted:
                 break
             side *= _STEP
         else:
             break
-        found.append(Level(coarse, side))
+        found.append(DetailLevel(coarse, side))
         finer = coarse
     return tuple(found)
 
 
-def coarser(gaussians: GaussianArrays, side: float) -> GaussianArrays:
+def merge_by_voxel(gaussians: GaussianArrays, side: float) -> GaussianArrays:
     """The Gaussians with those of one voxel of this `side` merged into one; larger ones stay.
 
     The merged ones come from no frame (source_frame -1). Raises ValueError for a side that is not above 0.
@@ -83,10 +83,15 @@ def coarser(gaussians: GaussianArrays, side: float) -> GaussianArrays:
     if not len(merged):
         return gaussians
     _, group = np.unique(voxel[~alone], return_inverse=True)
-    return joined([take(gaussians, stays), _moments(take(gaussians, merged), group.reshape(-1), side)])
+    return concatenate_gaussians(
+        [
+            select_gaussians(gaussians, stays),
+            _merge_groups(select_gaussians(gaussians, merged), group.reshape(-1), side),
+        ]
+    )
 
 
-def joined(parts: Iterable[GaussianArrays]) -> GaussianArrays:
+def concatenate_gaussians(parts: Iterable[GaussianArrays]) -> GaussianArrays:
     """All Gaussians of `parts`, in order; lower degrees of spherical harmonics are filled up with zeros."""
     every = list(parts) or [GaussianArrays.empty()]
     bases = max(part.sh.shape[1] for part in every)
@@ -95,12 +100,12 @@ def joined(parts: Iterable[GaussianArrays]) -> GaussianArrays:
     return GaussianArrays(*(np.concatenate([getattr(part, name) for part in filled]) for name in names))
 
 
-def _first_side(gaussians: GaussianArrays) -> float:
+def _choose_first_side(gaussians: GaussianArrays) -> float:
     """The median extent: smaller voxels hold hardly more than one Gaussian each."""
     return float(np.median(gaussians.scales.max(1))) if len(gaussians) else 1.0
 
 
-def _moments(gaussians: GaussianArrays, group: npt.NDArray[np.intp], side: float) -> GaussianArrays:
+def _merge_groups(gaussians: GaussianArrays, group: npt.NDArray[np.intp], side: float) -> GaussianArrays:
     """One Gaussian for each group 0, 1 ... with the moments of those in it.
 
     One that would have to be more than opaque to have their mass is wider instead, as far as it still is one of a

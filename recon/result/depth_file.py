@@ -11,11 +11,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import LONGEST_NAME, printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import MAX_CAMERAS
-from splatnode.recon.result.npz_file import opened
+from splatnode.recon.result.npz_file import open_npz
 
 DEPTHS = "depth.npz"  # in the result folder
 MOST_BYTES = 1 << 29  # of the arrays in a file that is read
@@ -40,14 +40,14 @@ def read_depths(folder: Path) -> dict[str, npt.NDArray[np.float16]]:
     path = folder / DEPTHS
     if not path.is_file():
         return {}
-    with foreign(SceneFileError, str(path)):
+    with guard_untrusted(SceneFileError, str(path)):
         return decode_depths(read_bounded(path, MOST_BYTES, SceneFileError, str(path)), str(path))
 
 
 def decode_depths(data: bytes, name: str = DEPTHS) -> dict[str, npt.NDArray[np.float16]]:
     """Reads depth.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
-    with foreign(SceneFileError, name):
-        with opened(data, MOST_BYTES, name, "depths") as arrays:
+    with guard_untrusted(SceneFileError, name):
+        with open_npz(data, MOST_BYTES, name, "depths") as arrays:
             names = arrays["names"]
             if names.ndim != 1 or names.dtype.kind != "S" or len(names) > MAX_CAMERAS:
                 raise SceneFileError(f"{name}: names must be those of at most {MAX_CAMERAS} cameras")
@@ -58,5 +58,5 @@ def decode_depths(data: bytes, name: str = DEPTHS) -> dict[str, npt.NDArray[np.f
                 raise SceneFileError(f"{name}: a depth must be (h, w) float16, got {depth.shape} {depth.dtype}")
             if not (np.isfinite(depth) & (depth >= 0)).all():
                 raise SceneFileError(f"{name}: depths must be finite, and 0 or more")
-        texts = [printable(each.decode(), LONGEST_NAME) for each in names.tolist()]
+        texts = [sanitize_text(each.decode(), LONGEST_NAME) for each in names.tolist()]
         return dict(zip(texts, depths, strict=True))

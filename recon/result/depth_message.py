@@ -29,7 +29,7 @@ class DepthHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     views: Annotated[tuple[tuple[Name, Share], ...], msgspec.Meta(max_length=MAX_CAMERAS)]  # name, share; where known
 
 
-def depth_header(
+def make_depth_header(
     snapshot: Snapshot, scene_id: str, scene_sequence: int, numbering: Mapping[str, object]
 ) -> DepthHeader:
     """The message on a snapshot that is shown by message `scene_sequence`; `numbering` as for `to_message`."""
@@ -43,7 +43,7 @@ def depth_header(
     )
 
 
-def with_depth(snapshot: Snapshot, header: DepthHeader) -> Snapshot:
+def add_depth_shares(snapshot: Snapshot, header: DepthHeader) -> Snapshot:
     """The snapshot of the scene that `header` is about, with what it says of each view."""
     shares = dict(header.views)
     cameras = tuple(replace(camera, consistent_depth=shares.get(camera.name)) for camera in snapshot.cameras)

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from splatnode.capture.process.disk_space import shortage
-from splatnode.capture.process.folders import claimed
-from splatnode.capture.process.lock import Held
-from splatnode.recon.result.export.staged import ResultWriteError, completed, explanation
+from splatnode.capture.process.folders import claim_folder
+from splatnode.capture.process.lock import LockHeld
+from splatnode.recon.result.export.staged import ResultWriteError, explain_error, finish_interrupted_write
 
 
-class FolderInUse(Held):
+class FolderInUse(LockHeld):
     """Another process writes results into this folder."""
 
     def __init__(self, folder: Path, pid: int | None) -> None:
@@ -22,7 +22,7 @@ class FolderInUse(Held):
 
 
 @contextlib.contextmanager
-def result_folder(out: Path, needed_bytes: int = 0) -> Iterator[None]:
+def hold_result_folder(out: Path, needed_bytes: int = 0) -> Iterator[None]:
     """Holds the folder `out` for this process. Folders that it made and that are empty are removed at the end.
 
     Raises ResultWriteError where nothing can be written into it or fewer than `needed_bytes` are free, and FolderInUse
@@ -30,13 +30,13 @@ def result_folder(out: Path, needed_bytes: int = 0) -> Iterator[None]:
     """
     with contextlib.ExitStack() as resources:
         try:
-            resources.enter_context(claimed(out))
-            completed(out, (path for path in out.iterdir() if path.is_dir() and not path.is_symlink()))
+            resources.enter_context(claim_folder(out))
+            finish_interrupted_write(out, (path for path in out.iterdir() if path.is_dir() and not path.is_symlink()))
             why = shortage(out, needed_bytes, "the result")
-        except Held as error:
+        except LockHeld as error:
             raise FolderInUse(out, error.pid) from error
         except OSError as error:
-            raise ResultWriteError(error.errno, explanation(error, out)) from error
+            raise ResultWriteError(error.errno, explain_error(error, out)) from error
         if why:
             raise ResultWriteError(errno.ENOSPC, f"{why}. Free some space or choose another folder")
         yield

@@ -44,7 +44,7 @@ class Landmarks:
     metric: bool = False  # lengths are metres
     focal_bounds: Array | None = None  # (C,) 95 % bounds of the focal lengths, percent; None: an earlier file has none
 
-    def moved(self, scale: float, rotation: Array, translation: Array, *, metric: bool = False) -> Landmarks:
+    def transform(self, scale: float, rotation: Array, translation: Array, *, metric: bool = False) -> Landmarks:
         """The same in the world to which x -> scale * rotation @ x + translation leads.
 
         `metric` says whether its unit is the metre.

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import LONGEST_NAME, printable
-from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
+from splatnode.recon.result.camera_check import MAX_COORDINATE, find_camera_problem
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
-from splatnode.recon.result.npz_file import opened
+from splatnode.recon.result.npz_file import open_npz
 
 LANDMARKS = "landmarks.npz"  # in the result folder
 DESCRIPTORS_A_PHOTOGRAPH = 2000  # kept at most, in the mean: 160 kB of the file
@@ -55,19 +55,19 @@ def read_landmarks(folder: Path) -> Landmarks:
     """
     path = folder / LANDMARKS
     if not path.is_file():
-        raise FileNotFoundError(_missing(folder))
-    with foreign(SceneFileError, str(path)):
+        raise FileNotFoundError(_explain_missing(folder))
+    with guard_untrusted(SceneFileError, str(path)):
         return decode_landmarks(read_bounded(path, MOST_BYTES, SceneFileError, str(path)), str(path))
 
 
 def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
     """Reads landmarks.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
-    with foreign(SceneFileError, name):
-        with opened(data, MOST_BYTES, name, "landmarks") as arrays:
+    with guard_untrusted(SceneFileError, name):
+        with open_npz(data, MOST_BYTES, name, "landmarks") as arrays:
             found = {key: arrays[key] for key in _SHAPES if key != _FOCAL_BOUNDS or key in arrays}
-        found["lenses"] = _with_second_radial(found["lenses"])
+        found["lenses"] = _insert_second_radial(found["lenses"])
         _check(found, name)
-        return _decoded(found)
+        return _make_landmarks(found)
 
 
 _FOCAL_BOUNDS = "focal_bounds"  # that an earlier splatnode did not write
@@ -86,7 +86,7 @@ _SHAPES: dict[str, tuple[str, str, tuple[int, ...]]] = {  # kind, what its first
 }
 
 
-def _with_second_radial(lenses: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def _insert_second_radial(lenses: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """(C, 6) of a file from before lenses had a second radial coefficient, which has (C, 5)."""
     return np.insert(lenses, 2, 0.0, axis=1) if lenses.ndim == 2 and lenses.shape[1] == 5 else lenses
 
@@ -109,7 +109,7 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
     if (found["point_of"] >= counts["P"]).any() or (found["photograph_of"] >= counts["C"]).any():
         raise SceneFileError(f"{name}: descriptors must be of its points and photographs")
     for T_world_camera, lens in zip(found["Ts_world_camera"], found["lenses"], strict=True):
-        problem = camera_problem(T_world_camera, np.diag([lens[0], lens[0], 1.0]), 1, 1)
+        problem = find_camera_problem(T_world_camera, np.diag([lens[0], lens[0], 1.0]), 1, 1)
         if problem:
             raise SceneFileError(f"{name}: {problem}")
     bounds = np.column_stack([found["bounds"], found.get(_FOCAL_BOUNDS, np.zeros(counts["C"]))])
@@ -117,7 +117,7 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
         raise SceneFileError(f"{name}: focal lengths, shapes, bounds and units must be positive")
 
 
-def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
+def _make_landmarks(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
     covariances = np.empty((len(found["points"]), 3, 3))
     covariances[:, _ROWS, _COLUMNS] = found["covariances"]
     covariances[:, _COLUMNS, _ROWS] = found["covariances"]
@@ -131,7 +131,7 @@ def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
         found["descriptors"],
         found["point_of"].astype(np.int64),
         found["photograph_of"].astype(np.int64),
-        tuple(printable(name.decode(), LONGEST_NAME) for name in found["names"].tolist()),
+        tuple(sanitize_text(name.decode(), LONGEST_NAME) for name in found["names"].tolist()),
         found["Ts_world_camera"],
         KnownLenses(lenses[:, 0], lenses[:, 1:3], lenses[:, 3:5], lenses[:, 5]),
         bounds[:, 0],
@@ -143,8 +143,8 @@ def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
     )
 
 
-def _missing(folder: Path) -> str:
-    """What to do where a folder has no landmarks."""
+def _explain_missing(folder: Path) -> str:
+    """Explains what to do where a folder has no landmarks."""
     if (folder / "scene.ply").is_file():
         return (
             f"{folder / LANDMARKS} is not there: an earlier splatnode made this result, or it is a merged map or a "

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from splatnode.recon.result.coarser import Level
+from splatnode.recon.result.coarser import DetailLevel
 from splatnode.recon.result.snapshot import CameraEstimate
 
 LEVELS_FILE = "levels.json"
 _FOCAL = 500.0  # pixels, where there is no camera
 
 
-def levels_record(levels: Sequence[Level], cameras: Sequence[CameraEstimate]) -> dict[str, object]:
-    """What levels.json and report.json tell of the `levels`, finest first.
+def make_levels_record(levels: Sequence[DetailLevel], cameras: Sequence[CameraEstimate]) -> dict[str, object]:
+    """Makes the record of the `levels`, finest first, for levels.json and report.json.
 
     `from_distance`, in the file's unit, is where a camera of `focal_px`, the longest of the scene's, begins to see
     errors below a pixel; for another focal length it is longer or shorter in proportion.
@@ -25,7 +25,7 @@ def levels_record(levels: Sequence[Level], cameras: Sequence[CameraEstimate]) ->
                 "file": f"levels/{number}.ply",
                 "num_gaussians": len(level.gaussians),
                 "voxel": level.side,
-                "from_distance": level.from_distance(focal),
+                "from_distance": level.compute_min_distance(focal),
             }
             for number, level in enumerate(levels, 1)
         ],

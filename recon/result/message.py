@@ -17,15 +17,15 @@ import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame, Intrinsics
-from splatnode.capture.left_out import or_left_out, or_none
-from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
+from splatnode.capture.left_out import make_optional_field, read_optional_field
+from splatnode.capture.messaging.jpeg import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.values import Amount, Count, Finite, Name, Text
 from splatnode.capture.messaging.wire import Header, Message, WireError
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import LONGEST_NAME, printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.camera_check import find_camera_problem
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -80,7 +80,7 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where nothing can be seen through it."""
         T_world_camera, K = np.array(self.T_world_camera).reshape(4, 4), np.array(self.K).reshape(3, 3)
-        why = camera_problem(T_world_camera, K, self.width, self.height)
+        why = find_camera_problem(T_world_camera, K, self.width, self.height)
         if not why and self.width * self.height > MAX_PIXELS:
             why = f"a picture of {self.width} x {self.height} pixels, more than {MAX_PIXELS}"
         if why:
@@ -113,7 +113,7 @@ class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
 
 @dataclass(frozen=True, eq=False)
 class LiveScene:
-    """What a viewer receives. The snapshot's `images` are thumbnails, its `sequence` counts the snapshots."""
+    """A scene as a viewer receives it. `images` are thumbnails, `sequence` counts the snapshots."""
 
     snapshot: Snapshot
     scene_id: str
@@ -121,7 +121,7 @@ class LiveScene:
     mono_ns: int  # of the sender
 
 
-def to_message(
+def encode_snapshot(
     snapshot: Snapshot, scene_id: str, numbering: Mapping[str, object]
 ) -> tuple[SceneHeader, list[npt.NDArray]]:
     """The header and the arrays of a snapshot; `numbering` is session, sequence and mono_ns."""
@@ -130,34 +130,36 @@ def to_message(
         **numbering,  # pyright: ignore[reportArgumentType]
         scene_id=scene_id,
         code=verdict.code,
-        message=printable(verdict.message),
-        advice=printable(verdict.advice),
+        message=sanitize_text(verdict.message),
+        advice=sanitize_text(verdict.advice),
         frames=verdict.frames[:MAX_NAMES],
         publishable=verdict.publishable,
         provisional=verdict.provisional,
-        cameras=tuple(camera_record(camera) for camera in snapshot.cameras),
+        cameras=tuple(make_camera_record(camera) for camera in snapshot.cameras),
         dropped=tuple(
-            (printable(frame.name, LONGEST_NAME) or "?", printable(frame.reason))
+            (sanitize_text(frame.name, LONGEST_NAME) or "?", sanitize_text(frame.reason))
             for frame in snapshot.dropped[-MAX_DROPPED:]
         ),
         iterations=snapshot.iterations,
         seconds=snapshot.seconds,
         final=snapshot.final,
-        scale=UNSET if snapshot.scale == RELATIVE else scale_record(snapshot.scale),
+        scale=UNSET if snapshot.scale == RELATIVE else make_scale_record(snapshot.scale),
     )
-    thumbnails = [to_jpeg(thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras]
+    thumbnails = [
+        make_jpeg_array(make_thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras
+    ]
     return header, [*(getattr(snapshot.gaussians, name) for name in GAUSSIAN_FIELDS), *thumbnails]
 
 
-def from_message(message: Message[SceneHeader]) -> LiveScene:
+def decode_snapshot(message: Message[SceneHeader]) -> LiveScene:
     """The scene in a message. Raises WireError where arrays and header do not belong together."""
-    with foreign(WireError, "a scene"):
-        return _live_scene(message)
+    with guard_untrusted(WireError, "a scene"):
+        return _decode_live_scene(message)
 
 
-def _live_scene(message: Message[SceneHeader]) -> LiveScene:
+def _decode_live_scene(message: Message[SceneHeader]) -> LiveScene:
     header = message.header
-    gaussians = _gaussians(message.arrays[: len(GAUSSIAN_FIELDS)])
+    gaussians = _parse_gaussians(message.arrays[: len(GAUSSIAN_FIELDS)])
     thumbnails = message.arrays[len(GAUSSIAN_FIELDS) :]
     if len(thumbnails) != len(header.cameras):
         raise WireError(f"{len(header.cameras)} cameras with {len(thumbnails)} thumbnails")
@@ -171,38 +173,38 @@ def _live_scene(message: Message[SceneHeader]) -> LiveScene:
             publishable=header.publishable,
             provisional=header.provisional,
         ),
-        cameras=tuple(camera_from(record) for record in header.cameras),
+        cameras=tuple(parse_camera(record) for record in header.cameras),
         gaussians=gaussians,
         images={
-            record.name: from_jpeg(jpeg, THUMBNAIL_SIDE)
+            record.name: decode_jpeg(jpeg, THUMBNAIL_SIDE)
             for record, jpeg in zip(header.cameras, thumbnails, strict=True)
         },
         dropped=tuple(DroppedFrame(name, reason) for name, reason in header.dropped),
         iterations=header.iterations,
         seconds=header.seconds,
         final=header.final,
-        scale=RELATIVE if header.scale is UNSET else scale_from(header.scale),
+        scale=RELATIVE if header.scale is UNSET else parse_scale(header.scale),
     )
     return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns)
 
 
-def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def make_thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """(h, w, 3) with the longer side at most THUMBNAIL_SIDE."""
     scale = min(1.0, THUMBNAIL_SIDE / max(image.shape[:2]))
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def scale_record(scale: Scale) -> ScaleRecord:
-    source = None if scale.source is None else printable(scale.source)
+def make_scale_record(scale: Scale) -> ScaleRecord:
+    source = None if scale.source is None else sanitize_text(scale.source)
     return ScaleRecord(scale.metric, source, scale.interval_95)
 
 
-def scale_from(record: ScaleRecord) -> Scale:
+def parse_scale(record: ScaleRecord) -> Scale:
     return Scale(**msgspec.structs.asdict(record))
 
 
-def bounds_record(bounds: Bounds | None) -> BoundsRecord | None:
+def make_bounds_record(bounds: Bounds | None) -> BoundsRecord | None:
     """A bound that is too small to be told is told as the least one, which holds, too."""
     if bounds is None:
         return None
@@ -212,11 +214,11 @@ def bounds_record(bounds: Bounds | None) -> BoundsRecord | None:
     return BoundsRecord(**numbers)
 
 
-def bounds_from(record: BoundsRecord | None) -> Bounds | None:
+def parse_bounds(record: BoundsRecord | None) -> Bounds | None:
     return None if record is None else Bounds(**msgspec.structs.asdict(record))
 
 
-def camera_record(camera: CameraEstimate) -> CameraRecord:
+def make_camera_record(camera: CameraEstimate) -> CameraRecord:
     return CameraRecord(
         name=camera.name,
         frame_id=camera.frame_id,
@@ -224,13 +226,13 @@ def camera_record(camera: CameraEstimate) -> CameraRecord:
         K=tuple(camera.K.ravel().tolist()),
         width=camera.width,
         height=camera.height,
-        bounds=bounds_record(camera.bounds),
+        bounds=make_bounds_record(camera.bounds),
         captured_at=camera.captured_at,
-        lens=or_left_out(camera.lens),
+        lens=make_optional_field(camera.lens),
     )
 
 
-def camera_from(record: CameraRecord) -> CameraEstimate:
+def parse_camera(record: CameraRecord) -> CameraEstimate:
     return CameraEstimate(
         name=record.name,
         frame_id=record.frame_id,
@@ -238,13 +240,13 @@ def camera_from(record: CameraRecord) -> CameraEstimate:
         K=np.array(record.K).reshape(3, 3),
         width=record.width,
         height=record.height,
-        bounds=bounds_from(record.bounds),
+        bounds=parse_bounds(record.bounds),
         captured_at=record.captured_at,
-        lens=or_none(record.lens),
+        lens=read_optional_field(record.lens),
     )
 
 
-def _gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
+def _parse_gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
     if len(arrays) != len(GAUSSIAN_FIELDS):
         raise WireError(f"{len(arrays)} arrays of Gaussians, expected {', '.join(GAUSSIAN_FIELDS)}")
     count = len(arrays[0]) if arrays[0].ndim else 0
@@ -256,10 +258,10 @@ def _gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
         kind = np.int32 if name == "source_frame" else np.float32
         if array.dtype != kind or array.shape != shape:
             raise WireError(f"{name} must be {np.dtype(kind)} {shape}, got {array.dtype} {array.shape}")
-    return _within_bounds(arrays)
+    return _drop_unbounded(arrays)
 
 
-def _within_bounds(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
+def _drop_unbounded(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
     """The Gaussians whose numbers are finite and not absurd."""
     kept = np.ones(len(arrays[0]), bool)
     for array in arrays[:-1]:

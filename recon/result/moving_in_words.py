@@ -7,7 +7,7 @@ from collections.abc import Mapping
 LEAST = 0.03  # share of a photograph: less is in the report alone
 
 
-def moving_in_words(shares: Mapping[str, float]) -> str:
+def describe_moving(shares: Mapping[str, float]) -> str:
     """The photographs of which so much was left out that their user should know; empty where there is none."""
     told = [share for share in shares.values() if share >= LEAST]
     if not told:

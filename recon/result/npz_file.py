@@ -16,7 +16,7 @@ from splatnode.recon.result.export.error import SceneFileError
 
 
 @contextlib.contextmanager
-def opened(data: bytes, most_bytes: int, name: str, what: str) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
+def open_npz(data: bytes, most_bytes: int, name: str, what: str) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
     """The arrays of an archive, which together have at most so many bytes; each is read when it is asked for.
 
     Raises SceneFileError, also for an array that is asked for and not there; it calls the file `name`, and its content

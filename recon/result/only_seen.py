@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.sources import seen
+from splatnode.recon.result.sources import find_confirmed
 
 
-def only_seen(snapshot: Snapshot) -> Snapshot:
+def remove_unconfirmed(snapshot: Snapshot) -> Snapshot:
     """The snapshot without Gaussians at depths that no two photographs confirm, and without the far shell."""
-    return replace(snapshot, gaussians=take(snapshot.gaussians, seen(snapshot.gaussians.source_frame)))
+    return replace(
+        snapshot, gaussians=select_gaussians(snapshot.gaussians, find_confirmed(snapshot.gaussians.source_frame))
+    )

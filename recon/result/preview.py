@@ -30,7 +30,7 @@ def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:
     return np.rint(rgb * 255).astype(np.uint8)
 
 
-def contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> bytes:
+def make_contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> bytes:
     """A PNG: photographs above, the Gaussians seen from the same cameras below; cameras from the first to the last.
 
     Without photographs where the snapshot does not have one of each camera.

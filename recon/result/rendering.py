@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.core import set_threads
-from splatnode.recon.rasterize.native import RasterImages, raster_forward, raster_input
+from splatnode.recon.rasterize.native import RasterImages, make_raster_input, raster_forward
 from splatnode.recon.result.snapshot import GaussianArrays
 
 Array = npt.NDArray[np.float32]
@@ -61,7 +61,7 @@ def render_arrays(
     if unknown:
         raise ValueError(f"channels must be of rgb, depth, normal and alpha; got {sorted(unknown)}")
 
-    source = raster_input(
+    source = make_raster_input(
         count,
         bases,
         [array.ctypes.data for array in arrays],

@@ -8,10 +8,10 @@ from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 
-from splatnode.recon.result.bounds import widest
-from splatnode.recon.result.export.cameras import camera_record
-from splatnode.recon.result.export.formats.ply import ply_bytes
-from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.bounds import find_widest
+from splatnode.recon.result.export.cameras import make_camera_dict
+from splatnode.recon.result.export.formats.ply import compute_ply_bytes
+from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.snapshot import Snapshot
 
 _PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
@@ -22,9 +22,9 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
 
     `scene_bytes` is the size of scene.ply, and `num_gaussians` what it holds, where the verdict lets it be published.
     """
-    gaussians = viewer_safe(snapshot.gaussians)
+    gaussians = sanitize_gaussians(snapshot.gaussians)
     verdict = snapshot.verdict
-    worst = widest(camera.bounds for camera in snapshot.cameras if camera.bounds is not None)
+    worst = find_widest(camera.bounds for camera in snapshot.cameras if camera.bounds is not None)
     share = snapshot.consistent_depth
     stages = {stage: seconds for stage, seconds in snapshot.seconds.items() if stage != "total"}
     return {
@@ -45,11 +45,13 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "seconds": {**stages, "total": snapshot.seconds.get("total", sum(stages.values()))},
         "peak_rss_mb": peak_rss_mb,
         "num_gaussians": len(gaussians),
-        "scene_bytes": ply_bytes(len(gaussians), gaussians.sh.shape[1], snapshot.scale) if verdict.publishable else 0,
+        "scene_bytes": compute_ply_bytes(len(gaussians), gaussians.sh.shape[1], snapshot.scale)
+        if verdict.publishable
+        else 0,
         "iterations": snapshot.iterations,
         "budget": [dict(hit) for hit in snapshot.budget],
         "served_by": dict(snapshot.served_by),
-        "cameras": [camera_record(camera) for camera in snapshot.cameras],
+        "cameras": [make_camera_dict(camera) for camera in snapshot.cameras],
         "frames_used": [camera.name for camera in snapshot.cameras],
         "frames_dropped": [{"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped],
         "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
@@ -58,12 +60,12 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "vignetting": {name: round(1.0 - math.exp(-falloff), 4) for name, falloff in snapshot.falloffs.items()},
         "seed": seed,
         "preset": preset,
-        "versions": versions(),
+        "versions": collect_versions(),
     }
 
 
-def versions() -> dict[str, str | None]:
-    """What ran: Python, the platform and the packages that decide the numbers (None: not installed)."""
+def collect_versions() -> dict[str, str | None]:
+    """Collects the versions of Python, the platform and the main packages (None: not installed)."""
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from splatnode.capture.process.printable import LONGEST_TEXT, printable
+from splatnode.capture.process.printable import LONGEST_TEXT, sanitize_text
 
 TWO_SIDED_95 = 1.96  # standard deviations to either side that hold 95 % of a normal distribution
 
@@ -36,11 +36,11 @@ class Scale:
 RELATIVE = Scale()
 
 
-def sentences(said: Sequence[str], longest: int = LONGEST_TEXT) -> str:
-    """What is `said`, as one text of at most `longest` characters: what fits, and how much more there is."""
+def join_sentences(said: Sequence[str], longest: int = LONGEST_TEXT) -> str:
+    """Joins `said` into one text of at most `longest` characters: what fits, and how many more there are."""
     for kept in range(len(said), 0, -1):
         left_out = [f"and {len(said) - kept} more"] if kept < len(said) else []
         text = "; ".join([*said[:kept], *left_out])
         if len(text) <= longest:
             return text
-    return printable("; ".join(said), longest)
+    return sanitize_text("; ".join(said), longest)

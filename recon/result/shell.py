@@ -22,7 +22,7 @@ _SAME_RADIUS = 0.03  # by how much of the radius those may be off it that no lon
 _ONE_RADIUS = 0.1  # by how much of the shell's radius its Gaussians may be off their median
 
 
-def far_shell(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.bool_]:
+def find_far_shell(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.bool_]:
     """(N,) which Gaussians are the shell; none where there is no shell."""
     nowhere = np.zeros(len(gaussians), bool)
     if not cameras or not len(gaussians):
@@ -38,7 +38,7 @@ def far_shell(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> n
     if len(candidates) < _FEWEST:
         return nowhere
     # Pieces of the sky, which are nearer, may look like it: the shell is the largest number at one distance.
-    edges = np.geomspace(candidates.min() * (1 - 1e-6), candidates.max() * (1 + 1e-6), _bins(candidates))
+    edges = np.geomspace(candidates.min() * (1 - 1e-6), candidates.max() * (1 + 1e-6), _count_edges(candidates))
     counts, _ = np.histogram(candidates, edges)
     fullest = int(counts.argmax())
     if counts[fullest] < _FEWEST:
@@ -49,6 +49,6 @@ def far_shell(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> n
     return (alike & (off <= _ONE_RADIUS)) | (large & (off <= _SAME_RADIUS))
 
 
-def _bins(distances: npt.NDArray[np.floating]) -> int:
+def _count_edges(distances: npt.NDArray[np.floating]) -> int:
     """So many edges that neighbouring ones are about a tenth apart."""
     return max(2, int(np.log(distances.max() / distances.min()) / _ONE_RADIUS) + 2)

@@ -12,7 +12,7 @@ LANDMARK_BYTES = 310_000  # a photograph, of landmarks.npz: 2000 descriptors and
 PIXELS_A_GAUSSIAN = 8
 
 
-def largest_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, most_gaussians: int | None) -> int:
+def bound_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, most_gaussians: int | None) -> int:
     """Bytes that the result of photographs of these `sizes` (width, height) stays below.
 
     `longer_side` of the modelled images is in pixels; `most_gaussians` is the limit that was set, if any.
@@ -21,9 +21,9 @@ def largest_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, mos
     pixels = sum(longer_side**2 * min(size) / max(size) for size in known)
     expected = round(pixels / PIXELS_A_GAUSSIAN)
     num_gaussians = expected if most_gaussians is None else min(expected, most_gaussians)
-    return result_bytes(num_gaussians, len(known))
+    return estimate_result_bytes(num_gaussians, len(known))
 
 
-def result_bytes(num_gaussians: int, num_photographs: int = 0) -> int:
+def estimate_result_bytes(num_gaussians: int, num_photographs: int = 0) -> int:
     """Bytes of a result folder with so many Gaussians, and with what is kept of so many photographs, rounded up."""
     return BYTES_A_GAUSSIAN * num_gaussians + (LANDMARK_BYTES + DEPTH_BYTES) * num_photographs + OTHER_BYTES

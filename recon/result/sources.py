@@ -16,12 +16,12 @@ SHELL = -1
 Source = TypeVar("Source")
 
 
-def filled(frame_id: int) -> int:
+def encode_unconfirmed(frame_id: int) -> int:
     """The source frame of Gaussians that this frame's pixels seeded at a depth that no other frame confirms."""
     return -2 - frame_id
 
 
-def frame_of(source_frame: Source) -> Source:
+def decode_frame_id(source_frame: Source) -> Source:
     """The frame_id (N,) of the keyframe that seeded each Gaussian, confirmed or not; SHELL for the far shell.
 
     Arrays and tensors alike.
@@ -29,6 +29,6 @@ def frame_of(source_frame: Source) -> Source:
     return abs(source_frame + 1) - 1  # pyright: ignore
 
 
-def seen(source_frame: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+def find_confirmed(source_frame: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
     """(N,) which Gaussians began at a depth that two photographs confirm."""
     return source_frame >= 0

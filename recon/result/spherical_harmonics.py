@@ -13,7 +13,7 @@ _CONSTANT = 0.28209479177387814  # the first term
 _DIRECTIONS = 64  # of the fit; a band of degree 3 needs 7
 
 
-def terms(x: Any, y: Any, z: Any, bases: int) -> list[Any]:
+def compute_sh_terms(x: Any, y: Any, z: Any, bases: int) -> list[Any]:
     """The first `bases` real spherical harmonics of unit vectors, in the order and with the signs of 3DGS; at most 16.
 
     The vectors' coordinates are arrays of NumPy or of torch, and so are the terms, of the same shape.
@@ -42,13 +42,13 @@ def terms(x: Any, y: Any, z: Any, bases: int) -> list[Any]:
     return found
 
 
-def basis(directions: Array, bases: int) -> Array:
+def compute_sh_basis(directions: Array, bases: int) -> Array:
     """(M, B) `terms` of unit vectors (M, 3)."""
     x, y, z = directions.T
-    return np.stack(terms(x, y, z, bases), 1)
+    return np.stack(compute_sh_terms(x, y, z, bases), 1)
 
 
-def turned(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float32]:
+def rotate_sh(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float32]:
     """(N, B, 3) the coefficients of the same colours after the world was turned by `rotation` (3, 3).
 
     What was seen along d is seen along rotation @ d. A rotation mixes the coefficients of one degree only, so each
@@ -59,7 +59,7 @@ def turned(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float
         raise ValueError(f"sh must be (N, B, 3) with B = 1, 4, 9 or 16, got {sh.shape}")
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    before, after = basis(directions @ rotation, bases), basis(directions, bases)
+    before, after = compute_sh_basis(directions @ rotation, bases), compute_sh_basis(directions, bases)
     result = sh.copy()
     for degree in range(1, round(bases**0.5)):
         band = slice(degree**2, (degree + 1) ** 2)
@@ -68,11 +68,11 @@ def turned(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float
     return result
 
 
-def flat(colours: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def make_flat_sh(colours: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """(N, 1, 3) coefficients of colours (N, 3) in [0, 1] that are the same from all directions."""
     return ((colours - 0.5) / _CONSTANT)[:, None].astype(np.float32)
 
 
-def mean_colours(sh: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+def compute_mean_colours(sh: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """(N, 3) the colours in [0, 1] of coefficients (N, B, 3), without what depends on the direction."""
     return np.clip(0.5 + _CONSTANT * sh[:, 0], 0.0, 1.0).astype(np.float32)

@@ -17,12 +17,12 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.image_file import (
     UnusableImage,
-    decode_photograph,
+    decode_any_image,
     encode_jpeg,
     find_common_range,
     read_image_file,
 )
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import outlast, raise_shortage
 from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
@@ -51,14 +51,14 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
     """
     folder = place if place.is_dir() else place.parent
     scene = place / "scene.ply" if place.is_dir() else place
-    report = _report(folder / "report.json") if place.is_dir() else None
+    report = _read_report(folder / "report.json") if place.is_dir() else None
     if not scene.is_file() and report is None:
         raise FileNotFoundError(
             f"{scene} is not there. Give a result's folder (splatnode replay FOLDER --out DIR), a .ply, .spz or .splat "
             "file, or the node's configuration (.yaml)"
         )
     report = report or _Report(Verdict(Code.OK, "A scene from a file, without a report.", "", publishable=True))
-    gaussians = _gaussians(scene) if scene.is_file() else GaussianArrays.empty()
+    gaussians = _read_gaussians(scene) if scene.is_file() else GaussianArrays.empty()
     cameras = read_cameras(folder / "cameras.json") if (folder / "cameras.json").is_file() else ()
     snapshot = Snapshot(
         sequence=0,
@@ -74,21 +74,21 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
         up=report.up,
         scenes=tuple(each.scene for each in report.scenes),
     )
-    return snapshot, _folders(folder, report)
+    return snapshot, _list_folders(folder, report)
 
 
-def photograph_folders(folder: Path) -> list[Path]:
-    """Where the photographs of the result in `folder` may be. Raises SceneFileError, OSError."""
-    return _folders(folder, _report(folder / "report.json"))
+def list_image_folders(folder: Path) -> list[Path]:
+    """Lists folders that may hold the images of the result in `folder`. Raises SceneFileError, OSError."""
+    return _list_folders(folder, _read_report(folder / "report.json"))
 
 
-def _folders(folder: Path, report: _Report | None) -> list[Path]:
+def _list_folders(folder: Path, report: _Report | None) -> list[Path]:
     reported = [] if report is None or report.photographs is None else [Path(report.photographs)]
     return [*reported, folder / "images", folder / "capture" / "images"]
 
 
-def _gaussians(scene: Path) -> GaussianArrays:
-    """With their source frames where the file beside the scene has them. Raises SceneFileError, OSError."""
+def _read_gaussians(scene: Path) -> GaussianArrays:
+    """Reads the Gaussians, with their source frames if known. Raises SceneFileError, OSError."""
     sources = scene.with_name(SOURCES)
     if scene.suffix.lower() == ".ply" and sources.is_file():
         try:
@@ -106,7 +106,7 @@ class _Scene(msgspec.Struct, frozen=True):
 
 
 class _Report(msgspec.Struct, frozen=True):
-    """What is shown of report.json."""
+    """The part of report.json that is shown."""
 
     verdict: Verdict
     frames_dropped: tuple[DroppedFrame, ...] = ()
@@ -116,7 +116,7 @@ class _Report(msgspec.Struct, frozen=True):
     up: Up | None = None
     scenes: tuple[_Scene, ...] = ()
 
-    def texts(self) -> list[str]:
+    def collect_texts(self) -> list[str]:
         """All that it says, which is shown; where its photographs lie is not."""
         verdict = self.verdict
         dropped = [text for frame in self.frames_dropped for text in (frame.name, frame.reason)]
@@ -132,16 +132,16 @@ class _Report(msgspec.Struct, frozen=True):
 
 
 def read_up(folder: Path) -> Up | None:
-    """Where up is in the world of the result in `folder`, if its report tells. Raises SceneFileError, OSError."""
-    report = _report(folder / "report.json")
+    """Reads the up direction from the report in `folder`, if it has one. Raises SceneFileError, OSError."""
+    report = _read_report(folder / "report.json")
     return None if report is None else report.up
 
 
-def _report(path: Path) -> _Report | None:
+def _read_report(path: Path) -> _Report | None:
     """None where there is none. Raises SceneFileError where it is something else, OSError."""
     if not path.is_file():
         return None
-    with foreign(SceneFileError, str(path)):
+    with guard_untrusted(SceneFileError, str(path)):
         try:
             report = record_in(read_json_file(path), _Report)
         except msgspec.MsgspecError as error:
@@ -152,13 +152,13 @@ def _report(path: Path) -> _Report | None:
         return report
 
 
-def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Path]) -> dict[str, npt.NDArray[np.uint8]]:
-    """By camera, its photograph in the first of the `folders` that has one, as large as a window needs it."""
+def load_images(cameras: tuple[CameraEstimate, ...], folders: Sequence[Path]) -> dict[str, npt.NDArray[np.uint8]]:
+    """Loads each camera's image from the first of `folders` that has it, reduced to a window's size."""
     found = {}
     used = find_common_range([folder / camera.name for camera in cameras for folder in folders])
     for camera in cameras:
         try:
-            path = photograph_path(camera, folders)
+            path = find_image(camera, folders)
             if path is not None:
                 found[camera.name] = outlast(lambda path=path: _photograph(path, used), camera.name)
         except (UnusableImage, OSError) as error:
@@ -167,22 +167,22 @@ def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Pat
 
 
 def _photograph(path: Path, used: ValueRange | None) -> npt.NDArray[np.uint8]:
-    return _small(decode_photograph(read_image_file(path), used=used).image)
+    return _shrink(decode_any_image(read_image_file(path), used=used).image)
 
 
-def photograph_path(camera: CameraEstimate, folders: Sequence[Path]) -> Path | None:
-    """Where the camera's photograph is: in the first of the `folders` that has one. Raises OSError."""
+def find_image(camera: CameraEstimate, folders: Sequence[Path]) -> Path | None:
+    """Finds the camera's image in the first of the `folders` that has one. Raises OSError."""
     paths = (folder / camera.name for folder in folders)
     return next((path for path in paths if path.is_file()), None)
 
 
-def _small(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+def _shrink(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     scale = min(1.0, _PHOTOGRAPH_SIDE / max(image.shape[:2]))
     size = math.ceil(image.shape[1] * scale), math.ceil(image.shape[0] * scale)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def recorded_snapshot(result: StoredResult) -> Snapshot:
+def load_full_snapshot(result: StoredResult) -> Snapshot:
     """All that a recording of a result tells: selected Gaussians, cameras, photographs, landmarks and the verdict.
 
     Photographs that are not found are left out. Raises what reading the files raises.
@@ -191,12 +191,12 @@ def recorded_snapshot(result: StoredResult) -> Snapshot:
     folder = result.scene.parent
     whole = (folder / "report.json").is_file() and result.scene.name == "scene.ply"
     snapshot, folders = read_result(folder if whole else result.scene)
-    images = found_photographs(snapshot.cameras, folders)
+    images = load_images(snapshot.cameras, folders)
     landmarks = read_landmarks(folder) if whole and (folder / LANDMARKS).is_file() else None
     return replace(snapshot, gaussians=gaussians, images=images, landmarks=landmarks)
 
 
-def photograph_of(camera: CameraEstimate, images: Mapping[str, npt.NDArray[np.uint8]]) -> bytes | None:
+def encode_image(camera: CameraEstimate, images: Mapping[str, npt.NDArray[np.uint8]]) -> bytes | None:
     """The camera's photograph as a JPEG file of `camera.width` x `camera.height`; None where there is none."""
     image = images.get(camera.name)
     if image is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 class Code(enum.Enum):
-    """What a verdict can be. `recon/verification/refusals.py` has the sentences and the advice."""
+    """The codes of a verdict. `recon/verification/refusals.py` has the sentences and the advice."""
 
     OK = "OK"
     OK_PARTIAL = "OK_PARTIAL"
@@ -42,7 +42,7 @@ SURE = (Code.OK, Code.OK_PARTIAL)  # the scene is known well enough to measure i
 
 @dataclass(frozen=True)
 class Verdict:
-    """What can be said of photographs, whether there is a scene of them or not."""
+    """The verdict on a set of images, whether there is a scene of them or not."""
 
     code: Code  # OK, OK_PARTIAL or OK_ROUGH, or why there is no scene: docs/verdicts.md explains each
     message: str  # one sentence

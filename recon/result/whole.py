@@ -16,7 +16,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, is_printable
 from splatnode.capture.process.records import record_in
 from splatnode.recon.result.export.error import SceneFileError
@@ -37,7 +37,7 @@ Rotation = tuple[Row, Row, Row]
 
 
 @dataclass(frozen=True)
-class ScenePlace:
+class SubmapEntry:
     """A scene as places.json tells of it."""
 
     scene_id: str
@@ -50,8 +50,8 @@ class ScenePlace:
 
 
 @dataclass(frozen=True)
-class SceneLink:
-    """That two scenes were found to lie beside or on each other."""
+class SubmapEdge:
+    """An edge of the pose graph between two scenes that overlap or follow one another."""
 
     scene: str
     other: str
@@ -64,7 +64,7 @@ class SceneLink:
 
 
 @dataclass(frozen=True)
-class WholeMap:
+class JoinedMap:
     """Scenes that lie in one world: that of the scene `name`, whose unit is that scene's."""
 
     name: str
@@ -72,39 +72,41 @@ class WholeMap:
 
 
 @dataclass(frozen=True)
-class Whole:
+class MapSet:
     """All that a node has made. Every scene is in exactly one map; one that is linked to none is a map of its own."""
 
-    places: Mapping[str, ScenePlace]  # by scene_id
-    links: tuple[SceneLink, ...]
-    maps: tuple[WholeMap, ...]
+    places: Mapping[str, SubmapEntry]  # by scene_id
+    links: tuple[SubmapEdge, ...]
+    maps: tuple[JoinedMap, ...]
 
 
-def is_whole(path: Path) -> bool:
+def is_map_set(path: Path) -> bool:
     """Whether `path` is the folder of a node's results: scenes and their places.json, no scene itself."""
     return path.is_dir() and (path / FILE).is_file() and not (path / "scene.ply").exists()
 
 
-def read_whole(folder: Path) -> Whole:
-    """What places.json in `folder` tells. Raises FileNotFoundError, SceneFileError (it names the file), OSError."""
+def read_map_set(folder: Path) -> MapSet:
+    """Reads places.json in `folder`. Raises FileNotFoundError, SceneFileError (names the file), OSError."""
     path = folder / FILE
     if not path.is_file():
         raise FileNotFoundError(
             f"{path} is not there. Give the folder that a node writes its scenes into (out of splatnode recon)"
         )
     data = read_json_file(path)
-    with foreign(SceneFileError, str(path)):
+    with guard_untrusted(SceneFileError, str(path)):
         try:
             found = record_in(data, _File)
         except msgspec.MsgspecError as error:
             raise SceneFileError(f"{path} is not a places.json of splatnode, or is damaged: {error}") from error
-        places = {place.scene_id: _place(place, folder, path) for place in found.places}
-        links = tuple(_link(link, path) for link in found.links if link.scene in places and link.other in places)
-        placed = _posed(found.poses, places, path) if found.poses is not None else _chained(places, links)
-        return Whole(places, links, _maps(places, placed))
+        places = {place.scene_id: _parse_submap(place, folder, path) for place in found.places}
+        links = tuple(_parse_edge(link, path) for link in found.links if link.scene in places and link.other in places)
+        placed = (
+            _parse_poses(found.poses, places, path) if found.poses is not None else _chain_placements(places, links)
+        )
+        return MapSet(places, links, _group_maps(places, placed))
 
 
-class _Place(msgspec.Struct, frozen=True):
+class _SubmapRecord(msgspec.Struct, frozen=True):
     scene_id: Name
     folder: Name | None = None
     verdict: Text = ""
@@ -120,7 +122,7 @@ class _Sim3(msgspec.Struct, frozen=True, kw_only=True):
     translation: Row
 
 
-class _Link(_Sim3, frozen=True, kw_only=True):
+class _EdgeRecord(_Sim3, frozen=True, kw_only=True):
     scene: Name
     other: Name
     kind: Text = "chain"
@@ -129,25 +131,25 @@ class _Link(_Sim3, frozen=True, kw_only=True):
     sigma_deg: Sigma | None = None
 
 
-class _Pose(_Sim3, frozen=True, kw_only=True):
+class _PoseRecord(_Sim3, frozen=True, kw_only=True):
     scene: Name
     map: Name
 
 
 class _File(msgspec.Struct, frozen=True):
-    places: Annotated[tuple[_Place, ...], msgspec.Meta(max_length=MOST_SCENES)]
-    links: Annotated[tuple[_Link, ...], msgspec.Meta(max_length=10 * MOST_SCENES)] = ()
-    poses: Annotated[tuple[_Pose, ...], msgspec.Meta(max_length=MOST_SCENES)] | None = None
+    places: Annotated[tuple[_SubmapRecord, ...], msgspec.Meta(max_length=MOST_SCENES)]
+    links: Annotated[tuple[_EdgeRecord, ...], msgspec.Meta(max_length=10 * MOST_SCENES)] = ()
+    poses: Annotated[tuple[_PoseRecord, ...], msgspec.Meta(max_length=MOST_SCENES)] | None = None
 
 
-def _place(place: _Place, folder: Path, path: Path) -> ScenePlace:
+def _parse_submap(place: _SubmapRecord, folder: Path, path: Path) -> SubmapEntry:
     texts = (place.scene_id, place.verdict, place.message, *place.frames_used)
     if not all(is_printable(text) for text in texts):
         raise SceneFileError(f"{path}: its texts must be printable")
     names = [place.scene_id] if place.folder is None else [place.scene_id, place.folder]
     if any("/" in name or "\0" in name or name in (".", "..") for name in names):
         raise SceneFileError(f"{path}: {place.scene_id!a} must name a folder beside the file, not {place.folder!a}")
-    return ScenePlace(
+    return SubmapEntry(
         place.scene_id,
         None if place.folder is None else folder / place.folder,
         place.verdict,
@@ -158,37 +160,39 @@ def _place(place: _Place, folder: Path, path: Path) -> ScenePlace:
     )
 
 
-def _placement(found: _Sim3, of: str, path: Path) -> Placement:
+def _parse_placement(found: _Sim3, of: str, path: Path) -> Placement:
     rotation = np.array(found.rotation)
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > _TURNED or np.linalg.det(rotation) < 0:
         raise SceneFileError(f"{path}: the rotation of {of} must be one")
     return Placement(found.scale, rotation, np.array(found.translation))
 
 
-def _link(link: _Link, path: Path) -> SceneLink:
+def _parse_edge(link: _EdgeRecord, path: Path) -> SubmapEdge:
     if not is_printable(link.kind) or not is_printable(link.retracted or ""):
         raise SceneFileError(f"{path}: its texts must be printable")
-    placement = _placement(link, f"the link {link.scene!a} to {link.other!a}", path)
-    return SceneLink(link.scene, link.other, placement, link.kind, link.retracted, link.sigma_scale, link.sigma_deg)
+    placement = _parse_placement(link, f"the link {link.scene!a} to {link.other!a}", path)
+    return SubmapEdge(link.scene, link.other, placement, link.kind, link.retracted, link.sigma_scale, link.sigma_deg)
 
 
-def _posed(poses: Sequence[_Pose], places: Mapping[str, ScenePlace], path: Path) -> dict[str, tuple[str, Placement]]:
+def _parse_poses(
+    poses: Sequence[_PoseRecord], places: Mapping[str, SubmapEntry], path: Path
+) -> dict[str, tuple[str, Placement]]:
     unknown = sorted({pose.map for pose in poses} - set(places))
     if unknown:  # folders are named after maps
         raise SceneFileError(f"{path}: a map must be named after one of its scenes, not {unknown[0][:60]!a}")
     return {
-        pose.scene: (pose.map, _placement(pose, f"the pose of {pose.scene!a}", path))
+        pose.scene: (pose.map, _parse_placement(pose, f"the pose of {pose.scene!a}", path))
         for pose in poses
         if pose.scene in places
     }
 
 
-Beside = Mapping[str, Sequence[SceneLink]]  # by scene, the links of it that count
+Beside = Mapping[str, Sequence[SubmapEdge]]  # by scene, the links of it that count
 
 
-def beside(links: Iterable[SceneLink]) -> Beside:
+def group_edges(links: Iterable[SubmapEdge]) -> Beside:
     """The links that count, in their order, by both of their scenes."""
-    found: dict[str, list[SceneLink]] = {}
+    found: dict[str, list[SubmapEdge]] = {}
     for link in links:
         if link.retracted is None:
             found.setdefault(link.scene, []).append(link)
@@ -196,7 +200,7 @@ def beside(links: Iterable[SceneLink]) -> Beside:
     return found
 
 
-def reached(first: str, links: Beside) -> Iterator[tuple[str, str, SceneLink]]:
+def walk_edges(first: str, links: Beside) -> Iterator[tuple[str, str, SubmapEdge]]:
     """How links lead to all other scenes from the first, along the fewest: the scene before, the scene, the link."""
     known, waiting = {first}, deque([first])
     while waiting:
@@ -209,24 +213,28 @@ def reached(first: str, links: Beside) -> Iterator[tuple[str, str, SceneLink]]:
                 yield here, there, link
 
 
-def _chained(places: Mapping[str, ScenePlace], links: Iterable[SceneLink]) -> dict[str, tuple[str, Placement]]:
-    """By scene, the map and the place in it: each further scene is placed by the first link that reaches it."""
-    those = beside(links)
+def _chain_placements(
+    places: Mapping[str, SubmapEntry], links: Iterable[SubmapEdge]
+) -> dict[str, tuple[str, Placement]]:
+    """Returns each scene's map and placement: a scene is placed by the first edge that reaches it."""
+    those = group_edges(links)
     placed: dict[str, tuple[str, Placement]] = {}
     for first in places:
         if first in placed:
             continue
         placed[first] = first, IDENTITY
-        for here, there, link in reached(first, those):
+        for here, there, link in walk_edges(first, those):
             step = link.placement if link.scene == here else link.placement.inverse()
             placed[there] = first, placed[here][1].after(step)
     return placed
 
 
-def _maps(places: Mapping[str, ScenePlace], placed: Mapping[str, tuple[str, Placement]]) -> tuple[WholeMap, ...]:
+def _group_maps(
+    places: Mapping[str, SubmapEntry], placed: Mapping[str, tuple[str, Placement]]
+) -> tuple[JoinedMap, ...]:
     """In the order of their first scenes. A scene that has no place in a map is one of its own."""
     maps: dict[str, dict[str, Placement]] = {}
     for scene_id in places:
         name, placement = placed.get(scene_id, (scene_id, IDENTITY))
         maps.setdefault(name, {})[scene_id] = placement
-    return tuple(WholeMap(name, placements) for name, placements in maps.items())
+    return tuple(JoinedMap(name, placements) for name, placements in maps.items())

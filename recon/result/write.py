@@ -7,15 +7,15 @@ from pathlib import Path
 from types import MappingProxyType
 
 from splatnode.recon.result.depth_file import DEPTHS, encode_depths
-from splatnode.recon.result.export import viewer_safe, write_result
+from splatnode.recon.result.export import sanitize_gaussians, write_result
 from splatnode.recon.result.export.sources import SOURCES, encode_sources
 from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
-from splatnode.recon.result.preview import contact_sheet
+from splatnode.recon.result.preview import make_contact_sheet
 from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 
 
-def finish(
+def write_result_folder(
     snapshot: Snapshot,
     out: Path,
     *,
@@ -30,8 +30,8 @@ def finish(
     was there before intact.
     """
     report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | dict(told)
-    preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
-    source_frame = viewer_safe(snapshot.gaussians).source_frame  # of those that scene.ply holds
+    preview = make_contact_sheet(snapshot) if snapshot.verdict.publishable else None
+    source_frame = sanitize_gaussians(snapshot.gaussians).source_frame  # of those that scene.ply holds
     further = {SOURCES: encode_sources(source_frame), **photographs} if snapshot.verdict.publishable else {}
     if snapshot.verdict.publishable and snapshot.landmarks is not None:
         further[LANDMARKS] = encode_landmarks(snapshot.landmarks)

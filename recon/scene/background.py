@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatnode.recon.geometry import project, quat_from_matrix, to_camera
+from splatnode.recon.geometry import project, quat_from_matrix, transform_to_camera
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.sources import SHELL
 from splatnode.recon.scene.gaussians import SH_C0, Gaussians, logit
@@ -32,7 +32,7 @@ MIN_SQUARED_DISTANCE = 1e-4  # between directions of length 1, in the weights of
 MIN_WIDENING = 1.1  # of the spacing in each attempt to have fewer Gaussians
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class BackgroundConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
     margin: float = 2.0  # how far beyond the images' borders they are so near, in units of the images' size
     elsewhere_deg: float = 10.0  # between those in all other directions; 0: there are none
@@ -41,7 +41,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def far_shell(
-    pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config, max_gaussians: int | None = None
+    pointmaps: Sequence[Pointmap], images: Sequence[Image], config: BackgroundConfig, max_gaussians: int | None = None
 ) -> Gaussians:
     """Gaussians on a sphere around the cameras, closer where these look than elsewhere; at most `max_gaussians`.
 
@@ -59,7 +59,7 @@ def far_shell(
     return shell
 
 
-def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> Gaussians:
+def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: BackgroundConfig) -> Gaussians:
     """Gaussians with the colours that the images have there, or suggest."""
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
@@ -70,13 +70,13 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Confi
     coarse = _fibonacci_sphere(config.elsewhere_deg if len(fine) else 0.0)
     directions = np.concatenate([fine, coarse])
     spacing_deg = np.repeat([config.spacing_deg, config.elsewhere_deg], [len(fine), len(coarse)])
-    outside, colours = _seen(centre + radius * directions, farthest, pointmaps, images)
+    outside, colours = _sample_colours(centre + radius * directions, farthest, pointmaps, images)
     kept = (outside < config.margin) == (np.arange(len(directions)) < len(fine))
     directions, outside, colours, spacing_deg = directions[kept], outside[kept], colours[kept], spacing_deg[kept]
     inside = outside <= 0
     if inside.any():
         upward = -np.sum([pointmap.T_world_camera[:3, 1] for pointmap in pointmaps], axis=0)
-        colours[~inside] = _continued(directions[~inside], directions[inside], colours[inside], upward)
+        colours[~inside] = _extrapolate_colours(directions[~inside], directions[inside], colours[inside], upward)
     count = len(directions)
     scales = EXTENT * radius * np.radians(spacing_deg)[:, None] * np.array([1.0, 1.0, THICKNESS])
     return Gaussians(
@@ -89,7 +89,7 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Confi
     )
 
 
-def _seen(
+def _sample_colours(
     points: Array, farthest: float, pointmaps: Sequence[Pointmap], images: Sequence[Image]
 ) -> tuple[Array, Array]:
     """(M,) how far world points (M, 3) lie outside all images, in units of the images' size; (M, 3) their colours.
@@ -103,7 +103,7 @@ def _seen(
     colours = np.zeros((len(points), 3))
     for pointmap, image in zip(pointmaps, images, strict=True):
         height, width = image.shape[:2]
-        in_camera = to_camera(points, pointmap.T_world_camera)
+        in_camera = transform_to_camera(points, pointmap.T_world_camera)
         ahead = in_camera[:, 2] > MIN_COSINE * np.linalg.norm(in_camera, axis=1)
         pixels = project(in_camera, pointmap.K)
         relative = pixels / (width, height) - 0.5
@@ -118,7 +118,7 @@ def _seen(
     return outside, colours
 
 
-def _continued(directions: Array, seen: Array, colours: Array, upward: Array) -> Array:
+def _extrapolate_colours(directions: Array, seen: Array, colours: Array, upward: Array) -> Array:
     """(M, 3) colours for unseen unit `directions` (M, 3), from the colours (N, 3) of directions `seen` (N, 3).
 
     Inverse distance weighting with the fourth power (Shepard 1968), elevation stretched by ELEVATION_STRETCH.

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import spsolve
 
 from splatnode.recon.priors import reprojection
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.workers import each
+from splatnode.recon.workers import map_parallel
 
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
@@ -36,7 +36,7 @@ MIN_LINK = 1e-3  # weight of smoothness across the strongest edge: nothing is cu
 MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or farther than all known ones of its view
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class DepthCompletionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.12  # least confidence of stereo for a known depth; those below are doubtful
     min_usable_confidence: float = 0.1  # doubtful depths below tell less than their surroundings do: they are dropped
     colour_tolerance: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel
@@ -51,20 +51,23 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def complete(
-    pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config, masks: Sequence[Mask | None] = ()
+    pointmaps: Sequence[Pointmap],
+    images: Sequence[Image],
+    config: DepthCompletionConfig,
+    masks: Sequence[Mask | None] = (),
 ) -> list[Pointmap]:
     """The point maps with unknown pixels filled or, where that would contradict another view, empty.
 
     What one of `masks` (h, w) hides has no colour that tells: it is filled only where no other view's points fall.
     """
-    known = [pointmap.masked(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+    known = [pointmap.apply_mask(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
-    partners = reprojection.overlapping(known, config.most_partners)
-    smooth = each(partial(_smooth, config=config), known, images)
+    partners = reprojection.find_overlapping(known, config.most_partners)
+    smooth = map_parallel(partial(_smooth, config=config), known, images)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         others = [(completed[i], blurred[i]) for i in partners[j]]
-        covered, explained = _seen_by_others(known[j], blurred[j], others, config.colour_tolerance)
+        covered, explained = _project_others(known[j], blurred[j], others, config.colour_tolerance)
         unknown = known[j].depth <= 0
         # Single pixels of another colour are noise and edges; an object that only this view sees is larger.
         object_size = np.ones((config.min_object_px, config.min_object_px), np.uint8)
@@ -75,9 +78,9 @@ def complete(
         filling = smooth[j]
         if filling is None or not hole.any():
             continue
-        for guess in _guesses(pointmaps[j], known[j], filling, covered, occluder, config):
-            guess = guess.masked(hole)
-            guess = guess.masked(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
+        for guess in _propose_fills(pointmaps[j], known[j], filling, covered, occluder, config):
+            guess = guess.apply_mask(hole)
+            guess = guess.apply_mask(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
             filled = guess.depth > 0
             completed[j] = replace(
                 completed[j],
@@ -89,24 +92,24 @@ def complete(
     return completed
 
 
-def _guesses(
-    doubtful: Pointmap, known: Pointmap, smooth: Float32, covered: Mask, occluder: Mask, config: Config
+def _propose_fills(
+    doubtful: Pointmap, known: Pointmap, smooth: Float32, covered: Mask, occluder: Mask, config: DepthCompletionConfig
 ) -> Iterator[Pointmap]:
     """The point maps that a hole may be filled from, the best first."""
     near, far = np.percentile(known.depth[known.depth > 0], [NEAREST_PERCENTILE, 100.0])
     yield doubtful
     facing = _facing_camera(known)
-    yield replace(facing, depth=smooth).masked(~covered)
-    yield replace(facing, depth=np.full_like(smooth, config.background_depth * far)).masked(~covered)
-    yield replace(facing, depth=np.full_like(smooth, config.foreground_depth * near)).masked(occluder)
+    yield replace(facing, depth=smooth).apply_mask(~covered)
+    yield replace(facing, depth=np.full_like(smooth, config.background_depth * far)).apply_mask(~covered)
+    yield replace(facing, depth=np.full_like(smooth, config.foreground_depth * near)).apply_mask(occluder)
 
 
-def _smooth(pointmap: Pointmap, image: Image, config: Config) -> Float32 | None:
+def _smooth(pointmap: Pointmap, image: Image, config: DepthCompletionConfig) -> Float32 | None:
     """`smooth_depth`; None where no depth is known."""
     return smooth_depth(pointmap, image, config) if (pointmap.depth > 0).any() else None
 
 
-def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
+def smooth_depth(pointmap: Pointmap, image: Image, config: DepthCompletionConfig) -> Float32:
     """(h, w) the depth whose inverse is the smoothest through the known ones that may jump at the image's edges.
 
     Minimises sum_i confidence_i (x_i - inverse_i)^2 + sum_ij link_ij (x_i - x_j)^2 over neighbouring pixels, a sparse
@@ -135,7 +138,7 @@ def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
     return (1.0 / np.clip(smooth, least, most)).astype(np.float32)
 
 
-def _seen_by_others(
+def _project_others(
     target: Pointmap, image: Image, others: Sequence[tuple[Pointmap, Image]], colour_tolerance: float
 ) -> tuple[Mask, Mask]:
     """(h, w) pixels of the target on which other views' points fall; (h, w) those of which one has the pixel's colour.
@@ -144,13 +147,13 @@ def _seen_by_others(
     """
     covered, explained = (np.zeros(target.depth.shape, bool) for _ in range(2))
     for other, other_image in others:
-        covered_here, explained_here = reprojection.explained(other, other_image, target, image, colour_tolerance)
+        covered_here, explained_here = reprojection.find_explained(other, other_image, target, image, colour_tolerance)
         covered |= covered_here
         explained |= explained_here
-    return _closed(covered), _closed(explained)
+    return _close_gaps(covered), _close_gaps(explained)
 
 
-def _closed(mask: Mask) -> Mask:
+def _close_gaps(mask: Mask) -> Mask:
     """The mask (h, w) without gaps of up to GAP_PX."""
     return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8)) > 0
 
@@ -159,7 +162,7 @@ def _hides_known(filled: Pointmap, others: Sequence[Pointmap], occlusion_toleran
     """(h, w) filled pixels whose point lies clearly before a known surface of another view."""
     wrong = np.zeros(filled.depth.shape, bool)
     for other in others:
-        wrong |= reprojection.hiding(filled, other, occlusion_tolerance)
+        wrong |= reprojection.find_hiding(filled, other, occlusion_tolerance)
     return wrong
 
 

@@ -16,11 +16,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import modelled_mask
+from splatnode.recon.frames.keyframe import resize_mask
 from splatnode.recon.priors import reprojection
-from splatnode.recon.priors.confirmed import AGREEING, LEAST_CONFIDENCE, confirmed
+from splatnode.recon.priors.confirmed import AGREEING, LEAST_CONFIDENCE, find_consistent_pixels
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.workers import each
+from splatnode.recon.workers import map_parallel
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -44,14 +44,14 @@ LEAST_THROUGH = 0.1  # share of the patch that is seen through
 MARGIN_PX = 3  # around it, of the reduced photograph
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TransientMaskConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Leave out what verified views see through, where all photographs are at hand: something that passed through one of
     # them. It also takes some surfaces that shine, or that stereo does not know, for such a thing
     enabled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _ReducedView:
     """A photograph and what is known of its depth, reduced."""
 
     known: Pointmap
@@ -61,15 +61,17 @@ class _View:
 
 
 @dataclass(frozen=True, eq=False)
-class _Case:
-    """What the others say of a photograph."""
+class _ViewEvidence:
+    """The evidence of the other views on an image."""
 
     surface: Float32  # (h, w) depth on which two others agree; infinite where none do
     contradicted: Mask  # (h, w) where it shows another colour than that surface, and than all others' points
     confirmed: Mask  # (h, w) where one of the others' points has its colour
 
 
-def denied(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], used: Sequence[Mask]) -> list[Mask | None]:
+def find_transient_masks(
+    pointmaps: Sequence[Pointmap], pictures: Sequence[Image], used: Sequence[Mask]
+) -> list[Mask | None]:
     """For each photograph (h, w), True where it shows something that the others see through; None: nowhere.
 
     `pictures` (h, w, 3), in one light, are those of the point maps. `used` (h, w) are the pixels that show the scene:
@@ -77,26 +79,28 @@ def denied(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], used: Seque
     """
     if len(pointmaps) < 3:
         return [None] * len(pointmaps)
-    reduced = [_reduced(*view) for view in zip(pointmaps, pictures, strict=True)]
-    sure = confirmed(reduced)
+    reduced = [_downscale_pointmap(*view) for view in zip(pointmaps, pictures, strict=True)]
+    sure = find_consistent_pixels(reduced)
     views = [
-        _View(known, known.masked(mask), _small(picture, known), modelled_mask(own, *known.depth.shape))
+        _ReducedView(
+            known, known.apply_mask(mask), _downscale_colours(picture, known), resize_mask(own, *known.depth.shape)
+        )
         for known, mask, picture, own in zip(reduced, sure, pictures, used, strict=True)
     ]
-    partners = reprojection.overlapping(reduced, MOST_PARTNERS)
+    partners = reprojection.find_overlapping(reduced, MOST_PARTNERS)
 
-    def asked(index: int) -> Mask | None:
+    def find_mask(index: int) -> Mask | None:
         others = [views[other] for other in partners[index]]
-        found = _moved(views[index], _case(views[index], others), others)
+        found = _find_moved_patches(views[index], _collect_evidence(views[index], others), others)
         if not found.any():
             return None
         height, width = pointmaps[index].depth.shape
         return cv2.resize(found.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
-    return each(asked, range(len(views)))
+    return map_parallel(find_mask, range(len(views)))
 
 
-def _reduced(pointmap: Pointmap, picture: Image) -> Pointmap:
+def _downscale_pointmap(pointmap: Pointmap, picture: Image) -> Pointmap:
     height, width = picture.shape[:2]
     size = max(1, width // REDUCTION), max(1, height // REDUCTION)
     usable = (pointmap.confidence >= LEAST_CONFIDENCE) & (pointmap.depth < FARTHEST)
@@ -107,13 +111,13 @@ def _reduced(pointmap: Pointmap, picture: Image) -> Pointmap:
     return replace(pointmap, depth=depth, confidence=ones, normal=none, K=K, unchecked=None)
 
 
-def _small(picture: Image, reduced: Pointmap) -> Float32:
+def _downscale_colours(picture: Image, reduced: Pointmap) -> Float32:
     small = cv2.resize(picture, reduced.depth.shape[::-1], interpolation=cv2.INTER_AREA)
     return (np.asarray(cv2.GaussianBlur(small, (3, 3), 0), np.float32) / np.float32(255)).astype(np.float32)
 
 
-def _case(view: _View, others: Sequence[_View]) -> _Case:
-    shown = [_shown(other, view.known) for other in others]
+def _collect_evidence(view: _ReducedView, others: Sequence[_ReducedView]) -> _ViewEvidence:
+    shown = [_project_surface(other, view.known) for other in others]
     surface = np.full(view.known.depth.shape, np.inf, np.float32)
     least = np.full(view.known.depth.shape, np.inf, np.float32)
     for depth, colour in shown:
@@ -127,23 +131,23 @@ def _case(view: _View, others: Sequence[_View]) -> _Case:
     # What it knows itself, and another view confirms, in front of that surface stands there.
     before = (view.sure.depth > 0) & (view.sure.depth < (1 - AGREEING) * surface)
     contradicted = view.used & np.isfinite(surface) & (least > DIFFERENT) & ~before
-    return _Case(surface, contradicted, least <= DIFFERENT)
+    return _ViewEvidence(surface, contradicted, least <= DIFFERENT)
 
 
-def _shown(other: _View, target: Pointmap) -> tuple[Float32, Float32]:
+def _project_surface(other: _ReducedView, target: Pointmap) -> tuple[Float32, Float32]:
     """(h, w) depth in the target of what the other is sure of, infinite where that is nothing; (h, w, 3) its colour."""
-    depth, _ = reprojection.nearest(other.sure, target)
+    depth, _ = reprojection.project_nearest(other.sure, target)
     depth = np.where(np.isinf(depth), cv2.erode(depth, np.ones((3, 3), np.uint8)), depth)  # gaps of a pixel
     there = depth < FARTHEST
     depth = np.where(there, depth, np.float32(np.inf))
     rows, columns = np.indices(depth.shape, np.float32) + np.float32(0.5)
-    x, y, _ = _seen_by(other.known, target, columns, rows, np.where(there, depth, np.float32(1)))
+    x, y, _ = _project_pixels(other.known, target, columns, rows, np.where(there, depth, np.float32(1)))
     border = cv2.BORDER_REPLICATE
     colour = cv2.remap(other.colour, x - np.float32(0.5), y - np.float32(0.5), cv2.INTER_LINEAR, borderMode=border)
     return depth, np.asarray(colour, np.float32)
 
 
-def _seen_by(
+def _project_pixels(
     other: Pointmap, target: Pointmap, columns: Float32, rows: Float32, depth: Float32
 ) -> tuple[Float32, Float32, Float32]:
     """The pixels and the depth in `other` of the target's pixels at `depth`; far outside where it is behind it."""
@@ -167,12 +171,12 @@ def _difference(one: Float32, other: Float32) -> Float32:
     return np.minimum(outside(one, other), outside(other, one))
 
 
-def _moved(view: _View, case: _Case, others: Sequence[_View]) -> Mask:
+def _find_moved_patches(view: _ReducedView, case: _ViewEvidence, others: Sequence[_ReducedView]) -> Mask:
     """(h, w) patches that are contradicted, and of which enough is seen through."""
     weak = _patches(case.contradicted, case.confirmed)
     if not weak.any():
         return weak
-    through = _seen_through(view.known, np.where(case.contradicted, case.surface, np.float32(0)), others)
+    through = _find_free_space_violations(view.known, np.where(case.contradicted, case.surface, np.float32(0)), others)
     strong = _patches(through, case.confirmed)
     count, labels = cv2.connectedComponents((weak | strong).astype(np.uint8))
     area = np.bincount(labels[strong], minlength=count)
@@ -191,7 +195,7 @@ def _patches(against: Mask, in_favour: Mask) -> Mask:
     return cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING_PX, OPENING_PX), np.uint8)) > 0
 
 
-def _seen_through(target: Pointmap, surface: Float32, others: Sequence[_View]) -> Mask:
+def _find_free_space_violations(target: Pointmap, surface: Float32, others: Sequence[_ReducedView]) -> Mask:
     """(h, w) pixels with a `surface`, above 0, before which other views see through every point of the sight line."""
     rows, columns = np.nonzero(surface)
     across, down = (places.astype(np.float32) + np.float32(0.5) for places in (columns, rows))
@@ -199,7 +203,7 @@ def _seen_through(target: Pointmap, surface: Float32, others: Sequence[_View]) -
     for share in np.geomspace(1 - 2 * AGREEING, NEAREST, LINE_SAMPLES):
         through = np.zeros(len(rows), bool)
         for other in others:
-            x, y, z = _seen_by(other.known, target, across, down, far * np.float32(share))
+            x, y, z = _project_pixels(other.known, target, across, down, far * np.float32(share))
             height, width = other.known.depth.shape
             inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
             behind = other.known.depth[y[inside].astype(int), x[inside].astype(int)]

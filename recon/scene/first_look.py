@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.registered_camera import modelled_K
+from splatnode.recon.priors.registered_camera import compute_modelled_K
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.scene.points import gaussians_at
 from splatnode.recon.scene.scene import Scene, TrainingView
@@ -15,7 +15,7 @@ OPACITY = 0.8  # of each Gaussian: there are few, and what is behind them is not
 MAX_GAUSSIANS = 20_000  # more points make the look slower and hardly better
 
 
-def first_look(graph: ViewGraph, registration: Registration, max_gaussians: int | None = None) -> Scene:
+def create_coarse_scene(graph: ViewGraph, registration: Registration, max_gaussians: int | None = None) -> Scene:
     """A coarse scene of the registered cameras: an isotropic Gaussian at each point, as wide as points are apart.
 
     Its colour is that of the photograph in which it was observed last. Of more than `max_gaussians`, or MAX_GAUSSIANS,
@@ -33,7 +33,7 @@ def first_look(graph: ViewGraph, registration: Registration, max_gaussians: int 
         rgb[registration.observed_point[mine]] = keyframe.image[y, x] / np.float32(255)
         source[registration.observed_point[mine]] = keyframe.frame.frame_id
         T_world_camera = torch.tensor(camera.T_world_camera, dtype=torch.float32)
-        K = torch.tensor(modelled_K(graph, camera), dtype=torch.float32)
+        K = torch.tensor(compute_modelled_K(graph, camera), dtype=torch.float32)
         shown = keyframe.name, keyframe.frame.frame_id, keyframe.image
         views.append(TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, lens=keyframe.lens))
     seen = np.flatnonzero(source >= 0)

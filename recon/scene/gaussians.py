@@ -50,13 +50,13 @@ class Gaussians:
         """The Gaussians at `index` (integers or a mask)."""
         return self.map(lambda tensor: tensor[index])
 
-    def brightened(self, factor: float) -> Gaussians:
+    def scale_brightness(self, factor: float) -> Gaussians:
         """The Gaussians with colours `factor` times as bright."""
         sh = factor * self.sh
         sh[:, 0] += (factor - 1.0) * 0.5 / SH_C0
         return replace(self, sh=sh)
 
-    def transformed(self, scale: float, rotation: Tensor, translation: Tensor) -> Gaussians:
+    def transform(self, scale: float, rotation: Tensor, translation: Tensor) -> Gaussians:
         """The Gaussians after the similarity x -> scale * rotation @ x + translation; SH are not rotated.
 
         `rotation` is (3, 3) and `translation` (3,). View-dependent colour therefore keeps its old directions.

@@ -11,11 +11,11 @@ import torch
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.result.sources import frame_of
+from splatnode.recon.result.sources import decode_frame_id
 from splatnode.recon.scene import initialisation, light
 from splatnode.recon.scene.gaussians import concatenate
 from splatnode.recon.scene.scene import Scene, TrainingView
-from splatnode.recon.scene.told_light import told_logs
+from splatnode.recon.scene.told_light import compute_exposure_priors
 
 NUM_NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty: each costs time
 
@@ -25,8 +25,8 @@ def grow(
     pointmaps: Mapping[str, Pointmap],
     graph: ViewGraph,
     registration: Registration,
-    config: initialisation.Config,
-    lighting: light.Config,
+    config: initialisation.SceneInitializationConfig,
+    lighting: light.ExposureConfig,
 ) -> Scene:
     """The scene with a view, and Gaussians seeded from it, for each registered camera that it does not have.
 
@@ -47,12 +47,12 @@ def grow(
     }
     lit = {view.name: view.exposure for view in scene.views if view.exposure is not None}
     falloffs = {name: _falloff(scene, pointmaps[name]) for name in further}
-    told = told_logs(graph.keyframes[index] for index in sorted(shown))
-    exposures = light.joining(seen, images, falloffs, lit, lighting, told)
-    begun = initialisation.initial_scene(
+    told = compute_exposure_priors(graph.keyframes[index] for index in sorted(shown))
+    exposures = light.estimate_further_exposures(seen, images, falloffs, lit, lighting, told)
+    begun = initialisation.initialize_scene(
         seen,
-        light.in_one_light(images, exposures),
-        initialisation.Config(
+        light.compensate_images(images, exposures),
+        initialisation.SceneInitializationConfig(
             completion=config.completion,
             seeding=config.seeding,
             background=msgspec.structs.replace(config.background, spacing_deg=0.0),
@@ -62,18 +62,18 @@ def grow(
         lenses={graph.keyframes[index].name: graph.keyframes[index].lens for index in shown},
     )
     views = tuple(view for view in begun.views if view.name in further)
-    before = tuple(_compared_further(view, begun.views) for view in scene.views)
+    before = tuple(_update_consistent_depth(view, begun.views) for view in scene.views)
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)
-    fresh = begun.gaussians.subset(torch.isin(frame_of(begun.gaussians.source_frame), ids))
+    fresh = begun.gaussians.subset(torch.isin(decode_frame_id(begun.gaussians.source_frame), ids))
     return replace(scene, views=before + views, gaussians=concatenate([scene.gaussians, fresh]))
 
 
-def without_views(scene: Scene, names: Collection[str]) -> Scene:
+def remove_views(scene: Scene, names: Collection[str]) -> Scene:
     """The scene without these views and the Gaussians that were seeded from them, in its first camera's world."""
     gone = torch.tensor([view.frame_id for view in scene.views if view.name in names], dtype=torch.int32)
     # What the views that go away confirmed is not known of the others any more.
     views = tuple(replace(view, consistent_depth=None) for view in scene.views if view.name not in names)
-    kept = scene.gaussians.subset(~torch.isin(frame_of(scene.gaussians.source_frame), gone))
+    kept = scene.gaussians.subset(~torch.isin(decode_frame_id(scene.gaussians.source_frame), gone))
     if not views:
         return replace(scene, views=(), gaussians=kept)
     T_camera_world = torch.linalg.inv(views[0].T_world_camera.double())
@@ -82,11 +82,11 @@ def without_views(scene: Scene, names: Collection[str]) -> Scene:
         views=tuple(
             replace(view, T_world_camera=(T_camera_world @ view.T_world_camera.double()).float()) for view in views
         ),
-        gaussians=kept.transformed(1.0, T_camera_world[:3, :3], T_camera_world[:3, 3]),
+        gaussians=kept.transform(1.0, T_camera_world[:3, :3], T_camera_world[:3, 3]),
     )
 
 
-def _compared_further(view: TrainingView, beside: Sequence[TrainingView]) -> TrainingView:
+def _update_consistent_depth(view: TrainingView, beside: Sequence[TrainingView]) -> TrainingView:
     """The view with the share that those `beside` it confirm, where that is more: some of what it shares is theirs."""
     found = next((each.consistent_depth for each in beside if each.name == view.name), None)
     if found is None or (view.consistent_depth is not None and view.consistent_depth >= found):
@@ -95,7 +95,7 @@ def _compared_further(view: TrainingView, beside: Sequence[TrainingView]) -> Tra
 
 
 def _falloff(scene: Scene, pointmap: Pointmap) -> float:
-    """That of the lens of a further photograph: as of the view whose lens is most like it."""
+    """Returns the falloff of a further image's lens: that of the view whose lens is most like it."""
     focal_lengths = [view.K[0, 0].item() / max(view.width, view.height) for view in scene.views]
     own = pointmap.K[0, 0] / max(pointmap.depth.shape)
     nearest = min(zip(focal_lengths, scene.views, strict=True), key=lambda lens: abs(lens[0] - own))[1]
@@ -112,7 +112,7 @@ def _neighbours(graph: ViewGraph, index: int, registered: Collection[int]) -> li
     return sorted(matches, key=lambda other: -matches[other])[:NUM_NEIGHBOURS]
 
 
-def limited(scene: Scene, max_gaussians: int | None) -> Scene:
+def limit_gaussians(scene: Scene, max_gaussians: int | None) -> Scene:
     """The scene with at most `max_gaussians`: those of the largest opacity times area; None is no limit."""
     gaussians = scene.gaussians
     if max_gaussians is None or len(gaussians) <= max_gaussians:

@@ -12,7 +12,7 @@ import torch
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames import border
-from splatnode.recon.priors.confirmed import confirmed, consistent_shares
+from splatnode.recon.priors.confirmed import compute_consistent_shares, find_consistent_pixels
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene import background, completion, pixelwise, seeding
 from splatnode.recon.scene.gaussians import Gaussians, concatenate
@@ -24,20 +24,20 @@ Mask = npt.NDArray[np.bool_]
 SHELL_PARTS = 10  # with a limit on the Gaussians, one part in this many may be the far shell
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SceneInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which Gaussians a scene begins with."""
 
-    completion: completion.Config = completion.Config()
-    seeding: seeding.Config = seeding.Config()
-    background: background.Config = background.Config()
-    pixelwise: pixelwise.Config | None = None  # in place of seeding: a Gaussian a pixel that stereo knows
+    completion: completion.DepthCompletionConfig = completion.DepthCompletionConfig()
+    seeding: seeding.GaussianInitializationConfig = seeding.GaussianInitializationConfig()
+    background: background.BackgroundConfig = background.BackgroundConfig()
+    pixelwise: pixelwise.PixelwiseConfig | None = None  # in place of seeding: a Gaussian a pixel that stereo knows
     max_gaussians: int | None = None  # None: as many as the photographs call for
 
 
-def initial_scene(
+def initialize_scene(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
-    config: Config,
+    config: SceneInitializationConfig,
     masks: Mapping[str, Mask | None] = MappingProxyType({}),
     exposures: Mapping[str, Exposure] = MappingProxyType({}),
     lenses: Mapping[str, Intrinsics | None] = MappingProxyType({}),
@@ -52,25 +52,27 @@ def initial_scene(
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
     known_masks = [masks.get(pointmap.name) for pointmap in pointmaps]
-    pointmaps = tuple(map(Pointmap.hidden, map(Pointmap.masked, pointmaps, valid), known_masks))
+    pointmaps = tuple(map(Pointmap.apply_image_mask, map(Pointmap.apply_mask, pointmaps, valid), known_masks))
     used = [rim if mask is None else rim & mask for rim, mask in zip(valid, known_masks, strict=True)]
-    sure = confirmed(pointmaps)
-    shares = consistent_shares(sure, used)
-    usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
+    sure = find_consistent_pixels(pointmaps)
+    shares = compute_consistent_shares(sure, used)
+    usable = [each.apply_mask(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
     surroundings = "fill" if config.pixelwise is None else config.pixelwise.surroundings
     shells = [] if surroundings == "none" else [_shell(usable, pictures, config)]
     limit = None if config.max_gaussians is None else config.max_gaussians - sum(map(len, shells))
     dense = pointmaps
     if surroundings == "fill":
-        dense = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion, known_masks), valid))
+        dense = list(
+            map(Pointmap.apply_mask, completion.complete(usable, pictures, config.completion, known_masks), valid)
+        )
     del usable
     if config.pixelwise is not None:
         surfaces = pixelwise.pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
         return Scene(_views(dense, shares, images, masks, exposures, lenses), concatenate([surfaces, *shells]))
-    surfaces = seeding.initial_gaussians(dense, pictures, config.seeding)
+    surfaces = seeding.initialize_gaussians(dense, pictures, config.seeding)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
-        surfaces = seeding.initial_gaussians(dense, pictures, config.seeding, limit)
+        surfaces = seeding.initialize_gaussians(dense, pictures, config.seeding, limit)
     return Scene(
         _views(pointmaps, shares, images, masks, exposures, lenses),
         concatenate([surfaces, *shells]),
@@ -78,7 +80,7 @@ def initial_scene(
     )
 
 
-def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: Config) -> Gaussians:
+def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: SceneInitializationConfig) -> Gaussians:
     limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
     return background.far_shell(pointmaps, pictures, config.background, limit)
 

@@ -22,10 +22,10 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.robust import solved
+from splatnode.recon.scene.robust import solve_robust
 from splatnode.recon.scene.scene import Exposure
-from splatnode.recon.scene.shared_pixels import Shared, median_log, shared_pixels
-from splatnode.recon.scene.vignetting import falloffs, light_at, without_falloff
+from splatnode.recon.scene.shared_pixels import SharedPixels, find_shared_pixels, median_log
+from splatnode.recon.scene.vignetting import estimate_falloffs, relative_illumination, remove_falloff
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -41,7 +41,7 @@ MOST_HEADROOM = 2.0  # beyond, dark things would have too few grey levels
 _NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ExposureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     enabled: bool = True  # bring photographs of different exposure or white balance to one light
     # Gains that differ by less, as a share, in each channel, from the median of all, or from those of the photograph
     # taken nearest, are left as they are
@@ -51,10 +51,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_falloff: Annotated[float, Meta(ge=0)] = 0.5
 
 
-def differing(
+def estimate_exposures(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
-    config: Config,
+    config: ExposureConfig,
     told: Mapping[str, float] = _NOTHING,
 ) -> dict[str, Exposure]:
     """The exposures of `images` (h, w, 3), by name; none where they do not differ by more than `config` says.
@@ -63,10 +63,12 @@ def differing(
     """
     if not config.enabled or len(pointmaps) < 2:
         return {}
-    shared = shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
-    falloff = falloffs(shared, _lens_of(pointmaps), config.least_falloff)
+    shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
+    falloff = estimate_falloffs(shared, _lens_of(pointmaps), config.least_falloff)
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
-    logs = _about_the_median(_logs(without_falloff(shared, falloff), priors, _told(pointmaps, told)))
+    logs = _subtract_median(
+        _solve_log_gains(remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, told))
+    )
     sudden = logs - _nearest(logs, np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps]))
     differ, differ_nearby = np.expm1(np.abs(logs).max()), np.expm1(np.abs(sudden).max())
     if differ < config.most and min(differ, differ_nearby) < config.least:
@@ -74,17 +76,17 @@ def differing(
     if not logs.any() and not falloff.any():
         return {}
     return {
-        pointmap.name: exposed(images[pointmap.name], gains, of_lens)
+        pointmap.name: make_exposure(images[pointmap.name], gains, of_lens)
         for pointmap, gains, of_lens in zip(pointmaps, np.exp(logs), falloff.tolist(), strict=True)
     }
 
 
-def joining(
+def estimate_further_exposures(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
     further: Mapping[str, float],
     known: Mapping[str, Exposure],
-    config: Config,
+    config: ExposureConfig,
     told: Mapping[str, float] = _NOTHING,
 ) -> dict[str, Exposure]:
     """The exposures of the photographs `further`, which join others that have one light already; none needs to differ.
@@ -97,25 +99,25 @@ def joining(
         return {}
     falloff = np.array([further.get(pointmap.name, 0.0) for pointmap in pointmaps])
     priors = np.array([PRIOR_SIGMA if pointmap.name in further else KNOWN_SIGMA for pointmap in pointmaps])
-    shared = shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
+    shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
     taken_out = {name: np.log(exposure.gains) for name, exposure in known.items()}
-    logs = _logs(without_falloff(shared, falloff), priors, _told(pointmaps, told, taken_out))
+    logs = _solve_log_gains(remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, told, taken_out))
     differ = np.expm1(np.abs(logs).max(axis=1))
     return {
-        pointmap.name: exposed(images[pointmap.name], np.exp(own), of_lens)
+        pointmap.name: make_exposure(images[pointmap.name], np.exp(own), of_lens)
         for pointmap, own, by, of_lens in zip(pointmaps, logs, differ, falloff.tolist(), strict=True)
         if pointmap.name in further and (known or by >= config.least)
     }
 
 
-def exposed(image: Image, gains: Array, falloff: float = 0.0) -> Exposure:
+def make_exposure(image: Image, gains: Array, falloff: float = 0.0) -> Exposure:
     """The exposure of a photograph `image` (h, w, 3) whose `gains` (3,), and its lens's `falloff`, are known."""
     red, green, blue = gains.tolist()
-    saturated = (image >= SATURATED) & (_share(image, gains, falloff) > 1.0)
+    saturated = (image >= SATURATED) & (_relative_light(image, gains, falloff) > 1.0)
     return Exposure((red, green, blue), falloff, saturated if saturated.any() else None)
 
 
-def with_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> tuple[dict[str, Exposure], float]:
+def apply_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> tuple[dict[str, Exposure], float]:
     """Exposures by which what photographs tell stays below white, and how much darker these leave the photographs.
 
     A dark photograph tells how bright things are that are brighter than white in the light of the median. Of the
@@ -126,41 +128,45 @@ def with_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure]
     for name, exposure in exposures.items():
         told = (images[name] < SATURATED).all(axis=2)
         if told.any():
-            share = _share(images[name], np.array(exposure.gains), exposure.falloff)
+            share = _relative_light(images[name], np.array(exposure.gains), exposure.falloff)
             brightest = np.quantile((images[name] / share)[told].max(axis=1), 1.0 - MOST_CLIPPED)
             headroom = max(headroom, float(brightest) / SATURATED)
     headroom = min(headroom, MOST_HEADROOM)
     if headroom == 1.0:
         return dict(exposures), 1.0
     darker = {
-        name: exposed(images[name], headroom * np.array(exposure.gains), exposure.falloff)
+        name: make_exposure(images[name], headroom * np.array(exposure.gains), exposure.falloff)
         for name, exposure in exposures.items()
     }
     return darker, headroom
 
 
-def in_one_light(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> dict[str, Image]:
+def compensate_images(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> dict[str, Image]:
     """The photographs, by name: those that have an exposure as gains of 1 would have them, the others as they are."""
-    return {name: alike(image, exposures[name]) if name in exposures else image for name, image in images.items()}
+    return {
+        name: apply_exposure(image, exposures[name]) if name in exposures else image for name, image in images.items()
+    }
 
 
-def relit(image: Image, gains: Sequence[float] | None, falloff: float = 0.0) -> tuple[Image, Exposure | None]:
+def compensate_image(
+    image: Image, gains: Sequence[float] | None, falloff: float = 0.0
+) -> tuple[Image, Exposure | None]:
     """The photograph `image` in the light of its scene, and the exposure taken out; as it is without gains."""
     if gains is None:
         return image, None
-    exposure = exposed(image, np.array(gains), falloff)
-    return alike(image, exposure), exposure
+    exposure = make_exposure(image, np.array(gains), falloff)
+    return apply_exposure(image, exposure), exposure
 
 
-def alike(image: Image, exposure: Exposure) -> Image:
+def apply_exposure(image: Image, exposure: Exposure) -> Image:
     """The photograph `image` (h, w, 3) as gains of 1 and a lens without falloff would have it."""
-    share = _share(image, np.array(exposure.gains), exposure.falloff)
+    share = _relative_light(image, np.array(exposure.gains), exposure.falloff)
     return np.clip(np.rint(image / share), 0, 255).astype(np.uint8)
 
 
-def _share(image: Image, gains: Array, falloff: float) -> Array:
+def _relative_light(image: Image, gains: Array, falloff: float) -> Array:
     """(h, w, 3), or one that broadcasts to it: the photograph's light over that of the scene."""
-    return light_at(falloff, image.shape[1], image.shape[0])[..., None] * gains if falloff else gains
+    return relative_illumination(falloff, image.shape[1], image.shape[0])[..., None] * gains if falloff else gains
 
 
 def _nearest(logs: Array, centres: Array) -> Array:
@@ -170,17 +176,21 @@ def _nearest(logs: Array, centres: Array) -> Array:
     return logs[distances.argmin(axis=1)]
 
 
-def log_gains(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], told: Mapping[str, float] = _NOTHING) -> Array:
+def estimate_log_gains(
+    pointmaps: Sequence[Pointmap], pictures: Sequence[Image], told: Mapping[str, float] = _NOTHING
+) -> Array:
     """(V, 3) logarithms of the photographs' gains; the median of each channel is 0. `told` is as for `differing`."""
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
-    return _about_the_median(_logs(shared_pixels(pointmaps, pictures), priors, _told(pointmaps, told)))
+    return _subtract_median(
+        _solve_log_gains(find_shared_pixels(pointmaps, pictures), priors, _select_metadata_logs(pointmaps, told))
+    )
 
 
-def _about_the_median(logs: Array) -> Array:
+def _subtract_median(logs: Array) -> Array:
     return logs - np.median(logs, axis=0)
 
 
-def _told(
+def _select_metadata_logs(
     pointmaps: Sequence[Pointmap], told: Mapping[str, float], taken_out: Mapping[str, Array] = MappingProxyType({})
 ) -> Array:
     """(V, 3) the logarithms in `told`, without those of the gains that were taken out, about their median.
@@ -196,7 +206,7 @@ def _told(
     return logs
 
 
-def _logs(shared: Sequence[Shared], priors: Array, told: Array) -> Array:
+def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, told: Array) -> Array:
     """(V, 3) logarithms of the photographs' gains, each with its standard deviation around 0 in `priors` (V,).
 
     `told` (V, 3) is what cameras say of them, up to one offset; NaN: nothing. What is far from all the rest counts for
@@ -213,7 +223,7 @@ def _logs(shared: Sequence[Shared], priors: Array, told: Array) -> Array:
         values[index], sigmas[index] = told[view], TOLD_SIGMA
     if len(tellers):
         priors = np.append(priors, OFFSET_SIGMA)
-    found = [solved(factors, *channel, priors) for channel in zip(values.T, sigmas.T, strict=True)]
+    found = [solve_robust(factors, *channel, priors) for channel in zip(values.T, sigmas.T, strict=True)]
     return np.column_stack(found)[:count]
 
 

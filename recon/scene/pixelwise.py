@@ -12,11 +12,11 @@ import numpy.typing as npt
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.points import NUM_NEIGHBOURS, gaussians_at
-from splatnode.recon.scene.seeding import Config as DownSampling
-from splatnode.recon.scene.seeding import redundant_pixels
+from splatnode.recon.scene.seeding import GaussianInitializationConfig as DownSampling
+from splatnode.recon.scene.seeding import find_redundant_pixels
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PixelwiseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     down_sampling: DownSampling = DownSampling(max_footprint_ratio=1e9)  # equations 14 to 17 as they are written
     min_confidence: float = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
     opacity: float = 0.1  # of a new Gaussian, as in 3DGS
@@ -28,7 +28,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def pixelwise_gaussians(
     pointmaps: Sequence[Pointmap],
     images: Sequence[npt.NDArray[np.uint8]],
-    config: Config,
+    config: PixelwiseConfig,
     max_gaussians: int | None = None,
 ) -> Gaussians:
     """An isotropic Gaussian for each pixel whose depth is confident and that no more confident view covers.
@@ -36,7 +36,7 @@ def pixelwise_gaussians(
     Of more than `max_gaussians` an even choice is kept; sizes then follow from the distances between those.
     """
     points, colours, frames = [], [], []
-    redundant = redundant_pixels(pointmaps, config.down_sampling)
+    redundant = find_redundant_pixels(pointmaps, config.down_sampling)
     for pointmap, image, covered in zip(pointmaps, images, redundant, strict=True):
         kept = ~covered & (pointmap.depth > 0) & (pointmap.confidence >= config.min_confidence)
         points.append(pointmap.points[kept])

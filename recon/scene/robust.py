@@ -10,7 +10,7 @@ Array = npt.NDArray[np.float64]
 _ROUNDS, _HUBER = 10, 2.0  # of reweighting; in standard deviations
 
 
-def solved(factors: Array, values: Array, sigmas: Array, priors: Array) -> Array:
+def solve_robust(factors: Array, values: Array, sigmas: Array, priors: Array) -> Array:
     """(K,) the unknowns for which `factors` (N, K) times them are `values` (N,), by Huber's loss.
 
     `sigmas` (N,) are of the equations, `priors` (K,) of the unknowns around 0.

@@ -55,8 +55,8 @@ class TrainingView:
         return self.image.shape[0]
 
 
-def fitted_pixels(views: Sequence[TrainingView]) -> list[npt.NDArray[np.bool_]]:
-    """Of each view (h, w) the pixels that the scene is fitted to: neither in a dark rim nor hidden by a mask."""
+def compute_fit_masks(views: Sequence[TrainingView]) -> list[npt.NDArray[np.bool_]]:
+    """Returns each view's pixels (h, w) that the scene is fitted to: neither in a dark rim nor masked."""
     shown = border.valid_masks([view.image for view in views])
     return [rim if view.mask is None else rim & view.mask for view, rim in zip(views, shown, strict=True)]
 
@@ -75,7 +75,7 @@ class Scene:
     # of the median, so that photographs are kept darker than that.
     headroom: float = 1.0
 
-    def on(self, device: torch.device) -> Scene:
+    def move_to_device(self, device: torch.device) -> Scene:
         """The same scene with its Gaussians on `device`. Cameras and photographs stay on the processor."""
         return replace(self, gaussians=self.gaussians.map(lambda tensor: tensor.to(device)))
 
@@ -122,7 +122,7 @@ class Scene:
 
         Colours above 1 are brighter than white in the light of the median.
         """
-        gaussians = self.gaussians if self.headroom == 1.0 else self.gaussians.brightened(self.headroom)
+        gaussians = self.gaussians if self.headroom == 1.0 else self.gaussians.scale_brightness(self.headroom)
         quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return GaussianArrays(
             means=gaussians.means.numpy().copy(),

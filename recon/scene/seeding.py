@@ -19,13 +19,13 @@ import torch
 
 from splatnode.recon.geometry import quat_from_matrix
 from splatnode.recon.priors import reprojection
-from splatnode.recon.priors.confirmed import confirmed
+from splatnode.recon.priors.confirmed import find_consistent_pixels
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.result.sources import filled
+from splatnode.recon.result.sources import encode_unconfirmed
 from splatnode.recon.scene.contrast_masking import visibility
 from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate, logit
 from splatnode.recon.scene.partition import partition
-from splatnode.recon.workers import each
+from splatnode.recon.workers import map_parallel
 
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
@@ -40,7 +40,7 @@ MIN_COARSENING = 1.1  # factor by which each attempt is to have fewer pieces
 ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class GaussianInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
     max_footprint_ratio: float = 1.5  # a pixel is redundant only beside a point whose footprint is at most this larger
     min_confidence: float = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
@@ -55,36 +55,40 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     opacity: float = 0.5  # of a new Gaussian
 
 
-def redundant_pixels(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
+def find_redundant_pixels(pointmaps: Sequence[Pointmap], config: GaussianInitializationConfig) -> list[Mask]:
     """For each point map the pixels (h, w) that a more confident map already covers (equations 14 to 17).
 
     Beyond the paper, a pixel is kept where the other map's point was seen from so far away that detail would be lost.
     """
     score = [float(pointmap.confidence.mean()) for pointmap in pointmaps]  # equation 14
 
-    def covered(j: int) -> Mask:
+    def find_covered(j: int) -> Mask:
         target = pointmaps[j]
         mask = np.zeros(target.depth.shape, bool)
         for i in range(len(pointmaps)):
             if (score[i], -i) > (score[j], -j):
-                projected, footprint = reprojection.nearest(pointmaps[i], target)
+                projected, footprint = reprojection.project_nearest(pointmaps[i], target)
                 near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
                 own = target.depth / target.K[0, 0]
                 mask |= near & (footprint < config.max_footprint_ratio * own)
         return mask & (target.depth > 0)
 
-    return each(covered, range(len(pointmaps)))
+    return map_parallel(find_covered, range(len(pointmaps)))
 
 
 def gaussians_from_pointmap(
-    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config, sure: Mask | None = None
+    pointmap: Pointmap,
+    image: npt.NDArray[np.uint8],
+    wanted: Mask,
+    config: GaussianInitializationConfig,
+    sure: Mask | None = None,
 ) -> Gaussians:
     """One Gaussian for each piece of the `wanted` (h, w) pixels of a keyframe's `image` (h, w, 3).
 
     Each lies on its piece's surface and has the piece's mean colour, centre and extent there (moment matching). It
     counts as seen by two photographs where most of its pixels are `sure` (h, w); None: all are.
     """
-    labels, count = _pieces(pointmap, image, wanted & (pointmap.depth > 0), config)
+    labels, count = _segment_at_reference_size(pointmap, image, wanted & (pointmap.depth > 0), config)
     wanted = labels >= 0
     piece = labels[wanted]
     pixels = np.bincount(piece, minlength=count)
@@ -101,19 +105,23 @@ def gaussians_from_pointmap(
     uu, vv = (mean(x * x) - centre[:, i] ** 2 + PIXEL_VARIANCE for i, x in enumerate((u, v)))
     uv = mean(u * v) - centre[:, 0] * centre[:, 1]
     spread = np.stack([np.stack([uu, uv], 1), np.stack([uv, vv], 1)], 1)
-    seeded = _on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
+    seeded = _place_on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
     if sure is None:
         return seeded
     seen = torch.from_numpy(mean(sure[wanted]) >= MOST)
-    return replace(seeded, source_frame=torch.where(seen, pointmap.frame_id, filled(pointmap.frame_id)).int())
+    return replace(
+        seeded, source_frame=torch.where(seen, pointmap.frame_id, encode_unconfirmed(pointmap.frame_id)).int()
+    )
 
 
-def _seeded(pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, sure: Mask, config: Config) -> Gaussians:
+def _initialize_gaussians(
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, sure: Mask, config: GaussianInitializationConfig
+) -> Gaussians:
     return gaussians_from_pointmap(pointmap, image, wanted, config, sure)
 
 
-def _pieces(
-    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
+def _segment_at_reference_size(
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: GaussianInitializationConfig
 ) -> tuple[npt.NDArray[np.int32], int]:
     """(h, w) the label of the piece that each pixel belongs to, -1 where it is not wanted; and the number of pieces.
 
@@ -127,17 +135,21 @@ def _pieces(
         depth = np.asarray(cv2.resize(pointmap.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
         there = cv2.resize(wanted.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
         colour = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-        labels, _ = _cut(depth, colour, there, 1.0, config)
+        labels, _ = _segment_image(depth, colour, there, 1.0, config)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), np.int32)
         found, numbers = np.unique(labels[wanted], return_inverse=True)
         labels = np.full(wanted.shape, -1, np.int32)
         labels[wanted] = numbers - (1 if len(found) and found[0] < 0 else 0)
         return labels, int(labels.max(initial=-1)) + 1
-    return _cut(pointmap.depth, image, wanted, scale, config)
+    return _segment_image(pointmap.depth, image, wanted, scale, config)
 
 
-def _cut(
-    depth: npt.NDArray[np.float32], image: npt.NDArray[np.uint8], wanted: Mask, scale: float, config: Config
+def _segment_image(
+    depth: npt.NDArray[np.float32],
+    image: npt.NDArray[np.uint8],
+    wanted: Mask,
+    scale: float,
+    config: GaussianInitializationConfig,
 ) -> tuple[npt.NDArray[np.int32], int]:
     """Labels (h, w) and number of the pieces of an image (h, w, 3) at `scale` of the reference's size."""
     log_depth = np.log(np.maximum(depth, 1e-9))
@@ -157,14 +169,14 @@ def _cut(
     )
 
 
-def _on_surface(
+def _place_on_surface(
     pointmap: Pointmap,
     centre: Array,  # (N, 2) pixels
     spread: Array,  # (N, 2, 2) covariance in the image, pixels squared
     inverse_depth: Array,  # (N,)
     normal: Array,  # (N, 3) camera frame, of any length
     colour: Array,  # (N, 3) in [0, 1]
-    config: Config,
+    config: GaussianInitializationConfig,
 ) -> Gaussians:
     """Gaussians in the tangent planes of the surface at these pixels, with their covariances carried there."""
     K, T_world_camera = pointmap.K, pointmap.T_world_camera
@@ -216,10 +228,10 @@ def _facing_normals(normal: Array, ray: Array) -> Array:
     return np.where(cosine < MIN_COSINE, sideways - MIN_COSINE * direction, unit)
 
 
-def initial_gaussians(
+def initialize_gaussians(
     pointmaps: Sequence[Pointmap],
     images: Sequence[npt.NDArray[np.uint8]],
-    config: Config,
+    config: GaussianInitializationConfig,
     max_gaussians: int | None = None,
 ) -> Gaussians:
     """The Gaussians of a scene that has not been optimised: every surface once, from its most confident view.
@@ -229,20 +241,20 @@ def initial_gaussians(
     """
     wanted = [
         ~covered & (pointmap.confidence >= config.min_confidence)
-        for pointmap, covered in zip(pointmaps, redundant_pixels(pointmaps, config), strict=True)
+        for pointmap, covered in zip(pointmaps, find_redundant_pixels(pointmaps, config), strict=True)
     ]
-    sure = confirmed(pointmaps)
+    sure = find_consistent_pixels(pointmaps)
     for _ in range(ATTEMPTS):
-        seeded = partial(_seeded, config=config)
-        gaussians = concatenate(each(seeded, pointmaps, images, wanted, sure))
+        seeded = partial(_initialize_gaussians, config=config)
+        gaussians = concatenate(map_parallel(seeded, pointmaps, images, wanted, sure))
         if max_gaussians is None or len(gaussians) <= max_gaussians:
             return gaussians
-        config = _coarsened(config, len(gaussians) / max(max_gaussians, 1))
+        config = _coarsen_config(config, len(gaussians) / max(max_gaussians, 1))
     assert max_gaussians is not None  # else the first was returned
     return gaussians.subset(torch.linspace(0, len(gaussians) - 1, max_gaussians).round().long())
 
 
-def _coarsened(config: Config, times: float) -> Config:
+def _coarsen_config(config: GaussianInitializationConfig, times: float) -> GaussianInitializationConfig:
     """The configuration that gives about `times` fewer pieces."""
     times = max(times, MIN_COARSENING)
     return msgspec.structs.replace(

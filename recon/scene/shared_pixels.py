@@ -13,7 +13,7 @@ from splatnode.recon.priors import reprojection
 from splatnode.recon.priors.confirmed import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.verification.exposure import BRIGHT, DARK
-from splatnode.recon.workers import each
+from splatnode.recon.workers import map_parallel
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -26,7 +26,7 @@ LEAST_SIGMA = 0.01  # of the logarithm of a ratio: surfaces shine differently in
 
 
 @dataclass(frozen=True, eq=False)
-class Shared:
+class SharedPixels:
     """M pixels of one surface in two photographs."""
 
     pair: tuple[int, int]  # the photographs' numbers
@@ -34,31 +34,31 @@ class Shared:
     radii: Array  # (M, 2) squared, of the pixels in the first and in the second
 
 
-def squared_radius(x: npt.ArrayLike, y: npt.ArrayLike, width: int, height: int) -> Array:
-    """Of pixels at x and y in a picture, from its middle: 1 at its corners."""
+def compute_squared_radius(x: npt.ArrayLike, y: npt.ArrayLike, width: int, height: int) -> Array:
+    """Returns the squared distance of pixels at x and y from an image's middle: 1 at its corners."""
     across, along = np.asarray(x) + 0.5 - width / 2.0, np.asarray(y) + 0.5 - height / 2.0
     return (across**2 + along**2) / ((width**2 + height**2) / 4.0)
 
 
-def shared_pixels(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> list[Shared]:
-    """Of each two photographs that share enough; `pictures` (h, w, 3) are as large as their point maps."""
-    known = [pointmap.masked(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
-    partners = reprojection.overlapping(known, MOST_PARTNERS)
-    seen = each(lambda view: _seen(*view), list(zip(known, pictures, strict=True)))
+def find_shared_pixels(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> list[SharedPixels]:
+    """Finds pixels that each two images share; `pictures` (h, w, 3) are as large as their point maps."""
+    known = [pointmap.apply_mask(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
+    partners = reprojection.find_overlapping(known, MOST_PARTNERS)
+    seen = map_parallel(lambda view: _sample_view(*view), list(zip(known, pictures, strict=True)))
     pairs = sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
-    found = each(lambda pair: _shared(pair, seen[pair[0]], seen[pair[1]]), pairs)
+    found = map_parallel(lambda pair: _compare_views(pair, seen[pair[0]], seen[pair[1]]), pairs)
     return [shared for shared in found if shared is not None]
 
 
 def median_log(logs: Array) -> tuple[Array, Array]:
-    """Of logarithms (M, ...) of ratios: the median and its standard deviation."""
+    """Returns the median of log ratios (M, ...) and its standard deviation."""
     median = np.median(logs, axis=0)
     spread = 1.4826 * np.median(np.abs(logs - median), axis=0)
     return median, np.hypot(spread / np.sqrt(len(logs) / INDEPENDENT), LEAST_SIGMA)
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _SampledView:
     """A photograph with its depth, and M of its points."""
 
     picture: Float32  # (h, w, 3) without its noise, in grey levels
@@ -69,18 +69,18 @@ class _Seen:
     radii: Array  # (M,) squared
 
 
-def _seen(pointmap: Pointmap, picture: Image) -> _Seen:
+def _sample_view(pointmap: Pointmap, picture: Image) -> _SampledView:
     height, width = pointmap.depth.shape
     own = np.zeros((height, width), bool)
     own[::STEP, ::STEP] = pointmap.depth[::STEP, ::STEP] > 0
     smooth = np.asarray(cv2.blur(picture.astype(np.float32), (3, 3)), np.float32)
     to_pixels = pointmap.K @ np.linalg.inv(pointmap.T_world_camera)[:3]
     rows, columns = np.nonzero(own)
-    radii = squared_radius(columns, rows, width, height)
-    return _Seen(smooth, pointmap.depth, to_pixels, pointmap.points[own], smooth[own], radii)
+    radii = compute_squared_radius(columns, rows, width, height)
+    return _SampledView(smooth, pointmap.depth, to_pixels, pointmap.points[own], smooth[own], radii)
 
 
-def _shared(pair: tuple[int, int], source: _Seen, target: _Seen) -> Shared | None:
+def _compare_views(pair: tuple[int, int], source: _SampledView, target: _SampledView) -> SharedPixels | None:
     """None where the two share too little."""
     x, y, z = target.world_to_pixels[:, :3] @ source.points.T + target.world_to_pixels[:, 3:]
     height, width = target.depth.shape
@@ -94,5 +94,5 @@ def _shared(pair: tuple[int, int], source: _Seen, target: _Seen) -> Shared | Non
     if usable.sum() < MIN_SAMPLES:
         return None
     logs = np.log(one[usable] / other[usable]).astype(np.float64)
-    radii = np.column_stack([source.radii[inside][agree], squared_radius(column, row, width, height)])
-    return Shared(pair, logs, radii[usable])
+    radii = np.column_stack([source.radii[inside][agree], compute_squared_radius(column, row, width, height)])
+    return SharedPixels(pair, logs, radii[usable])

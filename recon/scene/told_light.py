@@ -13,12 +13,12 @@ from splatnode.recon.frames.keyframe import Keyframe
 RESPONSE = 1.0 / 2.2  # exponent by which pixels answer to light, as sRGB's do
 
 
-def told_logs(keyframes: Iterable[Keyframe]) -> dict[str, float]:
-    """By name, the logarithm of how bright the camera made its photograph, as it says; only differences mean anything.
+def compute_exposure_priors(keyframes: Iterable[Keyframe]) -> dict[str, float]:
+    """Returns the log exposures that image metadata states, by name; only differences mean anything.
 
     An exposure with an f-number and one without cannot be compared: those of the kind that is rarer are left out.
     """
     told = {each.name: each.frame.exposure for each in keyframes if each.frame.exposure is not None}
     whole = {name for name, exposure in told.items() if exposure.f_number is not None}
     chosen = whole if 2 * len(whole) >= len(told) else told.keys() - whole
-    return {name: RESPONSE * exposure.log_light for name, exposure in told.items() if name in chosen}
+    return {name: RESPONSE * exposure.log_exposure for name, exposure in told.items() if name in chosen}

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.scene.robust import solved
-from splatnode.recon.scene.shared_pixels import Shared, median_log, squared_radius
+from splatnode.recon.scene.robust import solve_robust
+from splatnode.recon.scene.shared_pixels import SharedPixels, compute_squared_radius, median_log
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -25,13 +25,13 @@ MIN_PHOTOGRAPHS = 3  # fewer cannot contradict each other
 SIGMAS = 2.0  # standard deviations that a falloff must be above the least that is taken out
 
 
-def light_at(falloff: float, width: int, height: int) -> Float32:
+def relative_illumination(falloff: float, width: int, height: int) -> Float32:
     """(h, w) the share of the middle's light that reaches each pixel."""
     across, along = np.meshgrid(np.arange(width), np.arange(height))
-    return np.exp(-falloff * squared_radius(across, along, width, height)).astype(np.float32)
+    return np.exp(-falloff * compute_squared_radius(across, along, width, height)).astype(np.float32)
 
 
-def falloffs(shared: Sequence[Shared], lens_of: Sequence[int], least: float) -> Array:
+def estimate_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int], least: float) -> Array:
     """(V,) of each photograph's lens, which `lens_of` numbers; 0 where it may be less than `least`."""
     result = np.zeros(len(lens_of))
     for lens in sorted(set(lens_of)):
@@ -39,17 +39,17 @@ def falloffs(shared: Sequence[Shared], lens_of: Sequence[int], least: float) -> 
         if len(members) < MIN_PHOTOGRAPHS:
             continue
         bins = [each for pair in shared if set(pair.pair) <= set(members) for each in _bins(pair)]
-        found = _falloff(bins, members)
+        found = _estimate_falloff(bins, members)
         if found < least:
             continue
-        without = [_falloff([each for each in bins if view not in each.pair], members) for view in members]
+        without = [_estimate_falloff([each for each in bins if view not in each.pair], members) for view in members]
         sigma = np.sqrt((len(members) - 1) * np.var(without))  # the jackknife's
         if found - SIGMAS * sigma >= least:
             result[members] = found
     return result
 
 
-def without_falloff(shared: Sequence[Shared], falloff: Array) -> Sequence[Shared]:
+def remove_falloff(shared: Sequence[SharedPixels], falloff: Array) -> Sequence[SharedPixels]:
     """The ratios of colours as lenses would give them that dim nothing; `falloff` (V,) is of the photographs'."""
     if not falloff.any():
         return shared
@@ -69,7 +69,7 @@ class _Bin:
     sigma: float  # of `log`
 
 
-def _bins(shared: Shared) -> list[_Bin]:
+def _bins(shared: SharedPixels) -> list[_Bin]:
     farther, logs = shared.radii[:, 0] - shared.radii[:, 1], shared.logs.mean(axis=1)
     found = []
     for own in np.array_split(np.argsort(farther, kind="stable"), BINS):
@@ -80,12 +80,12 @@ def _bins(shared: Shared) -> list[_Bin]:
     return found
 
 
-def _falloff(bins: Collection[_Bin], members: Sequence[int]) -> float:
-    """That of the lens of the photographs `members`, whose gains are unknown, too; 0 where nothing is known."""
+def _estimate_falloff(bins: Collection[_Bin], members: Sequence[int]) -> float:
+    """Estimates the falloff of the lens of the images `members`, with their gains; 0 without data."""
     column = {view: index for index, view in enumerate(members)}
     factors = np.zeros((len(bins), len(members) + 1))
     for row, each in zip(factors, bins, strict=True):
         row[column[each.pair[0]]], row[column[each.pair[1]]], row[-1] = 1.0, -1.0, -each.farther
     values, sigmas = (np.array([getattr(each, name) for each in bins]) for name in ("log", "sigma"))
     priors = np.array([GAIN_SIGMA] * len(members) + [FALLOFF_SIGMA])
-    return float(solved(factors, values, sigmas, priors)[-1])
+    return float(solve_robust(factors, values, sigmas, priors)[-1])

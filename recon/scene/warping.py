@@ -10,13 +10,13 @@ import numpy.typing as npt
 import torch
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix, to_camera
+from splatnode.recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix, transform_to_camera
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
+from splatnode.recon.priors.registered_camera import compute_modelled_K, select_sparse_points
 from splatnode.recon.registration.register import RegisteredCamera, Registration
-from splatnode.recon.registration.straightened import corner_shift, straightened, with_lenses
-from splatnode.recon.result.sources import frame_of
+from splatnode.recon.registration.straightened import apply_known_lenses, corner_shift, undistort_keyframes
+from splatnode.recon.result.sources import decode_frame_id
 from splatnode.recon.scene import light
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
@@ -27,7 +27,7 @@ MAX_STRETCH = 2.0  # largest ratio of depths that a scene is warped by; beyond i
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class AlignedRegistration:
     """A scene, and what is known by now in its world; its photographs are those of the graph, straight as they are."""
 
     scene: Scene
@@ -35,17 +35,19 @@ class Beside:
     registration: Registration
 
 
-def beside(scene: Scene, registration: Registration, graph: ViewGraph, provisional: bool) -> Beside | None:
-    """What a new registration says, in the world of the scene; None where it cannot be brought there.
+def align_registration(
+    scene: Scene, registration: Registration, graph: ViewGraph, provisional: bool
+) -> AlignedRegistration | None:
+    """Aligns a new registration with the scene's world; None where that is impossible.
 
     Photographs are straightened. The lenses of a provisional registration are those of the scene, where it has some.
     """
     if provisional:
-        registration = with_lenses(registration, graph, {view.name: view.lens for view in scene.views})
-    graph, registration = straightened(graph, registration)
-    straight = with_photographs(scene, graph)
+        registration = apply_known_lenses(registration, graph, {view.name: view.lens for view in scene.views})
+    graph, registration = undistort_keyframes(graph, registration)
+    straight = replace_images(scene, graph)
     placed = None if straight is None else registration_in_scene_world(straight, registration, graph)
-    return None if straight is None or placed is None else Beside(straight, graph, placed)
+    return None if straight is None or placed is None else AlignedRegistration(straight, graph, placed)
 
 
 def registration_in_scene_world(scene: Scene, registration: Registration, graph: ViewGraph) -> Registration | None:
@@ -75,7 +77,7 @@ def registration_in_scene_world(scene: Scene, registration: Registration, graph:
     )
 
 
-def with_photographs(scene: Scene, graph: ViewGraph) -> Scene | None:
+def replace_images(scene: Scene, graph: ViewGraph) -> Scene | None:
     """The scene with its photographs as `graph` has them, without the distortion that is estimated by now.
 
     None where that moves the corner of one by more than MAX_LENS_SHIFT, or `graph` lacks one.
@@ -87,13 +89,13 @@ def with_photographs(scene: Scene, graph: ViewGraph) -> Scene | None:
             return None
         if keyframe.lens is not None:
             lit = view.exposure
-            image, exposure = light.relit(keyframe.image, lit and lit.gains, lit.falloff if lit else 0.0)
+            image, exposure = light.compensate_image(keyframe.image, lit and lit.gains, lit.falloff if lit else 0.0)
             view = replace(view, image=image, exposure=exposure, mask=keyframe.mask, lens=keyframe.lens)
         views.append(view)
     return replace(scene, views=tuple(views))
 
 
-def updated_pointmaps(
+def update_pointmaps(
     pointmaps: Mapping[str, Pointmap], registration: Registration, graph: ViewGraph
 ) -> dict[str, Pointmap]:
     """The point maps of registered cameras, by name, with these cameras; depths are scaled to the registered points."""
@@ -109,14 +111,14 @@ def updated_pointmaps(
             depth=before.depth * ratio,
             unchecked=None if before.unchecked is None else (before.unchecked * ratio).astype(np.float16),
             T_world_camera=camera.T_world_camera,
-            K=modelled_K(graph, camera),
+            K=compute_modelled_K(graph, camera),
         )
     return updated
 
 
 def _depth_ratio(pointmap: Pointmap, registration: Registration, camera: RegisteredCamera, keyframe: Keyframe) -> float:
     """Median of the registered points' depths over the point map's at their pixels; 1 below MIN_POINTS points."""
-    observed = sparse_points(registration, camera, keyframe.scale)
+    observed = select_sparse_points(registration, camera, keyframe.scale)
     height, width = pointmap.depth.shape
     column, row = np.clip(observed.points, 0, [width - 1, height - 1]).astype(int).T
     known = (pointmap.depth[row, column] > 0) & (observed.depths > 0)
@@ -125,7 +127,7 @@ def _depth_ratio(pointmap: Pointmap, registration: Registration, camera: Registe
     return float(np.median(observed.depths[known] / pointmap.depth[row, column][known]))
 
 
-def warped_scene(
+def warp_scene(
     scene: Scene, before: Mapping[str, Pointmap], after: Mapping[str, Pointmap], max_shift: float
 ) -> Scene | None:
     """The scene with each view, and the Gaussians that were seeded from it, where its point map is `after`.
@@ -140,7 +142,7 @@ def warped_scene(
     if any(warp.camera_shift > max_shift or warp.largest_stretch > MAX_STRETCH for warp in warps):
         return None
     gaussians = scene.gaussians.map(torch.clone)
-    source, views = frame_of(scene.gaussians.source_frame), []
+    source, views = decode_frame_id(scene.gaussians.source_frame), []
     view_ids = torch.tensor([view.frame_id for view in scene.views], dtype=source.dtype)
     for index, (view, warp) in enumerate(zip(scene.views, warps, strict=True)):
         own = source == view.frame_id
@@ -183,7 +185,7 @@ def _apply(warp: _Warp, gaussians: Gaussians, chosen: torch.Tensor) -> None:
     """Warps the `chosen` (N,) Gaussians in place; a stretch makes them larger by its mean and does not bend them."""
     T_before = torch.from_numpy(warp.T_world_camera).float()
     stretch, rigid = torch.from_numpy(warp.stretch).float(), torch.from_numpy(warp.rigid).float()
-    in_camera = to_camera(gaussians.means[chosen], T_before)
+    in_camera = transform_to_camera(gaussians.means[chosen], T_before)
     stretched = (in_camera * stretch) @ T_before[:3, :3].T + T_before[:3, 3]
     gaussians.means[chosen] = stretched @ rigid[:3, :3].T + rigid[:3, 3]
     gaussians.quats[chosen] = multiply_quats(quat_from_matrix(rigid[:3, :3]), gaussians.quats[chosen])

@@ -8,24 +8,24 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.causes import why_wide
-from splatnode.recon.verification.checks import Case
+from splatnode.recon.verification.causes import explain_wide_bounds
+from splatnode.recon.verification.checks import VerificationCase
 
 
-def accepted(case: Case) -> Verdict:
+def accept(case: VerificationCase) -> Verdict:
     """OK where all photographs were placed, exactly; else what the others show, or how roughly they are placed."""
-    left_out = _left_out(case)
-    rough = _rough(case)
+    left_out = _find_unplaced_frames(case)
+    rough = _describe_roughness(case)
     if rough:
-        message = f"{_placed(case)}, roughly: {rough}."
-        found = Verdict(Code.OK_ROUGH, message, _sharper(case), left_out, publishable=True)
+        message = f"{_summarize_placement(case)}, roughly: {rough}."
+        found = Verdict(Code.OK_ROUGH, message, _advise_remedy(case), left_out, publishable=True)
     else:
-        found = _partial(case, left_out) if left_out else _all_placed(case)
-    lenses = _own_lenses(case)
+        found = _accept_partial(case, left_out) if left_out else _accept_all(case)
+    lenses = _describe_own_lenses(case)
     return replace(found, message=f"{found.message} {lenses}") if lenses else found
 
 
-def _own_lenses(case: Case) -> str:
+def _describe_own_lenses(case: VerificationCase) -> str:
     """A sentence about images whose lens is not the one that they were taken to share, or that was given."""
     names = case.graph.names
     own = {names[camera.index]: camera.focal for camera in case.registration.cameras if camera.own_lens}
@@ -42,21 +42,21 @@ def _own_lenses(case: Case) -> str:
     )
 
 
-def _left_out(case: Case) -> tuple[str, ...]:
+def _find_unplaced_frames(case: VerificationCase) -> tuple[str, ...]:
     placed = {camera.index for camera in case.registration.cameras}
     return tuple(name for index, name in enumerate(case.graph.names) if index not in placed)
 
 
-def _placed(case: Case) -> str:
+def _summarize_placement(case: VerificationCase) -> str:
     placed, count = len(case.registration.cameras), len(case.graph.keyframes)
     return f"{'All' if placed == count else f'{placed} of'} {count} photographs were placed"
 
 
-def _rough(case: Case) -> str:
-    """What is known less well than an exact scene knows it; empty where nothing is."""
-    if case.exact:
+def _describe_roughness(case: VerificationCase) -> str:
+    """Describes what is known less well than in an exact scene; empty where nothing is."""
+    if case.is_exact:
         return ""
-    worst = case.worst
+    worst = case.widest_bounds
     return (
         f"positions are known to {worst.centre_percent:.2g} % of the distance to the scene "
         f"({case.travel_percent:.2g} % of how far the camera moved), directions to {worst.rotation_deg:.2g} degrees, "
@@ -64,13 +64,13 @@ def _rough(case: Case) -> str:
     )
 
 
-def _sharper(case: Case) -> str:
-    """What would make a rough scene exact: the remedy of the cause that made it rough."""
-    return why_wide(case).advice
+def _advise_remedy(case: VerificationCase) -> str:
+    """Returns the remedy for the cause that made the scene rough."""
+    return explain_wide_bounds(case).advice
 
 
-def _partial(case: Case, left_out: tuple[str, ...]) -> Verdict:
-    graph, summary = case.graph, _placed(case)
+def _accept_partial(case: VerificationCase, left_out: tuple[str, ...]) -> Verdict:
+    graph, summary = case.graph, _summarize_placement(case)
     names, placed = graph.names, {camera.index for camera in case.registration.cameras}
     apart = [part for part in graph.components() if not placed & set(part)]
     if any(len(part) > 1 for part in apart):
@@ -100,23 +100,23 @@ def _partial(case: Case, left_out: tuple[str, ...]) -> Verdict:
     )
 
 
-def _all_placed(case: Case) -> Verdict:
+def _accept_all(case: VerificationCase) -> Verdict:
     exposure_ratio, cameras = case.config.exposure_ratio, case.evidence.cameras
     gains = {camera.name: camera.gain for camera in cameras}  # finite, for `undetermined` let them pass
     ratio = max(gains.values()) / min(gains.values())
     if ratio <= exposure_ratio:
-        return Verdict(Code.OK, f"{_placed(case)}.", "", (), publishable=True)
+        return Verdict(Code.OK, f"{_summarize_placement(case)}.", "", (), publishable=True)
     limit = exposure_ratio**0.5
     return Verdict(
         Code.EXPOSURE_SHIFT,
-        f"{_placed(case)}; the brightest is exposed {ratio:.1f} times as much as the darkest.",
+        f"{_summarize_placement(case)}; the brightest is exposed {ratio:.1f} times as much as the darkest.",
         "Lock exposure and white balance.",
         tuple(name for name, gain in gains.items() if not 1 / limit < gain < limit),
         publishable=True,
     )
 
 
-def overfitted(names: Sequence[str], iterations: int, kept: int, before: float, after: float) -> Verdict:
+def make_overfit_verdict(names: Sequence[str], iterations: int, kept: int, before: float, after: float) -> Verdict:
     """OVERFIT: the scene after `kept` iterations is published in place of the one after `iterations`.
 
     `before` and `after` are their misfits between the photographs.

@@ -14,41 +14,45 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification import lens, refusals
-from splatnode.recon.verification.config import Config
+from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.input_kinds import refuse_stereo_or_panorama
 from splatnode.recon.verification.refusals import refuse
 
 Pair = tuple[int, int]
 
 
-def refuse_before_registration(graph: ViewGraph, rejected: Sequence[Rejected], config: Config) -> Verdict | None:
+def refuse_before_registration(
+    graph: ViewGraph, rejected: Sequence[Rejected], config: DecisionConfig
+) -> Verdict | None:
     """Why there can be no scene whatever the poses are, or None. `rejected` are the frames that screening left out."""
     kind = refuse_stereo_or_panorama(graph.keyframes)
-    return kind or _too_little(graph, rejected, config) or _no_motion(graph, config)
+    return kind or _refuse_insufficient_images(graph, rejected, config) or _refuse_no_motion(graph, config)
 
 
-def refuse_unplaced(graph: ViewGraph, registration: Registration | None, config: Config) -> Verdict:
+def refuse_unplaced(graph: ViewGraph, registration: Registration | None, config: DecisionConfig) -> Verdict:
     """Why registration placed too few cameras to verify them."""
     names = [keyframe.name for keyframe in graph.keyframes]
-    doubted = _doubted_focal(graph, config)
+    doubted = _refuse_doubtful_focal(graph, config)
     if doubted is not None:
         return doubted
     components = graph.components()
     if len(components[0]) < config.min_cameras:
         found = f"Only {len(components[0])} of {len(names)} photographs overlap."
         return refuse(refusals.NO_OVERLAP, names, found=found)
-    turned = _pure_rotations(graph)
+    turned = _find_pure_rotations(graph)
     if 2 * len(turned) >= len(graph.pairs):
-        return _without_parallax(graph, turned)
+        return _refuse_pure_rotation(graph, turned)
     placed = 0 if registration is None else len(registration.cameras)
     found = f"Only {placed} of {len(names)} photographs could be placed with certainty."
     return refuse(refusals.NO_OVERLAP, names, found=found)
 
 
-def _too_little(graph: ViewGraph, rejected: Sequence[Rejected], config: Config) -> Verdict | None:
+def _refuse_insufficient_images(
+    graph: ViewGraph, rejected: Sequence[Rejected], config: DecisionConfig
+) -> Verdict | None:
     names = [keyframe.name for keyframe in graph.keyframes]
     if len(names) < config.min_cameras:
-        return _too_few(names, rejected, config)
+        return _refuse_too_few_views(names, rejected, config)
     if graph.pairs:
         return None
     plain = [keyframe.name for keyframe in graph.keyframes if len(keyframe.features.points) < config.min_features]
@@ -57,8 +61,8 @@ def _too_little(graph: ViewGraph, rejected: Sequence[Rejected], config: Config) 
     return refuse(refusals.NO_OVERLAP, names, found="No two photographs show enough of the same things.")
 
 
-def _too_few(names: list[str], rejected: Sequence[Rejected], config: Config) -> Verdict:
-    """What most of the frames that were left out have in common is the reason, if they would have been enough."""
+def _refuse_too_few_views(names: list[str], rejected: Sequence[Rejected], config: DecisionConfig) -> Verdict:
+    """Refuses with what most rejected frames have in common, if they would have been enough."""
     by_code = {code: [frame for frame in rejected if frame.code == code] for code in Code}
     copies, blurred, blank = (by_code[code] for code in (Code.STATIC_CAMERA, Code.BLUR, Code.LOW_TEXTURE))
     if len(names) + len(rejected) >= config.min_cameras or (copies and len(names) == 1):
@@ -76,22 +80,22 @@ def _too_few(names: list[str], rejected: Sequence[Rejected], config: Config) -> 
     return refuse(refusals.TOO_FEW, names, usable=usable, least=config.min_cameras, left_out=left_out)
 
 
-def _no_motion(graph: ViewGraph, config: Config) -> Verdict | None:
+def _refuse_no_motion(graph: ViewGraph, config: DecisionConfig) -> Verdict | None:
     """The camera stood still, or only turned."""
     still = [pair for pair, view in graph.pairs.items() if _motion_px(graph, pair, view) < config.static_px]
     if len(still) == len(graph.pairs):
         return refuse(refusals.ONLY_COPIES, _names(graph, still))
-    turned = _pure_rotations(graph)
-    return _without_parallax(graph, turned) if len(turned) >= config.turned_share * len(graph.pairs) else None
+    turned = _find_pure_rotations(graph)
+    return _refuse_pure_rotation(graph, turned) if len(turned) >= config.turned_share * len(graph.pairs) else None
 
 
-def _doubted_focal(graph: ViewGraph, config: Config) -> Verdict | None:
+def _refuse_doubtful_focal(graph: ViewGraph, config: DecisionConfig) -> Verdict | None:
     """A refusal if all frames were given one focal length, and their pairs vote for quite another."""
     given = {
         keyframe.frame.intrinsics.fx if keyframe.frame.intrinsics is not None else None for keyframe in graph.keyframes
     }
     told = given.pop() if len(given) == 1 else None
-    voted = lens.voted_focal(graph.keyframes, list(graph.pairs.values()))
+    voted = lens.vote_focal(graph.keyframes, list(graph.pairs.values()))
     if told is None or voted is None or abs(np.log(voted / told)) < config.voted_change:
         return None
     names = [keyframe.name for keyframe in graph.keyframes]
@@ -99,11 +103,11 @@ def _doubted_focal(graph: ViewGraph, config: Config) -> Verdict | None:
     return refuse(refusals.WRONG_FOCAL_BY_VOTE, names, given=told, voted=voted, change=change)
 
 
-def _pure_rotations(graph: ViewGraph) -> list[Pair]:
+def _find_pure_rotations(graph: ViewGraph) -> list[Pair]:
     return [pair for pair, view in graph.pairs.items() if view.is_pure_rotation]
 
 
-def _without_parallax(graph: ViewGraph, turned: list[Pair]) -> Verdict:
+def _refuse_pure_rotation(graph: ViewGraph, turned: list[Pair]) -> Verdict:
     found = f"{len(turned)} of {len(graph.pairs)} overlapping pairs show no parallax"
     return refuse(refusals.NO_PARALLAX, _names(graph, turned), found=found)
 

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from splatnode.recon.result.bounds import Array, Bounds, axes_of, ball
+from splatnode.recon.result.bounds import Array, Bounds, compute_axes, make_ball
 from splatnode.recon.verification.errors import Errors
 from splatnode.recon.verification.evidence import Evidence
 
@@ -42,7 +42,7 @@ class BoundModel:
     count: float  # of the number of cameras
     own_lens: float = 1.0  # times, where an image has a lens of its own: which images have one is not certain
 
-    def of(
+    def predict_bound(
         self, errors: Errors, count: int, inlier_ratio: float = 1.0, link: float = 1.0, own_lens: bool = False
     ) -> float:
         """The bound in the unit of `errors`: never less than a source says. NaN and infinity stay what they are."""
@@ -56,7 +56,7 @@ class BoundModel:
 
 
 @dataclass(frozen=True)
-class ClaimModel:
+class ErrorModel:
     """The models of the bounds. A length counts in the distance to the scene, a focal length in its logarithm."""
 
     rotation: BoundModel  # degrees
@@ -64,29 +64,29 @@ class ClaimModel:
     focal: BoundModel
 
 
-def claims(evidence: Evidence, model: ClaimModel) -> dict[str, Bounds]:
+def predict_bounds(evidence: Evidence, model: ErrorModel) -> dict[str, Bounds]:
     """The bounds of each camera, by its name, with balls for ellipsoids; the distance to the scene is 1."""
     count, link = len(evidence.cameras), evidence.weakest_link.inlier_ratio
     own, found = any(camera.own_lens for camera in evidence.cameras), {}
     for camera in evidence.cameras:
-        focal = model.focal.of(camera.focal, count, own_lens=own)
-        centre = model.centre.of(camera.errors.centre, count, camera.inlier_ratio, link, own)
+        focal = model.focal.predict_bound(camera.focal, count, own_lens=own)
+        centre = model.centre.predict_bound(camera.errors.centre, count, camera.inlier_ratio, link, own)
         found[camera.name] = Bounds(
-            rotation_deg=model.rotation.of(camera.errors.rotation, count, camera.inlier_ratio, link, own),
+            rotation_deg=model.rotation.predict_bound(camera.errors.rotation, count, camera.inlier_ratio, link, own),
             centre=centre,
             centre_percent=100.0 * centre,
             focal_percent=100.0 * math.expm1(min(focal, MAX_LOG_FOCAL)),
-            axes=ball(centre),
+            axes=make_ball(centre),
         )
     return found
 
 
-def shaped(bounds: Mapping[str, Bounds], covariances: Mapping[str, Array]) -> dict[str, Bounds]:
+def shape_bounds(bounds: Mapping[str, Bounds], covariances: Mapping[str, Array]) -> dict[str, Bounds]:
     """The bounds with ellipsoids of the shape of each centre's covariance (3, 3), by the cameras' names."""
-    return {name: replace(each, axes=axes_of(covariances[name], each.centre)) for name, each in bounds.items()}
+    return {name: replace(each, axes=compute_axes(covariances[name], each.centre)) for name, each in bounds.items()}
 
 
-def travel_percent(bounds: Mapping[str, Bounds], evidence: Evidence) -> float:
+def compute_travel_percent(bounds: Mapping[str, Bounds], evidence: Evidence) -> float:
     """How far off a centre may be, in percent of how far the camera moved: of the RMS distance from their mean."""
     farthest = max((each.centre for each in bounds.values()), default=math.nan)
     return 100.0 * farthest / evidence.travel if evidence.travel > 0 else math.inf

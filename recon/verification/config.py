@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Before registration: frames and their pairs.
     min_cameras: int = 2  # fewest cameras of a scene
     min_features: int = 150  # fewest features of a frame that has enough texture

@@ -28,7 +28,7 @@ MIN_INFORMATION = 1e-9  # of an eigenvalue, in place of 0
 STEP = 1e-5  # of a rotation or a direction, radians, in differences
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class CycleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_matches: int = 40  # least matches of a pair that is used
     partners: int = 3  # of each frame, those with most matches
     max_matches: int = 400  # matches of a pair that are used; more make a relative pose no surer
@@ -36,7 +36,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class Cycles:
+class CycleConsistency:
     """Triangles of pairs, each with a relative pose of its own (five points, known focal lengths)."""
 
     triangles: int
@@ -46,18 +46,18 @@ class Cycles:
     direction_sigmas: float  # the same over the standard error that the pair's matches leave of it; 0 without a pair
 
 
-def measure(
+def measure_cycle_consistency(
     keyframes: Sequence[Keyframe],
     registration: Registration,
     pairs: Mapping[tuple[int, int], TwoView],
-    config: Config,
-) -> Cycles:
+    config: CycleConfig,
+) -> CycleConsistency:
     cameras = {camera.index: camera for camera in registration.cameras}
     rotations: dict[tuple[int, int], Array] = {}
     directions, sigmas = [], []
-    for i, j in _strongest_pairs(list(cameras), pairs, config):
+    for i, j in _select_strongest_pairs(list(cameras), pairs, config):
         scale = max(longer_side(keyframes[k].frame) for k in (i, j)) / REFERENCE_SIDE
-        thinned = _thinned(pairs[i, j], config.max_matches)
+        thinned = _thin_matches(pairs[i, j], config.max_matches)
         rays = [
             cameras[k].normalise(points + principal_point(keyframes[k].frame))
             for k, points in ((i, thinned.points1), (j, thinned.points2))
@@ -70,17 +70,17 @@ def measure(
             continue  # The pair has no rigid answer for these focal lengths; its inlier ratio says so, too.
         rotations[i, j] = rotation
         T_second_first = np.linalg.inv(cameras[j].T_world_camera) @ cameras[i].T_world_camera
-        angle = _angle_between(direction, T_second_first[:3, 3])
+        angle = _compute_angle_between(direction, T_second_first[:3, 3])
         directions.append(angle)
         focal = float(np.mean(focals))
-        sigma = direction_sigma_deg(rays[0], rays[1], rotation, direction, MIN_NOISE_PX * scale / focal)
+        sigma = estimate_direction_sigma_deg(rays[0], rays[1], rotation, direction, MIN_NOISE_PX * scale / focal)
         sigmas.append(angle / float(np.hypot(sigma, MIN_SIGMA_DEG)))
     left = []
     for i, j, k in combinations(sorted(cameras), 3):
         if (i, j) in rotations and (j, k) in rotations and (i, k) in rotations:
             around = rotations[i, k].T @ rotations[j, k] @ rotations[i, j]
             left.append(float(np.degrees(np.arccos(np.clip((np.trace(around) - 1.0) / 2.0, -1.0, 1.0)))))
-    return Cycles(
+    return CycleConsistency(
         triangles=len(left),
         rotation_deg=float(np.median(left)) if left else 0.0,
         worst_rotation_deg=float(np.max(left)) if left else 0.0,
@@ -89,7 +89,9 @@ def measure(
     )
 
 
-def direction_sigma_deg(rays1: Array, rays2: Array, rotation: Array, direction: Array, least_noise: float) -> float:
+def estimate_direction_sigma_deg(
+    rays1: Array, rays2: Array, rotation: Array, direction: Array, least_noise: float
+) -> float:
     """The standard error of the direction of motion that a pair's matches leave, degrees; 90 where nothing is known.
 
     `rays1` and `rays2` (M, 2) at depth 1, the pose from the first camera's axes to the second's. By the Sampson errors'
@@ -103,7 +105,7 @@ def direction_sigma_deg(rays1: Array, rays2: Array, rotation: Array, direction: 
     def errors(step: Array) -> Array:
         turned = rotation + cross_matrix(step[None, :3])[0] @ rotation
         moved = unit + step[3] * aside[0] + step[4] * aside[1]
-        return _sampson(rays1, rays2, cross_matrix(moved[None])[0] @ turned)
+        return _compute_sampson_errors(rays1, rays2, cross_matrix(moved[None])[0] @ turned)
 
     at = errors(np.zeros(5))
     noise = max(float(np.median(np.abs(at))) / MEDIAN_OF_NORMAL, least_noise)
@@ -115,7 +117,7 @@ def direction_sigma_deg(rays1: Array, rays2: Array, rotation: Array, direction: 
     return float(min(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))), 90.0))
 
 
-def _sampson(rays1: Array, rays2: Array, essential: Array) -> Array:
+def _compute_sampson_errors(rays1: Array, rays2: Array, essential: Array) -> Array:
     """(M,) signed, at depth 1."""
     one, other = (np.column_stack([rays, np.ones(len(rays))]) for rays in (rays1, rays2))
     line2, line1 = one @ essential.T, other @ essential
@@ -123,8 +125,8 @@ def _sampson(rays1: Array, rays2: Array, essential: Array) -> Array:
     return (other * line2).sum(1) / np.sqrt(np.maximum(gradient, MIN_LENGTH))
 
 
-def _strongest_pairs(
-    frames: Sequence[int], pairs: Mapping[tuple[int, int], TwoView], config: Config
+def _select_strongest_pairs(
+    frames: Sequence[int], pairs: Mapping[tuple[int, int], TwoView], config: CycleConfig
 ) -> list[tuple[int, int]]:
     """Pairs of registered frames that are among the strongest of one of the two."""
     strong = [
@@ -139,7 +141,7 @@ def _strongest_pairs(
     return sorted(chosen)
 
 
-def _thinned(pair: TwoView, count: int) -> TwoView:
+def _thin_matches(pair: TwoView, count: int) -> TwoView:
     """The pair with about `count` of its matches, spread evenly over their ranks."""
     if len(pair.matches) <= count:
         return pair
@@ -147,6 +149,6 @@ def _thinned(pair: TwoView, count: int) -> TwoView:
     return replace(pair, matches=pair.matches[chosen], points1=pair.points1[chosen], points2=pair.points2[chosen])
 
 
-def _angle_between(one: Array, other: Array) -> float:
+def _compute_angle_between(one: Array, other: Array) -> float:
     lengths = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(np.degrees(np.arccos(np.clip(one @ other / max(lengths, MIN_LENGTH), -1.0, 1.0))))

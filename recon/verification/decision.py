@@ -10,35 +10,35 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification import causes, checks
-from splatnode.recon.verification.acceptances import accepted
+from splatnode.recon.verification.acceptances import accept
 from splatnode.recon.verification.before_registration import refuse_before_registration, refuse_unplaced
-from splatnode.recon.verification.checks import Case
-from splatnode.recon.verification.config import Config
+from splatnode.recon.verification.checks import VerificationCase
+from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.models import Fitted
-from splatnode.recon.verification.odds_check import odds
-from splatnode.recon.verification.strong_lens import bends_strongly
-from splatnode.recon.verification.undetermined import undetermined
+from splatnode.recon.verification.models import VerdictModels
+from splatnode.recon.verification.odds_check import check_odds
+from splatnode.recon.verification.strong_lens import check_strong_distortion
+from splatnode.recon.verification.undetermined import check_finite
 
-__all__ = ["Config", "decide", "refuse_before_registration"]
+__all__ = ["DecisionConfig", "decide", "refuse_before_registration"]
 
 LIMITS = (  # each asks one piece of the evidence, and decides by itself
-    checks.given_lens,
-    checks.given_focal,
-    checks.distortion,
-    checks.moving_plane,
-    checks.weakest_link,
-    checks.disconnected,
-    checks.mirrored_photographs,
+    checks.check_given_lens,
+    checks.check_given_focal,
+    checks.check_distortion,
+    checks.check_moving_plane,
+    checks.check_weakest_link,
+    checks.check_connectivity,
+    checks.check_mirrored_images,
 )
 CHECKS = (  # what is surer about the reason comes first; those after the first may take all numbers for finite
-    undetermined,
+    check_finite,
     *LIMITS,
-    bends_strongly,
-    odds,
-    causes.unknown,
-    checks.required,
+    check_strong_distortion,
+    check_odds,
+    causes.check_bounds,
+    checks.check_required_precision,
 )
 
 
@@ -46,8 +46,8 @@ def decide(
     graph: ViewGraph,
     registration: Registration | None,
     evidence: Evidence | None,
-    config: Config,
-    fitted: Fitted = FITTED,
+    config: DecisionConfig,
+    fitted: VerdictModels = FITTED,
 ) -> Verdict:
     """OK, or another code that is publishable, or the reason why there is no scene.
 
@@ -56,9 +56,9 @@ def decide(
     """
     if registration is None or evidence is None or len(registration.cameras) < config.min_cameras:
         return refuse_unplaced(graph, registration, config)
-    case = Case(evidence, config, fitted.of(evidence), graph, registration)
+    case = VerificationCase(evidence, config, fitted.select_model(evidence), graph, registration)
     for check in CHECKS:
         refusal = check(case)
         if refusal is not None:
             return refusal
-    return accepted(case)
+    return accept(case)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatnode.recon.geometry import spread
+from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import focal_profile, jackknife, principal_point, refit
 
@@ -27,7 +27,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Of one camera."""
+    """The errors of the pose of one camera."""
 
     rotation: Errors  # degrees, after the best common rotation
     centre: Errors  # after the best similarity; the distance to the scene is 1
@@ -40,23 +40,27 @@ class AllErrors:
 
     @property
     def focal(self) -> Errors:
-        """Of the least certain focal length, by each source."""
-        return worst(self.focals.values())
+        """Returns the errors of the least certain focal length, by each source."""
+        return combine_worst(self.focals.values())
 
 
-def worst(errors: Iterable[Errors]) -> Errors:
+def combine_worst(errors: Iterable[Errors]) -> Errors:
     """The largest of each source; NaN where one is."""
     found = np.array([(of.sigma, of.regions, of.profile) for of in errors])
     return Errors(*found.max(0).tolist())
 
 
-def measure(fit: refit.Fit, registration: Registration) -> AllErrors:
-    """Of the cameras of `registration`, of which `fit` is a part of the points."""
-    regions, profile, freed = jackknife.by_regions(fit), focal_profile.profile(fit), principal_point.freed(fit)
+def measure_errors(fit: refit.BundleFit, registration: Registration) -> AllErrors:
+    """Measures the errors of the cameras of `registration`; `fit` has a part of its points."""
+    regions, profile, freed = (
+        jackknife.estimate_spread(fit),
+        focal_profile.profile_focal(fit),
+        principal_point.free_principal_points(fit),
+    )
     turned, shifted = (profile.rotation_deg, profile.centre)
     if freed is not None:
         turned, shifted = np.maximum(turned, freed.rotation_deg), np.maximum(shifted, freed.centre)
-    unit = travel(registration)
+    unit = compute_travel(registration)
     cameras = {
         camera.index: PoseErrors(
             rotation=Errors(camera.rotation_sigma_deg, regions.rotation_deg[i], float(turned[i])),
@@ -72,33 +76,33 @@ def measure(fit: refit.Fit, registration: Registration) -> AllErrors:
     return AllErrors(cameras, focals)
 
 
-def travel(registration: Registration) -> float:
+def compute_travel(registration: Registration) -> float:
     """RMS distance of the centres from their mean; the distance to the scene is 1."""
     centres = np.stack([camera.T_world_camera[:3, 3] for camera in registration.cameras])
-    return spread(centres)
+    return compute_rms_radius(centres)
 
 
-def continued(registration: Registration, known: Mapping[int, PoseErrors]) -> dict[int, PoseErrors]:
-    """Of the cameras of a continuation, quickly, by their keyframes' positions; `known` are those of some of them.
+def extrapolate_pose_errors(registration: Registration, known: Mapping[int, PoseErrors]) -> dict[int, PoseErrors]:
+    """Extrapolates the errors of a continuation's cameras, by keyframe, from the `known` ones of some.
 
     A continuation aligns no patches, so that its sigmas are too large: they shrink as much as those of the known
     cameras do. What is known of a camera besides stays. A further camera is taken for the worst of the known ones, and
     as much worse as its sigma is larger.
     """
-    unit = travel(registration)
+    unit = compute_travel(registration)
     rotations = {camera.index: camera.rotation_sigma_deg for camera in registration.cameras}
     centres = {camera.index: unit * camera.centre_sigma_rel for camera in registration.cameras}
-    of_rotations = _continued(rotations, {index: of.rotation for index, of in known.items()})
-    of_centres = _continued(centres, {index: of.centre for index, of in known.items()})
+    of_rotations = _extrapolate_errors(rotations, {index: of.rotation for index, of in known.items()})
+    of_centres = _extrapolate_errors(centres, {index: of.centre for index, of in known.items()})
     return {index: PoseErrors(of_rotations[index], of_centres[index]) for index in rotations}
 
 
-def continued_focals(registration: Registration, known: Mapping[int, Errors]) -> dict[int, Errors]:
-    """Of the focal lengths of a continuation, of which `known` are those of some cameras: the larger sigma counts.
+def extrapolate_focal_errors(registration: Registration, known: Mapping[int, Errors]) -> dict[int, Errors]:
+    """Extrapolates the focal errors of a continuation from the `known` ones; the larger sigma counts.
 
     A further camera has what is known of the least certain focal length.
     """
-    least_certain = worst(known.values())
+    least_certain = combine_worst(known.values())
     found = {}
     for camera in registration.cameras:
         was = known.get(camera.index, least_certain)
@@ -106,7 +110,7 @@ def continued_focals(registration: Registration, known: Mapping[int, Errors]) ->
     return found
 
 
-def _continued(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:
+def _extrapolate_errors(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:
     ratios = [of.sigma / max(sigmas[index], MIN_SIGMA) for index, of in known.items()]
     sharper = float(np.clip(np.median(ratios), LEAST_SHARPER, 1.0))
     largest = Errors(*(max(getattr(of, part) for of in known.values()) for part in ("sigma", "regions", "profile")))

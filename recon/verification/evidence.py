@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from splatnode.recon.verification.cycles import Cycles
+from splatnode.recon.verification.cycles import CycleConsistency
 from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.lens import Distortion, FreedLens
 from splatnode.recon.verification.reflection import Reflection
@@ -13,7 +13,7 @@ from splatnode.recon.verification.weakest_link import WeakestLink
 
 @dataclass(frozen=True)
 class CameraEvidence:
-    """What speaks for the pose of one camera."""
+    """The evidence for the pose of one camera."""
 
     name: str
     inlier_ratio: float  # of its matches, in all verified pairs: those that the poses explain
@@ -30,7 +30,7 @@ class CameraEvidence:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of a registration with at least three cameras."""
+    """The evidence for or against a registration."""
 
     cameras: tuple[CameraEvidence, ...]
     inlier_ratio: float  # of all matches of verified pairs: those that the poses explain
@@ -39,7 +39,7 @@ class Evidence:
     reflection: Reflection  # the frames that stand out most as mirror images
     flatness: float  # share of the points on one plane
     mirrored_cost: float  # of the mirrored answer over that of this one
-    cycles: Cycles
+    cycles: CycleConsistency
     median_angle_deg: float
     rms_px: float
     focal: Errors  # of the logarithm of the least certain focal length

@@ -13,7 +13,7 @@ DARK, BRIGHT = 12.0, 243.0  # grey levels of 255; what is near black or white sa
 ROUNDS = 3  # each compares a frame with the mean of the others as it is known so far
 
 
-def gains(
+def estimate_gains(
     greys: Mapping[int, npt.NDArray[np.float32]], registration: Registration, scales: Mapping[int, tuple[float, float]]
 ) -> dict[int, float]:
     """Each frame's gain: its points' grey levels over those of the same points in the other frames, 1 on average.

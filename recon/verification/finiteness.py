@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass
 import numpy as np
 
 
-def not_finite(record: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+def find_non_finite(record: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     """The path of every number in `record` that is NaN or infinite: field names, positions and keys, outermost first.
 
     Walks dataclasses, mappings, tuples, lists and numeric arrays; an array counts as one number. A field that is added
@@ -25,4 +25,4 @@ def not_finite(record: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str
             yield path
         return
     for name, value in parts:
-        yield from not_finite(value, (*path, name))
+        yield from find_non_finite(value, (*path, name))

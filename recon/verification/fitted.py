@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from splatnode.recon.verification.claims import BoundModel, ClaimModel
+from splatnode.recon.verification.claims import BoundModel, ErrorModel
 from splatnode.recon.verification.likelihood import OddsModel, Term
-from splatnode.recon.verification.models import Fitted, Numbers
+from splatnode.recon.verification.models import VerdictModel, VerdictModels
 
-FITTED = Fitted(
-    many=Numbers(
-        claims=ClaimModel(
+FITTED = VerdictModels(
+    many=VerdictModel(
+        claims=ErrorModel(
             rotation=BoundModel(
                 factor=1.34,
                 floor=0.1,
@@ -60,8 +60,8 @@ FITTED = Fitted(
             },
         ),
     ),
-    pair=Numbers(
-        claims=ClaimModel(
+    pair=VerdictModel(
+        claims=ErrorModel(
             rotation=BoundModel(
                 factor=2.54,
                 floor=0.1,

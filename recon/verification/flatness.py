@@ -13,7 +13,7 @@ _PLANES = 300  # tried, each through three of them
 _SLIVER = 1e-4  # twice the area of a triangle that defines no plane
 
 
-def share_on_plane(points: Array, seed: int = 0) -> float:
+def compute_share_on_plane(points: Array, seed: int = 0) -> float:
     """The largest share of `points` (P, 3), whose median depth is 1, that lies on one plane (RANSAC); 0 without any.
 
     NaN where a point is not finite."""

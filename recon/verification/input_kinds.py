@@ -90,20 +90,22 @@ def measure_stereo(keyframe: Keyframe, layout: StereoLayout) -> tuple[int, float
     size = np.array([keyframe.frame.width, keyframe.frame.height], float)
     half = size.copy()
     half[layout.axis] /= 2
-    plain = keyframe.features.of_tilt(PLAIN)
+    plain = keyframe.features.select_tilt(PLAIN)
     points = plain.points[plain.point_of]
     second = points[:, layout.axis] >= half[layout.axis]
     (firsts,), (seconds,) = np.nonzero(~second), np.nonzero(second)
     firsts, seconds = firsts[:STEREO_FEATURES], seconds[:STEREO_FEATURES]
-    found = nearest_neighbours.match(plain.descriptors[firsts], plain.descriptors[seconds], nearest_neighbours.Config())
+    found = nearest_neighbours.match(
+        plain.descriptors[firsts], plain.descriptors[seconds], nearest_neighbours.NearestNeighbourConfig()
+    )
     if not len(found):
         return 0, 0.0, 0.0
     first, other = points[firsts[found[:, 0]]], points[seconds[found[:, 1]]]
     other = other - half * (np.arange(2) == layout.axis)
     apart = np.abs(other - first) / half
     agree = (apart[:, 0] < MAX_DISPARITY) & (apart[:, 1] < MAX_VERTICAL)
-    cells = _cells(first[agree], half, (STEREO_CELLS, STEREO_CELLS))
-    filled = _cells(points[firsts], half, (STEREO_CELLS, STEREO_CELLS))
+    cells = _mark_occupied_cells(first[agree], half, (STEREO_CELLS, STEREO_CELLS))
+    filled = _mark_occupied_cells(points[firsts], half, (STEREO_CELLS, STEREO_CELLS))
     return int(agree.sum()), float(agree.mean()), float(cells.sum() / max(1, filled.sum()))
 
 
@@ -124,7 +126,7 @@ def measure_seam(image: npt.NDArray[np.uint8]) -> float | None:
 
 @dataclass(frozen=True)
 class StaticPair:
-    """What stands still in two photographs."""
+    """The matches that stand still in two images."""
 
     matches: int  # that stand still
     ratio: float  # of all matches
@@ -139,13 +141,13 @@ class StaticPair:
 
 
 def measure_static(graph: ViewGraph, pair: Pair) -> StaticPair:
-    """Of a key of `graph.plain`."""
+    """Measures the matches that stand still in a pair, a key of `graph.plain`."""
     first, second = (graph.keyframes[index] for index in pair)
     matches, side = graph.plain[pair].matches, longer_side(second.frame)
     size = np.array([first.frame.width, first.frame.height], float)
     points1, points2 = first.features.points[matches[:, 0]], second.features.points[matches[:, 1]]
     still = two_view.motion_px(points1, points2, side) < STATIC_PX
-    cells = _cells(points1[still], size, STATIC_GRID)
+    cells = _mark_occupied_cells(points1[still], size, STATIC_GRID)
     across, down = (count // 4 for count in STATIC_GRID)
     middle = cells[across:-across], cells[:, down:-down]
     strips = middle[0][:, :down], middle[0][:, -down:], middle[1][:across], middle[1][-across:]
@@ -208,7 +210,7 @@ def explain_refusal(verdict: Verdict, graph: ViewGraph) -> Verdict:
     return refuse(TURNTABLE, graph.names, static=static, of=len(pairs))
 
 
-def _cells(points: Array, size: Array, shape: tuple[int, int]) -> Mask:
+def _mark_occupied_cells(points: Array, size: Array, shape: tuple[int, int]) -> Mask:
     """(shape) the cells of an image of this (width, height) in which points (M, 2) lie."""
     cells = np.zeros(shape, bool)
     columns, rows = np.clip((points / size * shape).astype(int), 0, np.array(shape) - 1).T

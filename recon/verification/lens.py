@@ -30,31 +30,31 @@ class FreedLens:
 
 @dataclass(frozen=True)
 class Distortion:
-    """What the observations ask for when the first radial coefficient of all lenses is free, too."""
+    """The distortion that the observations ask for when all first radial coefficients are free, too."""
 
     corner_shift: float  # by which a corner of the picture moves further, relative to its distance from the middle
     cost_ratio: float  # robust cost with it free over that with it as registered
 
 
-def distortion(fit: refit.Fit) -> Distortion:
-    held = refit.adjusted(fit)
+def measure_distortion(fit: refit.BundleFit) -> Distortion:
+    held = refit.adjust(fit)
     num_lenses = len(held.prior.sigmas)
     first = np.tile([FREE_RADIAL, 0.0], (num_lenses, 1))
-    free = refit.adjusted(replace(held, prior=replace(held.prior, radial_sigmas=first)))
+    free = refit.adjust(replace(held, prior=replace(held.prior, radial_sigmas=first)))
     corner = CORNER * REFERENCE_SIDE * held.scale
     further = (free.problem.radials - held.problem.radials)[:, 0] * (corner / np.exp(free.problem.log_focals)) ** 2
     return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, refit.MIN_COST)))
 
 
-def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
+def free_lenses(fit: refit.BundleFit) -> tuple[FreedLens, ...]:
     """All lenses that came with the frames, set free together. Empty where none did."""
     told = np.isfinite(fit.told)
     if not told.any():
         return ()
-    held = refit.adjusted(replace(fit, prior=replace(fit.prior, sigmas=np.where(told, 0.0, fit.prior.sigmas))))
+    held = refit.adjust(replace(fit, prior=replace(fit.prior, sigmas=np.where(told, 0.0, fit.prior.sigmas))))
     prior = replace(held.prior, sigmas=np.where(told, refit.FREE_SIGMA, held.prior.sigmas))
     starts = [held.problem.log_focals + np.where(told, step, 0.0) for step in STEPS]
-    tried = [refit.adjusted(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
+    tried = [refit.adjust(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
     free = tried[int(np.argmin([candidate.cost for candidate in tried]))]  # the first NaN, where there is one
     ratio = float(free.cost / max(held.cost, refit.MIN_COST))
     focals = (fit.told, np.exp(held.problem.log_focals), np.exp(free.problem.log_focals))
@@ -64,7 +64,7 @@ def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
     )
 
 
-def voted_focal(keyframes: Sequence[Keyframe], pairs: Sequence[TwoView]) -> float | None:
+def vote_focal(keyframes: Sequence[Keyframe], pairs: Sequence[TwoView]) -> float | None:
     """The focal length in pixels that the pairs vote for where all frames have the same size, else None."""
     sides = {longer_side(keyframe.frame) for keyframe in keyframes}
     if len(sides) != 1 or not pairs:

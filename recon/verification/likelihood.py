@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from splatnode.recon.verification.claims import ClaimModel, claims, travel_percent
+from splatnode.recon.verification.claims import ErrorModel, compute_travel_percent, predict_bounds
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 
 # A camera whose matches lie on one plane that fills little of its picture may see a poster, a screen or a thing that
@@ -33,7 +33,7 @@ class Term:
     typical: float
     slope: float
 
-    def of(self, measure: float) -> float:
+    def evaluate(self, measure: float) -> float:
         return self.slope * (measure - self.typical)
 
 
@@ -55,62 +55,62 @@ class Odds:
         return self.prior + sum(self.terms.values())
 
     @property
-    def against(self) -> str:
+    def strongest_rejection(self) -> str:
         """The term that speaks most against the poses."""
         return min(self.terms, key=lambda name: self.terms[name])
 
 
-def measures(evidence: Evidence, model: ClaimModel) -> dict[str, float]:
-    """What the terms rest on; NaN for what rests on a number that is not finite."""
-    bounds, cameras = claims(evidence, model), evidence.cameras
+def compute_measures(evidence: Evidence, model: ErrorModel) -> dict[str, float]:
+    """Computes the measures that the terms rest on; NaN where a number behind one is not finite."""
+    bounds, cameras = predict_bounds(evidence, model), evidence.cameras
     link = evidence.weakest_link
     return {
-        "inlier_ratio": _clipped(evidence.inlier_ratio, 0.0, 0.95),
-        "camera_inlier_ratio": _clipped(min(camera.inlier_ratio for camera in cameras), 0.0, 0.95),
-        "link_inlier_ratio": _clipped(link.inlier_ratio, 0.0, 1.0),
-        "coverage": _log_clipped(min(camera.coverage for camera in cameras), 0.05, 0.5),
-        "flat_patch": max(_flat_patch(camera) for camera in cameras),
-        "mirrored_cost": _log_clipped(evidence.mirrored_cost, 0.8, 10.0),
-        "reflection": _clipped(evidence.reflection.gain, 0.1, 1.0),
-        "directions": _log_clipped(evidence.cycles.direction_sigmas, 1.0, 30.0),
+        "inlier_ratio": _clip(evidence.inlier_ratio, 0.0, 0.95),
+        "camera_inlier_ratio": _clip(min(camera.inlier_ratio for camera in cameras), 0.0, 0.95),
+        "link_inlier_ratio": _clip(link.inlier_ratio, 0.0, 1.0),
+        "coverage": _clip_log(min(camera.coverage for camera in cameras), 0.05, 0.5),
+        "flat_patch": max(_measure_flat_patch(camera) for camera in cameras),
+        "mirrored_cost": _clip_log(evidence.mirrored_cost, 0.8, 10.0),
+        "reflection": _clip(evidence.reflection.gain, 0.1, 1.0),
+        "directions": _clip_log(evidence.cycles.direction_sigmas, 1.0, 30.0),
         "own_lens": float(any(camera.own_lens for camera in cameras)),
-        "rotation_bound": _log_clipped(max(each.rotation_deg for each in bounds.values()), 0.3, 30.0),
-        "travel_bound": _log_clipped(travel_percent(bounds, evidence), 0.5, 100.0),
+        "rotation_bound": _clip_log(max(each.rotation_deg for each in bounds.values()), 0.3, 30.0),
+        "travel_bound": _clip_log(compute_travel_percent(bounds, evidence), 0.5, 100.0),
     }
 
 
-def weigh(evidence: Evidence, claim_model: ClaimModel, model: OddsModel) -> Odds:
+def compute_log_odds(evidence: Evidence, claim_model: ErrorModel, model: OddsModel) -> Odds:
     """NaN for every term that rests on a number that is not finite."""
     with np.errstate(divide="ignore", invalid="ignore"):  # what comes of it is told as NaN
-        found = measures(evidence, claim_model)
-    return Odds(model.prior, {name: term.of(found[name]) for name, term in model.terms.items()})
+        found = compute_measures(evidence, claim_model)
+    return Odds(model.prior, {name: term.evaluate(found[name]) for name, term in model.terms.items()})
 
 
-def record(evidence: Evidence, odds: Odds) -> dict[str, object]:
+def make_evidence_record(evidence: Evidence, odds: Odds) -> dict[str, object]:
     """The evidence and what it amounts to, for report.json: None stands for a number that could not be computed."""
     log_odds = {"total": odds.total, "terms": dict(odds.terms)}
-    return {name: _with_none(value) for name, value in {**asdict(evidence), "log_odds": log_odds}.items()}
+    return {name: _replace_non_finite(value) for name, value in {**asdict(evidence), "log_odds": log_odds}.items()}
 
 
-def _flat_patch(camera: CameraEvidence) -> float:
+def _measure_flat_patch(camera: CameraEvidence) -> float:
     """0 where a camera's points fill much of its picture, or do not lie on a plane; else how small the plane is."""
-    flat = _clipped((camera.flat_share - FLAT_FROM) / (FLAT_FULLY - FLAT_FROM), 0.0, 1.0)
-    return flat * max(0.0, _log_clipped(SMALL / max(camera.coverage, MIN_SHARE), MIN_SHARE, 1.0 / MIN_SHARE))
+    flat = _clip((camera.flat_share - FLAT_FROM) / (FLAT_FULLY - FLAT_FROM), 0.0, 1.0)
+    return flat * max(0.0, _clip_log(SMALL / max(camera.coverage, MIN_SHARE), MIN_SHARE, 1.0 / MIN_SHARE))
 
 
-def _with_none(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     """The value of dictionaries, lists and tuples with None for every number that is not finite."""
     if isinstance(value, dict):
-        return {key: _with_none(each) for key, each in value.items()}
+        return {key: _replace_non_finite(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return type(value)(_with_none(each) for each in value)
+        return type(value)(_replace_non_finite(each) for each in value)
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _log_clipped(value: float, least: float, most: float) -> float:
-    return math.log(clipped) if math.isfinite(clipped := _clipped(value, least, most)) else math.nan
+def _clip_log(value: float, least: float, most: float) -> float:
+    return math.log(clipped) if math.isfinite(clipped := _clip(value, least, most)) else math.nan
 
 
-def _clipped(value: float, least: float, most: float) -> float:
+def _clip(value: float, least: float, most: float) -> float:
     """NaN where the value is not finite: clipping must not hide that something could not be computed."""
     return float(np.clip(value, least, most)) if math.isfinite(value) else math.nan

@@ -5,24 +5,24 @@ from __future__ import annotations
 from splatnode.capture import quality
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification import refusals
-from splatnode.recon.verification.causes import why_wide
-from splatnode.recon.verification.checks import Case
-from splatnode.recon.verification.likelihood import weigh
+from splatnode.recon.verification.causes import explain_wide_bounds
+from splatnode.recon.verification.checks import VerificationCase
+from splatnode.recon.verification.likelihood import compute_log_odds
 from splatnode.recon.verification.refusals import refuse
 
 
-def odds(case: Case) -> Verdict | None:
+def check_odds(case: VerificationCase) -> Verdict | None:
     """The evidence speaks against the poses."""
-    found = weigh(case.evidence, case.numbers.claims, case.numbers.odds)
+    found = compute_log_odds(case.evidence, case.numbers.claims, case.numbers.odds)
     if found.total >= case.config.min_log_odds:
         return None
-    return _wrong_frames(case) or _wrong_poses(case, found.against)
+    return _refuse_wrong_frames(case) or _refuse_wrong_poses(case, found.strongest_rejection)
 
 
-def _wrong_frames(case: Case) -> Verdict | None:
-    """What about the photographs explains that their poses are unlikely, or None."""
+def _refuse_wrong_frames(case: VerificationCase) -> Verdict | None:
+    """Refuses the images that explain why their poses are unlikely; None where none do."""
     names, limit = case.names, case.config.blurred_px
-    foreign = _through_other_lenses(case)
+    foreign = _find_other_lens_frames(case)
     if foreign:
         return refuse(refusals.MIXED_CAMERAS, foreign, others=len(foreign), count=len(names))
     widths = {
@@ -36,8 +36,8 @@ def _wrong_frames(case: Case) -> Verdict | None:
     return None
 
 
-def _wrong_poses(case: Case, against: str) -> Verdict:
-    """What speaks most against the poses."""
+def _refuse_wrong_poses(case: VerificationCase, against: str) -> Verdict:
+    """Refuses for the reason that speaks most against the poses."""
     cameras = case.evidence.cameras
     if against == "mirrored_cost":
         return refuse(refusals.MIRRORED_IN_DEPTH, case.names)
@@ -53,11 +53,11 @@ def _wrong_poses(case: Case, against: str) -> Verdict:
         percent = 100 * smallest.coverage
         return refuse(refusals.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
     if against in ("rotation_bound", "travel_bound"):
-        return why_wide(case)
-    return _contradictions(case, against)
+        return explain_wide_bounds(case)
+    return _refuse_contradictions(case, against)
 
 
-def _contradictions(case: Case, against: str) -> Verdict:
+def _refuse_contradictions(case: VerificationCase, against: str) -> Verdict:
     """Photographs, pairs of them, or two parts do not fit together. It is about the photograph that fits least."""
     weakest = min(case.evidence.cameras, key=lambda camera: camera.inlier_ratio)
     if against == "directions":
@@ -71,7 +71,7 @@ def _contradictions(case: Case, against: str) -> Verdict:
     return refuse(refusals.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 
-def _through_other_lenses(case: Case) -> list[str]:
+def _find_other_lens_frames(case: VerificationCase) -> list[str]:
     """Frames whose size says that another lens took them than most; none where the camera was calibrated."""
     keyframes = [case.graph.keyframes[camera.index] for camera in case.registration.cameras]
     sizes = [tuple(sorted((keyframe.frame.width, keyframe.frame.height))) for keyframe in keyframes]

@@ -9,42 +9,42 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.known_poses import Deviation, GivenWorld
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.result.bounds import Bounds, axes_of, length_95, widest
-from splatnode.recon.result.bounds_in_words import rounded_up
+from splatnode.recon.result.bounds import Bounds, compute_axes, compute_length_95, find_widest
+from splatnode.recon.result.bounds_in_words import format_rounded_up
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification import refusals
-from splatnode.recon.verification.config import Config
+from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.refusals import refuse
 
 _TWO_SIDED_95 = 1.96
 _MOST_NAMED = 5  # poses whose residuals a sentence tells
 
 
-def posed_bounds(graph: ViewGraph, registration: Registration, given: GivenWorld) -> dict[str, Bounds]:
+def compute_posed_bounds(graph: ViewGraph, registration: Registration, given: GivenWorld) -> dict[str, Bounds]:
     """The 95 % bounds of each camera in the given world, by its name: of its given pose and the images together."""
     found = {}
     for position, camera in enumerate(registration.cameras):
         of_centre = given.centre_covariances[position]
-        centre = length_95(of_centre)
+        centre = compute_length_95(of_centre)
         focal = _TWO_SIDED_95 * camera.focal_sigma if np.isfinite(camera.focal_sigma) else 0.0
         found[graph.names[camera.index]] = Bounds(
-            rotation_deg=float(np.degrees(length_95(given.turn_covariances[position]))),
+            rotation_deg=float(np.degrees(compute_length_95(given.turn_covariances[position]))),
             centre=centre,
             centre_percent=100.0 * centre,
             focal_percent=100.0 * float(np.expm1(focal)),
-            axes=axes_of(of_centre, centre),
+            axes=compute_axes(of_centre, centre),
         )
     return found
 
 
-def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld, config: Config) -> Verdict:
+def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld, config: DecisionConfig) -> Verdict:
     """OK, or another code that is publishable; TOO_ROUGH where more was required than poses and images tell."""
-    bounds = posed_bounds(graph, registration, given)
-    worst = widest(bounds.values())
+    bounds = compute_posed_bounds(graph, registration, given)
+    worst = find_widest(bounds.values())
     if worst is None:
         raise ValueError("there must be a camera to be judged")
     if config.require_percent is not None and worst.centre_percent > config.require_percent:
@@ -56,13 +56,13 @@ def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld
     code, message = (Code.OK_PARTIAL if left_out else Code.OK), f"{count}, {len(given.held)} of them by given poses."
     if rough := _rough(registration, worst, config):
         code, message = Code.OK_ROUGH, f"{message[:-1]}, roughly: {rough}."
-    advice = f"Give a pose of {printable(left_out[0])}, or add a photograph beside it." if left_out else ""
+    advice = f"Give a pose of {sanitize_text(left_out[0])}, or add a photograph beside it." if left_out else ""
     verdict = Verdict(code, message, advice, left_out, publishable=True)
     return _naming(verdict, graph, given, placed)
 
 
-def _rough(registration: Registration, worst: Bounds, config: Config) -> str:
-    """What is known less well than an exact scene knows it; empty where nothing is."""
+def _rough(registration: Registration, worst: Bounds, config: DecisionConfig) -> str:
+    """Says what is known less well than an exact scene knows it; empty where nothing is."""
     # What the given world leaves open for all cameras alike bends no scene.
     shape = _TWO_SIDED_95 * max(camera.centre_sigma_rel for camera in registration.cameras)
     travel_percent = 100.0 * float(np.nan_to_num(shape, nan=np.inf))
@@ -75,11 +75,11 @@ def _rough(registration: Registration, worst: Bounds, config: Config) -> str:
 
 
 def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[int]) -> Verdict:
-    """With the poses that the images contradict, and what all given poses have wrong in common."""
+    """Adds the poses that the images contradict, and what all given poses have wrong in common."""
     sentences, advice = [verdict.message], [verdict.advice]
     if given.offset is not None:
         off = f"{given.offset.degrees:.2g} degrees and {given.offset.metres:.2g} m"
-        known = f"{_known(float(np.degrees(given.offset.turn_sigma)))} degrees and {_known(given.offset.shift_sigma)} m"
+        known = f"{_format_sigma(float(np.degrees(given.offset.turn_sigma)))} degrees and {_format_sigma(given.offset.shift_sigma)} m"
         sentences.append(
             f"All given poses are off alike, by {off} in the camera's frame (known to {known}), which was taken out."
         )
@@ -94,11 +94,11 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
     return replace(verdict, message=" ".join(sentences), advice=" ".join(filter(None, advice)), frames=frames)
 
 
-def _known(sigma: float) -> str:
-    return rounded_up(_TWO_SIDED_95 * sigma)
+def _format_sigma(sigma: float) -> str:
+    return format_rounded_up(_TWO_SIDED_95 * sigma)
 
 
 def _residual(graph: ViewGraph, deviation: Deviation, placed: set[int]) -> str:
     done = "placed by the photographs alone" if deviation.index in placed else "left out"
-    name = printable(graph.names[deviation.index])
+    name = sanitize_text(graph.names[deviation.index])
     return f"that of {name} is {deviation.metres:.2g} m and {deviation.degrees:.2g} degrees off ({done})"

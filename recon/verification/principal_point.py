@@ -15,10 +15,12 @@ from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.registration import lenses
 from splatnode.recon.verification import refit
 
-FREE_SHIFT = lenses.Config().free_shift_sigma  # of the longer side, as where frames of several sizes are told apart
+FREE_SHIFT = (
+    lenses.LensGroupingConfig().free_shift_sigma
+)  # of the longer side, as where frames of several sizes are told apart
 
 
-def freed(fit: refit.Fit) -> refit.Moved | None:
+def free_principal_points(fit: refit.BundleFit) -> refit.CameraShifts | None:
     """How far the cameras move when the lenses of fewer cameras than the commonest one are set free.
 
     None where all pictures came through one lens, or every other one came calibrated. Lenses of single images that
@@ -29,6 +31,8 @@ def freed(fit: refit.Fit) -> refit.Moved | None:
     free = (fit.prior.sigmas > 0) & ~fit.own & (np.arange(count) != seen_through.argmax())
     if not free.any():
         return None
-    whole = refit.adjusted(fit)
+    whole = refit.adjust(fit)
     sigmas = np.where(free, FREE_SHIFT * REFERENCE_SIDE * max(fit.scale, 1.0), whole.prior.shift_sigmas)
-    return refit.moved(whole, refit.adjusted(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas))))
+    return refit.compute_camera_shifts(
+        whole, refit.adjust(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas)))
+    )

@@ -10,16 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
-from splatnode.recon.geometry import align_cameras, angles_deg, spread, umeyama
+from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, umeyama
 from splatnode.recon.registration import bundle, finishing, lenses, own_lenses, tracks
 from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-NOMINAL_SIGMA = lenses.Config().exif_sigma
+NOMINAL_SIGMA = lenses.LensGroupingConfig().exif_sigma
 FREE_SIGMA = 0.3  # of log focal where nothing is known: one sigma is a factor of 1.35
-FREE_SHIFT = lenses.Config().free_shift_sigma  # of the longer side, of a principal point that was displaced
+FREE_SHIFT = lenses.LensGroupingConfig().free_shift_sigma  # of the longer side, of a principal point that was displaced
 FREE_ASPECT = 0.1  # of log aspect, where pixels are not square
 SQUARE = 1e-3  # difference of an aspect from 1 from which on they are not
 ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
@@ -30,12 +30,12 @@ MIN_SPREAD = 1e-12  # of centres, as MIN_COST: all in one place
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BundleFit:
     """A bundle that holds C registered cameras, numbered in their order, with what is known of their lenses."""
 
     problem: bundle.Problem
     prior: bundle.LensPrior
-    loss: bundle.Config
+    loss: bundle.BundleAdjustmentConfig
     scale: float  # longer side of the largest frame, whose pixels these are, over REFERENCE_SIDE
     told: Array  # (G,) focal length that came with the frames; NaN where none did
     nominal_sigmas: Array  # (G,) of its logarithm where it is nominal, as EXIF's is; infinite for any other lens
@@ -48,7 +48,7 @@ class Fit:
         return Ts_world_camera(self.problem)
 
     @cached_property
-    def minimum(self) -> Fit:
+    def minimum(self) -> BundleFit:
         """This fit adjusted: found once, for several sources of evidence begin there."""
         return replace(self, problem=bundle.adjust(self.problem, self.prior, self.loss))
 
@@ -64,7 +64,7 @@ class Fit:
         return bundle.robust_cost(self.problem, self.loss) / max(1, len(self.problem.pixels))
 
 
-def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> Fit:
+def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> BundleFit:
     """The registration as a bundle of at most about `tracks_per_camera` tracks a camera, the longest first.
 
     A given focal length is kept, others are almost free. Pixels are those of frames enlarged to the largest of all.
@@ -119,30 +119,32 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         radial_sigmas=np.zeros((count, 2)),
         shift_sigmas=shift_sigmas,
         aspect_sigmas=aspect_sigmas,
-        ties=_ties(numbers, near),
+        ties=_tie_near_lenses(numbers, near),
     )
     errors = bundle.reprojection_errors(problem)
     median = float(np.median(errors))
     robust_px = float(np.clip(ROBUST_FACTOR * median, *(np.array(ROBUST_PX) * scale)))
     noise = bundle.noise_px(len(problem.pixels), len(problem.points), median / scale)
-    loss = bundle.Config(robust_px=robust_px, noise_px=scale * noise * float(np.sqrt(finishing.Config().correlated)))
-    return Fit(problem, prior, loss, scale, told, nominal, own, units)
+    loss = bundle.BundleAdjustmentConfig(
+        robust_px=robust_px, noise_px=scale * noise * float(np.sqrt(finishing.FinalAdjustmentConfig().correlated))
+    )
+    return BundleFit(problem, prior, loss, scale, told, nominal, own, units)
 
 
-def _ties(numbers: Index, near: Index) -> bundle.Ties | None:
-    """What holds the focal lengths of lenses together that are near one lens: to that one, or to the first of them."""
+def _tie_near_lenses(numbers: Index, near: Index) -> bundle.LensTies | None:
+    """Ties the focal lengths of lenses that are near one lens to that one, or to the first of them."""
     to, sigmas = np.full(len(numbers), -1), np.zeros((len(numbers), 6))
     for common in np.unique(near[near >= 0]):
         (members,) = np.nonzero(near == common)
         (itself,) = np.nonzero(numbers == common)
         first = itself[0] if len(itself) else members[0]
         others = members[members != first]
-        to[others], sigmas[others, 0] = first, own_lenses.Config().focal_sigma
-    return bundle.Ties(to, sigmas) if (to >= 0).any() else None
+        to[others], sigmas[others, 0] = first, own_lenses.OwnLensesConfig().focal_sigma
+    return bundle.LensTies(to, sigmas) if (to >= 0).any() else None
 
 
-def nominal_cost(of: Fit) -> float:
-    """What nominal focal lengths say against those of the fit: squares of standard errors.
+def compute_nominal_cost(of: BundleFit) -> float:
+    """Returns how far nominal focal lengths are from those of the fit: squares of standard errors.
 
     All EXIF data of a camera err together: each lens counts as a share of one observation.
     """
@@ -153,17 +155,17 @@ def nominal_cost(of: Fit) -> float:
     return float(np.mean(off[known] ** 2))
 
 
-def adjusted(start: Fit) -> Fit:
+def adjust(start: BundleFit) -> BundleFit:
     return start.minimum
 
 
-def noise_px(of: Fit) -> float:
+def estimate_noise_px(of: BundleFit) -> float:
     """The standard deviation of one component of an observation's error, pixels of the largest frame; never 0."""
     median = float(np.median(bundle.reprojection_errors(of.problem))) / of.scale
     return of.scale * bundle.noise_px(len(of.problem.pixels), len(of.problem.points), median)
 
 
-def without_points(start: Fit, left_out: npt.NDArray[np.bool_]) -> Fit:
+def remove_points(start: BundleFit, left_out: npt.NDArray[np.bool_]) -> BundleFit:
     """The same with the points `left_out` (P,) taken away."""
     problem = start.problem
     (kept,) = np.nonzero(~left_out)
@@ -187,7 +189,7 @@ def Ts_world_camera(problem: bundle.Problem) -> Array:
 
 
 @dataclass(frozen=True)
-class Shift:
+class FitShift:
     """How far cameras have moved from one fit to another."""
 
     rotation_deg: float  # the largest change of a relative rotation
@@ -196,7 +198,7 @@ class Shift:
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
+class CameraShifts:
     """How far each camera has moved from one fit to another."""
 
     rotation_deg: Array  # (C,) after the best common rotation
@@ -204,27 +206,27 @@ class Moved:
     focals_rel: Array  # (G,) change of the logarithm of each lens' focal length, without its sign
 
 
-def moved(before: Fit, after: Fit) -> Moved:
+def compute_camera_shifts(before: BundleFit, after: BundleFit) -> CameraShifts:
     """Farther than any limit, and finite, where one of the two has come to nothing."""
     Ts_before, Ts_after = before.Ts_world_camera, after.Ts_world_camera
     count = len(Ts_before)
     if not (np.isfinite(Ts_before).all() and np.isfinite(Ts_after).all()):
         lost = np.full(len(before.problem.log_focals), LOST.focal_rel)
-        return Moved(np.full(count, LOST.rotation_deg), np.full(count, LOST.centre_rel), lost)
+        return CameraShifts(np.full(count, LOST.rotation_deg), np.full(count, LOST.centre_rel), lost)
     common = align_cameras(Ts_after, Ts_before)
     centres, target = Ts_after[:, :3, 3], Ts_before[:, :3, 3]
     onto = umeyama(centres, target) if count >= MIN_FOR_CENTRES else common
-    return Moved(
+    return CameraShifts(
         rotation_deg=angles_deg(common.rotation @ Ts_after[:, :3, :3], Ts_before[:, :3, :3]),
         centre=np.linalg.norm(onto(centres) - target, axis=1),
         focals_rel=np.abs(before.problem.log_focals - after.problem.log_focals),
     )
 
 
-LOST = Shift(rotation_deg=180.0, centre_rel=1e3, focal_rel=10.0)  # farther than any limit, and finite
+LOST = FitShift(rotation_deg=180.0, centre_rel=1e3, focal_rel=10.0)  # farther than any limit, and finite
 
 
-def shift(before: Fit, after: Fit) -> Shift:
+def compute_shift(before: BundleFit, after: BundleFit) -> FitShift:
     """`LOST` where one of them has come to nothing."""
     Ts_before, Ts_after = before.Ts_world_camera, after.Ts_world_camera
     if not (np.isfinite(Ts_before).all() and np.isfinite(Ts_after).all()):
@@ -234,8 +236,10 @@ def shift(before: Fit, after: Fit) -> Shift:
     moved = align_cameras(Ts_after, Ts_before)
     centres = moved(Ts_after[:, :3, 3])
     target = Ts_before[:, :3, 3]
-    return Shift(
+    return FitShift(
         rotation_deg=float(angles_deg(*relative).max()),
-        centre_rel=float(np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(spread(target), MIN_SPREAD)),
+        centre_rel=float(
+            np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(compute_rms_radius(target), MIN_SPREAD)
+        ),
         focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
     )

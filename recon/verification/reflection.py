@@ -16,20 +16,20 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
 from splatnode.recon.matching import nearest_neighbours
-from splatnode.recon.workers import in_turn
+from splatnode.recon.workers import map_parallel_lazily
 
 Array = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
 Flags = npt.NDArray[np.bool_]
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ReflectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_features: int = 1500  # of each frame, the strongest
     by_chance: float = 50.0  # matches of frames that have nothing in common, which say nothing
     partners: int = 4  # known frames with which a further one is compared, those that share most points with it
     # Largest gain of a further frame beside them when mirrored; right ones of ten scenes reach 0.08
     max_further_gain: float = 0.1
-    nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
+    nearest_neighbours: nearest_neighbours.NearestNeighbourConfig = nearest_neighbours.NearestNeighbourConfig()
 
 
 @dataclass(frozen=True)
@@ -40,36 +40,40 @@ class Reflection:
     gain: float  # mean logarithm of the matches of mirrored over plain pairs of one of them and one of the others
 
 
-def measure(keyframes: Sequence[Keyframe], pairs: Collection[tuple[int, int]], config: Config) -> Reflection:
-    """Of two frames or more, by those `pairs` (i < j) of their positions that are compared."""
-    plain = [_strongest(keyframe.features, config.num_features) for keyframe in keyframes]
-    mirrored = [mirrored_descriptors(descriptors) for descriptors in plain]
+def measure_reflection(
+    keyframes: Sequence[Keyframe], pairs: Collection[tuple[int, int]], config: ReflectionConfig
+) -> Reflection:
+    """Measures the reflection of two or more frames over `pairs` (i < j) of their positions."""
+    plain = [_select_descriptors(keyframe.features, config.num_features) for keyframe in keyframes]
+    mirrored = [mirror_descriptors(descriptors) for descriptors in plain]
     gains, compared = np.zeros((len(plain), len(plain))), np.zeros((len(plain), len(plain)))
     ordered = sorted(pairs)
-    of_pairs = in_turn(lambda pair: _gain(plain[pair[0]], mirrored[pair[1]], plain[pair[1]], config), ordered)
+    of_pairs = map_parallel_lazily(
+        lambda pair: _compute_gain(plain[pair[0]], mirrored[pair[1]], plain[pair[1]], config), ordered
+    )
     for (i, j), gain in zip(ordered, of_pairs, strict=True):
         gains[i, j] = gains[j, i] = gain
         compared[i, j] = compared[j, i] = 1.0
-    grown = [_grown(gains, compared, first) for first in range(len(plain))]
+    grown = [_grow_group(gains, compared, first) for first in range(len(plain))]
     group, gain = grown[int(np.argmax([gain for _, gain in grown]))]  # the first NaN, where there is one
     return Reflection(tuple(keyframes[index].name for index in np.flatnonzero(group).tolist()), gain)
 
 
-def measure_further(further: Keyframe, known: Sequence[Keyframe], config: Config) -> Reflection:
-    """Of one frame more, beside frames of which it is known that they show the place the right way round."""
-    descriptors = _strongest(further.features, config.num_features)
-    mirrored = mirrored_descriptors(descriptors)
-    others = (_strongest(keyframe.features, config.num_features) for keyframe in known)
-    gains = [_gain(other, mirrored, descriptors, config) for other in others]
+def measure_further(further: Keyframe, known: Sequence[Keyframe], config: ReflectionConfig) -> Reflection:
+    """Measures the reflection of a further frame beside frames that are the right way round."""
+    descriptors = _select_descriptors(further.features, config.num_features)
+    mirrored = mirror_descriptors(descriptors)
+    others = (_select_descriptors(keyframe.features, config.num_features) for keyframe in known)
+    gains = [_compute_gain(other, mirrored, descriptors, config) for other in others]
     return Reflection((further.name,), float(np.mean(gains)))
 
 
-def strongest(found: Sequence[Reflection]) -> Reflection:
+def select_strongest_reflection(found: Sequence[Reflection]) -> Reflection:
     """The one with the largest gain; the first whose gain is NaN, where there is one."""
     return found[int(np.argmax([each.gain for each in found]))]
 
 
-def _gain(other: Bytes, mirrored: Bytes, plain: Bytes, config: Config) -> float:
+def _compute_gain(other: Bytes, mirrored: Bytes, plain: Bytes, config: ReflectionConfig) -> float:
     """The logarithm of the matches that a frame has with another one when it is mirrored, over those as it is."""
     found, expected = (
         len(nearest_neighbours.match(other, descriptors, config.nearest_neighbours)) + config.by_chance
@@ -78,11 +82,11 @@ def _gain(other: Bytes, mirrored: Bytes, plain: Bytes, config: Config) -> float:
     return float(np.log(found / expected))
 
 
-def _strongest(features: Features, count: int) -> Bytes:
-    return features.of_tilt(PLAIN).descriptors[:count]
+def _select_descriptors(features: Features, count: int) -> Bytes:
+    return features.select_tilt(PLAIN).descriptors[:count]
 
 
-def mirrored_descriptors(descriptors: Bytes) -> Bytes:
+def mirror_descriptors(descriptors: Bytes) -> Bytes:
     """SIFT descriptors (M, 128) as they are in the mirrored image.
 
     They are histograms of 8 directions in 4 x 4 cells, along and across the direction of the keypoint: mirroring
@@ -92,7 +96,7 @@ def mirrored_descriptors(descriptors: Bytes) -> Bytes:
     return np.ascontiguousarray(cells[:, ::-1][..., -np.arange(8) % 8].reshape(-1, 128))
 
 
-def _grown(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
+def _grow_group(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
     """The group with the largest mean gain across its border, grown from one frame by the frame that suits best.
 
     Pairs that are not `compared` (1, else 0) have a gain of 0 and do not count.
@@ -100,12 +104,12 @@ def _grown(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
     group = np.zeros(len(gains), bool)
     group[first] = True
     total, count = gains[first].sum(), compared[first].sum()
-    best = group.copy(), float(_mean(total, count))
+    best = group.copy(), float(_compute_mean(total, count))
     while 2 * (group.sum() + 1) <= len(gains):
         # A frame that joins the group takes its pairs with the group from the border, and adds those with the others.
         totals = total + gains @ ~group - gains @ group
         counts = count + compared @ ~group - compared @ group
-        means = np.where(group, -np.inf, _mean(totals, counts))
+        means = np.where(group, -np.inf, _compute_mean(totals, counts))
         other = int(means.argmax())
         group[other], total, count = True, totals[other], counts[other]
         if means[other] > best[1]:
@@ -113,7 +117,7 @@ def _grown(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
     return best
 
 
-def _mean(total: Array, count: Array) -> Any:
+def _compute_mean(total: Array, count: Array) -> Any:
     """Minus infinity where nothing was compared."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(count > 0, total / count, -np.inf)

@@ -10,7 +10,7 @@ import numpy as np
 from splatnode.recon.geometry import distortion
 from splatnode.recon.registration.register import RegisteredCamera
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.checks import Case
+from splatnode.recon.verification.checks import VerificationCase
 from splatnode.recon.verification.refusals import Refusal, refuse
 
 STRONG = 0.25  # by which a corner moves at most, of its distance from the middle: of 25 % it is 9 pixels of 1024 off
@@ -24,16 +24,16 @@ BENDS_STRONGLY = Refusal(
 )
 
 
-def bends_strongly(case: Case) -> Verdict | None:
+def check_strong_distortion(case: VerificationCase) -> Verdict | None:
     """An estimated lens moves the corners of its pictures too far, or folds them over."""
     for camera in case.registration.cameras:
         frame = case.graph.keyframes[camera.index].frame
-        if not _is_told(camera, frame.width, frame.height):
+        if not _is_well_modelled(camera, frame.width, frame.height):
             return refuse(BENDS_STRONGLY, case.names, moved=100 * STRONG)
     return None
 
 
-def _is_told(camera: RegisteredCamera, width: int, height: int) -> bool:
+def _is_well_modelled(camera: RegisteredCamera, width: int, height: int) -> bool:
     """Whether the lens shows each pixel as far as its farthest corner one ray, and that corner's within STRONG."""
     if not camera.radial.any():
         return True

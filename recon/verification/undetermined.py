@@ -7,8 +7,8 @@ asked about such a number: poses of which something could not be computed are no
 from __future__ import annotations
 
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.checks import Case
-from splatnode.recon.verification.finiteness import not_finite
+from splatnode.recon.verification.checks import VerificationCase
+from splatnode.recon.verification.finiteness import find_non_finite
 from splatnode.recon.verification.refusals import Refusal, refuse
 
 UNDETERMINED = Refusal(
@@ -35,12 +35,12 @@ WORDS = {  # what each field of the evidence says, for the user
 }
 
 
-def undetermined(case: Case) -> Verdict | None:
+def check_finite(case: VerificationCase) -> Verdict | None:
     """A number of the registration or of its evidence is NaN or infinite."""
-    paths = list(not_finite(case.evidence))
+    paths = list(find_non_finite(case.evidence))
     of_cameras = [case.names[int(path[1])] for path in paths if path[0] == "cameras"]
     found = [WORDS[path[0]] for path in paths]
-    if any(not_finite(case.registration)):
+    if any(find_non_finite(case.registration)):
         found.append("the poses themselves")
     if not found:
         return None

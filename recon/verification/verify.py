@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.inliers import pooled_ratio
+from splatnode.recon.registration.inliers import compute_pooled_ratio
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.verification import (
     cycles,
@@ -35,14 +35,17 @@ OUTSIDE = 0.03  # share of a camera's points on each side that the box of its co
 MIN_MATCHES = 60  # of a pair whose homography says something: fewer are explained by chance
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class VerificationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracks_per_camera: int = 300  # tracks of a camera in the bundle that is adjusted again
-    cycles: cycles.Config = cycles.Config()
-    reflection: reflection.Config = reflection.Config()
+    cycles: cycles.CycleConfig = cycles.CycleConfig()
+    reflection: reflection.ReflectionConfig = reflection.ReflectionConfig()
 
 
 def verify(
-    graph: ViewGraph, registration: Registration | None, config: Config, pause: Callable[[], None] = lambda: None
+    graph: ViewGraph,
+    registration: Registration | None,
+    config: VerificationConfig,
+    pause: Callable[[], None] = lambda: None,
 ) -> Evidence | None:
     """Numbers for and against `registration`; None where it has fewer than two cameras.
 
@@ -50,30 +53,32 @@ def verify(
     """
     if registration is None or len(registration.cameras) < 2:
         return None
-    fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
-    sizes = errors.measure(fit, registration)
+    fit = refit.build_fit(graph.keyframes, registration, config.tracks_per_camera)
+    sizes = errors.measure_errors(fit, registration)
     pause()
-    cameras = _of_cameras(graph, registration, sizes.cameras, sizes.focals)
+    cameras = _collect_camera_evidence(graph, registration, sizes.cameras, sizes.focals)
     pause()
     return Evidence(
         cameras=cameras,
-        inlier_ratio=inlier_ratio(graph, registration, None),
-        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs),
-        disconnected=_disconnected(graph, registration),
-        reflection=_reflection(graph, registration, config.reflection),
-        flatness=flatness.share_on_plane(registration.points),
-        mirrored_cost=reversal.mirrored_cost(fit),
-        cycles=cycles.measure(graph.keyframes, registration, graph.pairs, config.cycles),
+        inlier_ratio=compute_inlier_ratio(graph, registration, None),
+        weakest_link=weakest_link.measure_weakest_link(registration, graph.names, graph.pairs),
+        disconnected=_name_disconnected_frames(graph, registration),
+        reflection=_measure_reflection(graph, registration, config.reflection),
+        flatness=flatness.compute_share_on_plane(registration.points),
+        mirrored_cost=reversal.compute_reversal_cost_ratio(fit),
+        cycles=cycles.measure_cycle_consistency(graph.keyframes, registration, graph.pairs, config.cycles),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
         focal=sizes.focal,
-        travel=errors.travel(registration),
-        freed=lens.freed(fit),
-        distortion=lens.distortion(fit),
+        travel=errors.compute_travel(registration),
+        freed=lens.free_lenses(fit),
+        distortion=lens.measure_distortion(fit),
     )
 
 
-def verify_further(graph: ViewGraph, registration: Registration, known: Evidence, config: Config) -> Evidence | None:
+def verify_further(
+    graph: ViewGraph, registration: Registration, known: Evidence, config: VerificationConfig
+) -> Evidence | None:
     """Evidence for `registration`, which continues the one that `known` is about: provisional, and quick.
 
     None where a further photograph may be mirrored: a few partners cannot tell that for certain, all evidence must.
@@ -88,52 +93,52 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
     before = {camera.name: camera for camera in known.cameras}
     names = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
     further = {index for index, name in names.items() if name not in before}
-    reflections = _reflections_of_further(graph, registration, names.keys() - further, further, config.reflection)
+    reflections = _measure_further_reflections(graph, registration, names.keys() - further, further, config.reflection)
     if not all(each.gain <= config.reflection.max_further_gain for each in reflections):
         return None
     known_errors = {index: before[name].errors for index, name in names.items() if name in before}
-    sizes = errors.continued(registration, known_errors)
+    sizes = errors.extrapolate_pose_errors(registration, known_errors)
     known_focals = {index: before[name].focal for index, name in names.items() if name in before}
-    focals = errors.continued_focals(registration, known_focals)
+    focals = errors.extrapolate_focal_errors(registration, known_focals)
     of_further = {index: sizes[index] for index in further}
-    measured = {camera.name: camera for camera in _of_cameras(graph, registration, of_further, focals)}
+    measured = {camera.name: camera for camera in _collect_camera_evidence(graph, registration, of_further, focals)}
     return replace(
         known,
         cameras=tuple(
             replace(
                 measured.get(names[camera.index]) or before[names[camera.index]],
-                inlier_ratio=inlier_ratio(graph, registration, camera.index),
+                inlier_ratio=compute_inlier_ratio(graph, registration, camera.index),
                 errors=sizes[camera.index],
                 focal=focals[camera.index],
             )
             for camera in registration.cameras
         ),
-        inlier_ratio=inlier_ratio(graph, registration, None),
-        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs),
-        disconnected=_disconnected(graph, registration),
-        reflection=reflection.strongest([known.reflection, *reflections]),
-        flatness=flatness.share_on_plane(registration.points),
+        inlier_ratio=compute_inlier_ratio(graph, registration, None),
+        weakest_link=weakest_link.measure_weakest_link(registration, graph.names, graph.pairs),
+        disconnected=_name_disconnected_frames(graph, registration),
+        reflection=reflection.select_strongest_reflection([known.reflection, *reflections]),
+        flatness=flatness.compute_share_on_plane(registration.points),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
-        focal=errors.worst(focals.values()),
-        travel=errors.travel(registration),
+        focal=errors.combine_worst(focals.values()),
+        travel=errors.compute_travel(registration),
     )
 
 
-def _of_cameras(
+def _collect_camera_evidence(
     graph: ViewGraph,
     registration: Registration,
     sizes: Mapping[int, PoseErrors],
     focals: Mapping[int, Errors],
 ) -> tuple[CameraEvidence, ...]:
-    """Of the cameras that `sizes` has, by keyframe."""
+    """Collects the evidence of the cameras that `sizes` has, by keyframe."""
     by = registration.observed_by
     times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
     by_third = times_seen[registration.observed_point] >= 3
     confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
     keyframes = {camera.index: graph.keyframes[camera.index] for camera in registration.cameras}
     greys = {index: cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY) for index, keyframe in keyframes.items()}
-    gains = exposure.gains(
+    gains = exposure.estimate_gains(
         {index: grey.astype(np.float32) for index, grey in greys.items()},
         registration,
         {index: keyframe.scale for index, keyframe in keyframes.items()},
@@ -141,29 +146,29 @@ def _of_cameras(
     return tuple(
         CameraEvidence(
             name=keyframes[camera.index].name,
-            inlier_ratio=inlier_ratio(graph, registration, camera.index),
+            inlier_ratio=compute_inlier_ratio(graph, registration, camera.index),
             confirmed=int(confirmed[camera.index]),
-            coverage=coverage(keyframes[camera.index], registration.observed_pixels[by == camera.index]),
-            flat_share=flat_share(graph, camera.index),
+            coverage=compute_coverage(keyframes[camera.index], registration.observed_pixels[by == camera.index]),
+            flat_share=compute_flat_share(graph, camera.index),
             gain=gains[camera.index],
             errors=sizes[camera.index],
             focal=focals[camera.index],
             own_lens=camera.own_lens or camera.displaced or abs(camera.aspect - 1.0) > refit.SQUARE,
-            refuted_focal=_refuted_focal(camera, keyframes[camera.index]),
+            refuted_focal=_compute_refuted_focal(camera, keyframes[camera.index]),
         )
         for camera in registration.cameras
         if camera.index in sizes
     )
 
 
-def _refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float:
+def _compute_refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float:
     given = keyframe.frame.intrinsics
     if given is None or given.source not in ("given", "calibration"):
         return 0.0
     return camera.focal / given.fx if camera.own_lens else 1.0
 
 
-def coverage(keyframe: Keyframe, pixels: Array) -> float:
+def compute_coverage(keyframe: Keyframe, pixels: Array) -> float:
     """The share of the picture in the box that holds all of `pixels` (M, 2), but for a few on each side."""
     if len(pixels) == 0:
         return 0.0
@@ -171,46 +176,50 @@ def coverage(keyframe: Keyframe, pixels: Array) -> float:
     return float(np.prod((most - least) / (keyframe.frame.width, keyframe.frame.height)))
 
 
-def flat_share(graph: ViewGraph, index: int) -> float:
+def compute_flat_share(graph: ViewGraph, index: int) -> float:
     """The largest share of a pair's matches that one homography explains, of the pairs of the keyframe `index`."""
     of_camera = (pair for key, pair in graph.pairs.items() if index in key and len(pair.matches) >= MIN_MATCHES)
     return max((pair.num_homography / len(pair.matches) for pair in of_camera), default=0.0)
 
 
-def _reflection(graph: ViewGraph, registration: Registration, config: reflection.Config) -> Reflection:
-    """By the registered pairs that are worth matching: of many keyframes each has enough of them."""
+def _measure_reflection(
+    graph: ViewGraph, registration: Registration, config: reflection.ReflectionConfig
+) -> Reflection:
+    """Measures the registered pairs that are worth matching: each keyframe has enough of them."""
     place = {camera.index: position for position, camera in enumerate(registration.cameras)}
-    worth = {(place[i], place[j]) for i, j in graph.worth_matching() if i in place and j in place}
+    worth = {(place[i], place[j]) for i, j in graph.select_pairs_worth_matching() if i in place and j in place}
     pairs = {(min(pair), max(pair)) for pair in worth}
-    return reflection.measure([graph.keyframes[index] for index in place], pairs, config)
+    return reflection.measure_reflection([graph.keyframes[index] for index in place], pairs, config)
 
 
-def _reflections_of_further(
+def _measure_further_reflections(
     graph: ViewGraph,
     registration: Registration,
     known: Collection[int],
     further: Collection[int],
-    config: reflection.Config,
+    config: reflection.ReflectionConfig,
 ) -> list[Reflection]:
-    """Of each further camera beside the known ones that share most points with it."""
+    """Measures each further camera beside the known ones that share most points with it."""
     found = []
     for index in sorted(further):
-        others = partners(index, known, registration, config.partners)
+        others = find_partners(index, known, registration, config.partners)
         beside = [graph.keyframes[other] for other in others]
         found.append(reflection.measure_further(graph.keyframes[index], beside, config))
     return found
 
 
-def _disconnected(graph: ViewGraph, registration: Registration) -> tuple[str, ...]:
-    return tuple(graph.keyframes[index].name for index in weakest_link.disconnected(registration, graph.pairs))
+def _name_disconnected_frames(graph: ViewGraph, registration: Registration) -> tuple[str, ...]:
+    return tuple(
+        graph.keyframes[index].name for index in weakest_link.find_disconnected_frames(registration, graph.pairs)
+    )
 
 
-def inlier_ratio(graph: ViewGraph, registration: Registration, index: int | None) -> float:
+def compute_inlier_ratio(graph: ViewGraph, registration: Registration, index: int | None) -> float:
     """The share of matches that the cameras explain, of all verified pairs or of those of the keyframe `index`."""
-    return pooled_ratio(registration.inlier_ratios, graph.pairs, index)
+    return compute_pooled_ratio(registration.inlier_ratios, graph.pairs, index)
 
 
-def partners(index: int, among: Collection[int], registration: Registration, count: int) -> list[int]:
+def find_partners(index: int, among: Collection[int], registration: Registration, count: int) -> list[int]:
     """The `count` views of `among` that share most points with the view `index`."""
     mine = registration.observed_point[registration.observed_by == index]
     shared = np.bincount(registration.observed_by[np.isin(registration.observed_point, mine)], minlength=max(among) + 1)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.matching.components import connected_components
+from splatnode.recon.matching.components import find_components
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration.register import Registration
 
@@ -27,22 +27,22 @@ class WeakestLink:
 
     @property
     def inlier_ratio(self) -> float:
-        """Of the matches across it; 0 without any."""
+        """Returns the share of the matches across the link that the poses explain; 0 without any."""
         return float(self.inliers / np.maximum(1, self.matches))  # NaN where one of them is
 
 
-def measure(
+def measure_weakest_link(
     registration: Registration,
     names: Sequence[str],
     pairs: Mapping[tuple[int, int], TwoView],
 ) -> WeakestLink:
-    """What connects the two parts into which the cameras fall without the last edge of the maximum spanning tree.
+    """Measures the link between the two parts that the last edge of the maximum spanning tree joins.
 
     `names` are those of all keyframes.
     """
     indices = [camera.index for camera in registration.cameras]
-    shared = shared_points(registration)
-    one, other = _two_parts(indices, shared)
+    shared = count_shared_points(registration)
+    one, other = _split_at_weakest_link(indices, shared)
     across = [(i, j) for i in one for j in other]
     verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.inlier_ratios]
     return WeakestLink(
@@ -53,7 +53,7 @@ def measure(
     )
 
 
-def disconnected(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) -> tuple[int, ...]:
+def find_disconnected_frames(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) -> tuple[int, ...]:
     """Keyframes, by position, outside the largest component of geometrically consistent pairs.
 
     Frames that pose as others, as mirror images of a symmetric place do, fit well with each other, and with the rest
@@ -64,11 +64,11 @@ def disconnected(registration: Registration, pairs: Mapping[tuple[int, int], Two
         for key, share in registration.inlier_ratios.items()
         if share >= MIN_CONSISTENT_SHARE and share * len(pairs[key].matches) >= MIN_CONSISTENT_MATCHES
     ]
-    _, *rest = connected_components([camera.index for camera in registration.cameras], consistent)
+    _, *rest = find_components([camera.index for camera in registration.cameras], consistent)
     return tuple(sorted(index for part in rest for index in part))
 
 
-def shared_points(registration: Registration) -> npt.NDArray[np.int64]:
+def count_shared_points(registration: Registration) -> npt.NDArray[np.int64]:
     """(M, M) how many points each two frames both observe."""
     size = max(camera.index for camera in registration.cameras) + 1
     seen = np.zeros((size, len(registration.points)), np.int64)
@@ -76,7 +76,7 @@ def shared_points(registration: Registration) -> npt.NDArray[np.int64]:
     return seen @ seen.T
 
 
-def _two_parts(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
+def _split_at_weakest_link(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
     """The parts without the edge that Kruskal's algorithm adds last, most shared points first: the larger, the rest."""
     links = sorted(
         ((i, j) for place, i in enumerate(indices) for j in indices[:place]),
@@ -84,9 +84,9 @@ def _two_parts(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[
     )
     taken: list[tuple[int, int]] = []
     for link in links:
-        parts = connected_components(indices, [*taken, link])
+        parts = find_components(indices, [*taken, link])
         if len(parts) == 1:
             break
         taken.append(link)
-    first, *rest = connected_components(indices, taken)
+    first, *rest = find_components(indices, taken)
     return first, [index for part in rest for index in part]

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.stamp import Stamp
-from splatnode.recon.result.bounds import Bounds, covariance
+from splatnode.recon.result.bounds import Bounds, compute_covariance
 from splatnode.recon.result.snapshot import CameraEstimate
 
 Array = npt.NDArray[np.float64]
@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Where a photograph was taken from, through which lens, and how well that is known.
+    """A camera of the result: its pose, its lens, and how well they are known.
 
     Axes are OpenCV's: x right, y down, z forward. The world is the frame of the first camera that was placed; its unit
     is the metre where `Result.metric` is set, and none otherwise.
@@ -52,7 +52,7 @@ class Camera:
     @property
     def covariance(self) -> Array | None:
         """(3, 3) of its centre, in the world's axes and squared unit, whose 95 % ellipsoid is that of the claim."""
-        return None if self.bounds is None else covariance(self.bounds.axes)
+        return None if self.bounds is None else compute_covariance(self.bounds.axes)
 
 
 def camera_of(estimate: CameraEstimate, lens: Intrinsics | None = None) -> Camera:

@@ -10,8 +10,8 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_MAP
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.messaging.wire import WireError
-from splatnode.capture.process.problems import Problems, is_said
-from splatnode.recon.occupancy.message import MapHeader, from_message
+from splatnode.capture.process.problems import Problems, is_logged
+from splatnode.recon.occupancy.message import MapHeader, decode_map
 from splatnode.recon.occupancy.occupancy_map import OccupancyMap
 
 log = logging.getLogger(__name__)
@@ -22,7 +22,7 @@ _POLL_S = 0.25
 
 @dataclass(frozen=True, eq=False)
 class NodeMap:
-    """What a node knows of free space now."""
+    """A node's current knowledge of free space."""
 
     scene_id: str  # of the place; empty where the node has said nothing
     occupancy: OccupancyMap | None  # in the world of that scene, as it is now
@@ -33,8 +33,8 @@ NOTHING_HEARD = NodeMap("", None, SILENT)
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
-    """What was said, and of which message of recon.scene."""
+class ReceivedMap:
+    """The newest message about the map, and the message of recon.scene that it belongs to."""
 
     told: NodeMap
     scene: tuple[str, int] | None = None  # session and sequence
@@ -47,14 +47,14 @@ class LiveMap:
         """Raises what opening the network raises."""
         self._client = StateClient(RECON_MAP, network, MapHeader)
         self._refusals = Problems()
-        self._heard = Heard(NOTHING_HEARD)
+        self._heard = ReceivedMap(NOTHING_HEARD)
         self._error: BaseException | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="live map", daemon=True)
         self._thread.start()
 
     @property
-    def newest(self) -> Heard:
+    def newest(self) -> ReceivedMap:
         """Raises what the connection failed with, for example PermissionError."""
         if self._error is not None:
             raise self._error
@@ -73,11 +73,11 @@ class LiveMap:
                     continue
                 header: MapHeader = message.header
                 try:
-                    told = NodeMap(header.scene_id, from_message(message), header.why)
+                    told = NodeMap(header.scene_id, decode_map(message), header.why)
                 except WireError as error:
-                    if is_said(self._refusals.add("maps that were refused", error)):
+                    if is_logged(self._refusals.add("maps that were refused", error)):
                         log.warning("a map of the node was refused: %s", error)
                     told = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
-                self._heard = Heard(told, header.map and (header.session, header.map.scene_sequence))
+                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence))
         except Exception as error:
             self._error = error

@@ -11,11 +11,11 @@ from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.landmarks_file import LANDMARKS, read_landmarks
 from splatnode.recon.result.stored_snapshot import read_result
-from splatnode.recon.result.whole import is_whole
+from splatnode.recon.result.whole import is_map_set
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredFiles:
     """The files of a result, where they were read."""
 
     folder: Path
@@ -33,11 +33,11 @@ def load(folder: str | PathLike[str]) -> Result:
     place = Path(folder)
     if not place.is_dir():
         raise FileNotFoundError(f"{place} is no folder; give one that Result.save or splatnode replay --out wrote")
-    if is_whole(place):
+    if is_map_set(place):
         scenes = ", ".join(sorted(path.parent.name for path in place.glob("*/report.json")))
         raise ValueError(f"{place} holds several results; give one of its folders: {scenes}")
     snapshot = read_result(place)[0]
     if (place / LANDMARKS).exists():
         snapshot = replace(snapshot, landmarks=read_landmarks(place))
     snapshot = replace(snapshot, depths=read_depths(place))
-    return result_of(snapshot, Stored(place.resolve()))
+    return result_of(snapshot, StoredFiles(place.resolve()))

@@ -9,36 +9,36 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.api.photographs import Lens, Picture, photographs, with_lens
+from splatnode.api.photographs import Lens, Picture, apply_lens, load_frames
 from splatnode.capture.frame import Frame
 from splatnode.capture.given_pose import rigid_problem
-from splatnode.capture.process.progress import told_to_nobody
+from splatnode.capture.process.progress import ignore_progress
 from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.locate import locate
+from splatnode.recon.locating.locate import localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.result.landmarks import Landmarks
 
 Near: TypeAlias = "Located | NotLocated | npt.ArrayLike | None"
 
 
-def localised(
+def localize_query(
     landmarks: Landmarks, image: str | PathLike[str] | Picture, lens: Lens | None, near: Near
 ) -> Located | NotLocated:
     """The camera of one photograph, a file or a picture. Raises TypeError, ValueError, FileNotFoundError."""
     if isinstance(image, (str, PathLike)) and not Path(image).is_file():
         raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
-    expected = _expected(near)
-    given = with_lens(photographs([image], None, False, told_to_nobody), lens, [image]).frames
+    expected = _parse_near(near)
+    given = apply_lens(load_frames([image], None, False, ignore_progress), lens, [image]).frames
     (frame, *_) = given
     if not isinstance(frame, Frame):
         raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
     if expected is None:
-        return locate(landmarks, frame.image, frame.intrinsics)
+        return localize_image(landmarks, frame.image, frame.intrinsics)
     return follow(landmarks, frame.image, expected, frame.intrinsics)
 
 
-def _expected(near: Near) -> Located | npt.NDArray[np.float64] | None:
-    """What is known of where the photograph was taken; None: nothing."""
+def _parse_near(near: Near) -> Located | npt.NDArray[np.float64] | None:
+    """Parses the known position of the photograph; None where nothing is known."""
     if near is None or isinstance(near, NotLocated):
         return None
     if isinstance(near, Located):

@@ -9,21 +9,21 @@ from typing import Any, TypeAlias
 
 import numpy.typing as npt
 
-from splatnode.api.photographs import Images, as_list, picture_name
+from splatnode.api.photographs import Images, list_images, picture_name
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Frame
-from splatnode.capture.masks import Find, Mask, as_mask, in_files, read_mask
+from splatnode.capture.masks import Find, Mask, open_masks, parse_mask, read_mask
 
 # In a list one for each photograph, in the order of the photographs; None: that one is used whole.
 MaskOf: TypeAlias = "str | PathLike[str] | npt.NDArray[Any] | None"
 Masks: TypeAlias = "str | PathLike[str] | npt.NDArray[Any] | Sequence[MaskOf]"
 
 
-def finder(masks: Masks, images: Images) -> Find:
+def make_mask_finder(masks: Masks, images: Images) -> Find:
     """Finds the mask of a frame of `images`. Raises TypeError, ValueError, FileNotFoundError."""
     if isinstance(masks, (str, PathLike)):
-        return in_files(Path(masks))
-    given, of = as_list(images), list(masks)
+        return open_masks(Path(masks))
+    given, of = list_images(images), list(masks)
     if len(given) == 1 and isinstance(given[0], (str, PathLike)) and Path(given[0]).is_dir():
         raise TypeError("masks must be a folder of masks where images is a folder, got a list")
     if len(of) != len(given):
@@ -38,4 +38,4 @@ def finder(masks: Masks, images: Images) -> Find:
 def _mask(given: MaskOf, frame: Frame) -> Mask | None:
     if given is None:
         return None
-    return read_mask(Path(given), frame) if isinstance(given, (str, PathLike)) else as_mask(given)
+    return read_mask(Path(given), frame) if isinstance(given, (str, PathLike)) else parse_mask(given)

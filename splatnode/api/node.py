@@ -12,11 +12,11 @@ from splatnode.api.camera import Camera, camera_of
 from splatnode.api.live_map import LiveMap, NodeMap
 from splatnode.api.result import Result, result_of
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import read_yaml, typed
+from splatnode.capture.process.config import parse_config, read_yaml
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.write import write_result_folder
 from splatnode.viewer.moment import Moment
-from splatnode.viewer.sources import Live
+from splatnode.viewer.sources import LiveSource
 
 FIRST_PORT = Network().first_port
 OUTDATED = "the scene has changed since its map was made"
@@ -32,13 +32,13 @@ class NodeUpdate:
 
 
 @dataclass(frozen=True, eq=False)
-class Received:
-    """What came over the network, as it can be written."""
+class ReceivedFiles:
+    """A snapshot that came over the network, as it can be written."""
 
     snapshot: Snapshot
 
     def write(self, out: Path) -> None:
-        finish(self.snapshot, out, seed=0, preset_name="received from a node")
+        write_result_folder(self.snapshot, out, seed=0, preset_name="received from a node")
 
 
 class Node:
@@ -49,7 +49,7 @@ class Node:
     """
 
     def __init__(self, network: Network) -> None:
-        self._live = Live(network)
+        self._live = LiveSource(network)
         try:
             self._map = LiveMap(network)
         except BaseException:
@@ -74,11 +74,11 @@ class Node:
 
     @property
     def live_camera(self) -> Camera | None:
-        """Where the live camera is now, in the newest scene; None: not known, as before the scene is final.
+        """Returns the live camera in the newest scene; None where it is not known, as before the scene is final.
 
         The node looks once a second; the camera has no bounds, and its K is that of the preview.
         """
-        tracked = self._live.tracked
+        tracked = self._live.live_camera
         return None if tracked is None else camera_of(tracked)
 
     @property
@@ -141,7 +141,7 @@ def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | No
         return Network()
     path = Path(address)
     if path.suffix.lower() in (".yaml", ".yml"):
-        return typed(read_yaml(path).get("network", {}), Network, "network")
+        return parse_config(read_yaml(path).get("network", {}), Network, "network")
     if path.is_dir():
         return Network(directory=path)
     if isinstance(address, PathLike) or "/" in address:
@@ -154,4 +154,4 @@ def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | No
 
 
 def _update(moment: Moment) -> NodeUpdate:
-    return NodeUpdate(moment.scene_id, result_of(moment.snapshot, Received(moment.snapshot)))
+    return NodeUpdate(moment.scene_id, result_of(moment.snapshot, ReceivedFiles(moment.snapshot)))

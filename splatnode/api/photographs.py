@@ -10,17 +10,17 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.cameras.folder import SUFFIXES, frame_name, in_words_of_range
+from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
 from splatnode.capture.exif import exif_exposure, exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import ALL, Lenses, find_key
-from splatnode.capture.masks import masked
+from splatnode.capture.masks import apply_mask
 from splatnode.capture.orientation import ORIENTATION, upright
 from splatnode.capture.process.progress import Tell
 from splatnode.capture.stamp import Stamp
-from splatnode.capture.value_range import Extent, ValueRange, find_range, measure_extent, to_eight_bits
-from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, source, with_lenses
+from splatnode.capture.value_range import Extent, ValueRange, convert_to_eight_bits, find_range, measure_extent
+from splatnode.recon.replay_source import Request, Source, apply_lenses, load_source, parse_paths, select_frames
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
 _EXIF = b"Exif\0\0"  # before the TIFF structure
@@ -32,20 +32,22 @@ Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 LensChoice: TypeAlias = "Lens | Sequence[Lens | None] | Mapping[str, Lens]"
 
 
-def photographs(images: Images, views: int | None, every_frame: bool, tell: Tell) -> Source:
+def load_frames(images: Images, views: int | None, every_frame: bool, tell: Tell) -> Source:
     """The frames of a folder, of files, of a video, or of pictures. Raises TypeError, ValueError, FileNotFoundError."""
-    given = as_list(images)
+    given = list_images(images)
     paths = [isinstance(each, (str, PathLike)) for each in given]
     if all(paths):
-        path, listed = asked_for([Path(each) for each in given])
-        return source(Request(path, listed, views, every_frame=every_frame), tell)
+        path, listed = parse_paths([Path(each) for each in given])
+        return load_source(Request(path, listed, views, every_frame=every_frame), tell)
     if any(paths):
         raise TypeError("images must be all paths or all pictures, got both. Read the files, or write the pictures")
     used = find_range([extent for extent in map(_extent, given) if extent is not None])
     if used is not None:
-        tell(in_words_of_range(used))
-    frames = [frame(each, index, picture_name(index), index * STEP_NS, used=used) for index, each in enumerate(given)]
-    return at_hand(frames, views, every_frame, tell)
+        tell(describe_value_range(used))
+    frames = [
+        make_frame(each, index, picture_name(index), index * STEP_NS, used=used) for index, each in enumerate(given)
+    ]
+    return select_frames(frames, views, every_frame, tell)
 
 
 def picture_name(index: int) -> str:
@@ -55,7 +57,7 @@ def picture_name(index: int) -> str:
 
 def names_of(images: Images) -> list[str]:
     """The names of listed photographs or pictures, in their order. Raises TypeError, ValueError: of a folder, too."""
-    given = as_list(images)
+    given = list_images(images)
     if len(given) == 1 and isinstance(given[0], (str, PathLike)) and Path(given[0]).suffix.lower() not in SUFFIXES:
         raise TypeError("a list goes with a list of photographs, one for each; of a folder or a video, give names")
     return [
@@ -64,7 +66,7 @@ def names_of(images: Images) -> list[str]:
     ]
 
 
-def frame(
+def make_frame(
     picture: Picture,
     frame_id: int,
     name: str,
@@ -77,15 +79,15 @@ def frame(
     `used` as for `pixels`. Raises TypeError, ValueError.
     """
     try:
-        image, tiff = pixels(picture, used), _tiff(picture)
+        image, tiff = make_rgb_image(picture, used), _exif_bytes(picture)
         height, width = image.shape[:2]
         tags, taken_at = read_tags(tiff), captured_at or exif_time(tiff)
         intrinsics, exposure = exif_intrinsics(tags, width, height), exif_exposure(tags)
         made = Frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=taken_at, exposure=exposure)
-        mask = _opaque(picture)
+        mask = _alpha_mask(picture)
         if mask is None:
             return made
-        seen = masked(made, mask)
+        seen = apply_mask(made, mask)
         if isinstance(seen, DroppedFrame):
             raise ValueError(f"its alpha channel hides {100 * (1 - mask.mean()):.1f} % of it: leave alpha out")
         return seen
@@ -93,17 +95,17 @@ def frame(
         raise type(error)(f"image {name}: {error}") from error
 
 
-def pixels(picture: Picture, used: ValueRange | None = None) -> npt.NDArray[np.uint8]:
+def make_rgb_image(picture: Picture, used: ValueRange | None = None) -> npt.NDArray[np.uint8]:
     """A copy of a picture (H, W, 3) RGB, treated as a file's: upright, grey as RGB, no alpha.
 
     Of 16 bits the range `used` becomes 8; None: what this picture uses of them alone.
     An array must be (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), of uint8 or uint16. Raises TypeError, ValueError.
     """
-    array = _of_pil(picture) if _is_pil(picture) else picture
+    array = _convert_pil(picture) if _is_pil(picture) else picture
     if not isinstance(array, np.ndarray):
         raise TypeError(f"must be a NumPy array (H, W, 3) uint8 or a PIL image, got {type(picture).__name__}")
     if array.dtype == np.uint16:
-        array = to_eight_bits(array, used or find_range([measure_extent(array)] if array.size else []))
+        array = convert_to_eight_bits(array, used or find_range([measure_extent(array)] if array.size else []))
     if array.dtype != np.uint8:
         raise TypeError(f"must be uint8, got {array.dtype}. Of floats in [0, 1]: (255 * image).round().astype('uint8')")
     if array.ndim == 2:
@@ -114,7 +116,7 @@ def pixels(picture: Picture, used: ValueRange | None = None) -> npt.NDArray[np.u
     return np.array(colours, np.uint8, order="C")
 
 
-def with_lens(given: Source, lens: LensChoice | None, images: Images) -> Source:
+def apply_lens(given: Source, lens: LensChoice | None, images: Images) -> Source:
     """Returns the frames with their lenses in place of what their EXIF tells.
 
     One lens is of all frames of its aspect ratio; a mapping is of images, cameras or patterns, as `Lenses` has it; a
@@ -130,7 +132,7 @@ def with_lens(given: Source, lens: LensChoice | None, images: Images) -> Source:
         of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera) == key)
         first = next(of_lens, frames[0])
         by_key[key] = intrinsics_of(each, first.width, first.height)
-    return with_lenses(given, Lenses(by_key))
+    return apply_lenses(given, Lenses(by_key))
 
 
 def _key_lenses(lens: Any, images: Images) -> Mapping[str, Lens]:
@@ -161,13 +163,13 @@ def intrinsics_of(lens: Lens, width: int, height: int) -> Intrinsics:
 
 
 def lenses(frames: Iterable[Any]) -> dict[str, Intrinsics]:
-    """By name, the lenses that were given or calibrated."""
+    """Returns the lenses that were given or calibrated, by name."""
     known = {each.name: each.intrinsics for each in frames if isinstance(each, Frame) and each.intrinsics is not None}
     return {name: lens for name, lens in known.items() if lens.source in ("given", "calibration")}
 
 
-def as_list(images: Any) -> list[Any]:
-    """What `images` names, one or several. Raises TypeError, ValueError."""
+def list_images(images: Any) -> list[Any]:
+    """Lists what `images` names, one or several. Raises TypeError, ValueError."""
     one = isinstance(images, (str, PathLike)) or _is_pil(images)
     if one or (isinstance(images, np.ndarray) and images.ndim < 4):
         return [images]
@@ -180,13 +182,13 @@ def as_list(images: Any) -> list[Any]:
 
 
 def _extent(picture: Picture) -> Extent | None:
-    """Of the values of a picture of 16 bits; None of another one."""
-    array = _of_pil(picture) if _is_pil(picture) else picture
+    """Measures the extent of the values of a 16-bit picture; None for another one."""
+    array = _convert_pil(picture) if _is_pil(picture) else picture
     deep = isinstance(array, np.ndarray) and array.dtype == np.uint16 and array.size
     return measure_extent(array[..., :3] if array.ndim == 3 else array) if deep else None
 
 
-def _opaque(picture: Picture) -> npt.NDArray[np.bool_] | None:
+def _alpha_mask(picture: Picture) -> npt.NDArray[np.bool_] | None:
     """(H, W) where a picture's alpha is above 0; None where it has none, or one that says nothing, as of a file."""
     if _is_pil(picture):
         if "A" not in picture.getbands() and "transparency" not in picture.info:
@@ -201,16 +203,16 @@ def _opaque(picture: Picture) -> npt.NDArray[np.bool_] | None:
 
 
 def _is_pil(picture: Any) -> bool:
-    """Whether it is used as PIL's images are: PIL itself is not needed."""
+    """True if the picture has the interface of PIL's images: PIL itself is not needed."""
     return all(hasattr(picture, name) for name in ("convert", "getbands", "mode", "info"))
 
 
-def _of_pil(picture: Any) -> npt.NDArray:
+def _convert_pil(picture: Any) -> npt.NDArray:
     deep = picture.mode.startswith("I;16")
     return upright(np.asarray(picture if deep else picture.convert("RGB")), picture.getexif().get(ORIENTATION, 1))
 
 
-def _tiff(picture: Any) -> bytes:
+def _exif_bytes(picture: Any) -> bytes:
     """The TIFF structure of a PIL image's EXIF; empty where it has none."""
     known = picture.info.get("exif", b"") if _is_pil(picture) else b""
     return known.removeprefix(_EXIF) if isinstance(known, bytes) else b""

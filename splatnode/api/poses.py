@@ -13,11 +13,11 @@ import numpy.typing as npt
 from splatnode.api.photographs import Images, names_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.given_pose import GivenPose, given_pose
+from splatnode.capture.given_pose import GivenPose, make_given_pose
 from splatnode.capture.gravity import SIGMA_DEG, Gravity
 from splatnode.capture.motion import Motion
-from splatnode.capture.poses_file import named, poses_of, read_poses
-from splatnode.recon.metric.config import Config
+from splatnode.capture.poses_file import create_trajectory, poses_of, read_poses
+from splatnode.recon.metric.config import MetricConfig
 
 LEAST_STEP_SIGMA_M = 0.001  # standard deviation of a motion, however short it is
 
@@ -26,13 +26,13 @@ Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix
 
 
 def sigmas_of(poses_sigma: tuple[float, float] | None) -> dict[str, float] | None:
-    """What of the configuration's `metric` the standard deviations set. Raises TypeError."""
+    """Returns the settings of `metric` that the standard deviations change. Raises TypeError."""
     if poses_sigma is None:
         return None
-    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), _two(poses_sigma, "poses_sigma"), strict=True))
+    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), _parse_sigmas(poses_sigma, "poses_sigma"), strict=True))
 
 
-def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: Config) -> GivenPose | None:
+def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: MetricConfig) -> GivenPose | None:
     """The pose of one photograph, T_world_camera (4, 4), metres; `sigma` None: as `config` has it.
 
     Raises TypeError, ValueError.
@@ -42,11 +42,15 @@ def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, confi
             raise ValueError("pose_sigma says how unsure a pose is: give pose, too")
         return None
     usual = config.poses_sigma_m, config.poses_sigma_deg
-    return given_pose(_matrix(pose), *(usual if sigma is None else _two(sigma, "pose_sigma")))
+    return make_given_pose(_matrix(pose), *(usual if sigma is None else _parse_sigmas(sigma, "pose_sigma")))
 
 
 def next_motion(
-    before: Motion | None, name: str, step: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: Config
+    before: Motion | None,
+    name: str,
+    step: npt.ArrayLike | None,
+    sigma: tuple[float, float] | None,
+    config: MetricConfig,
 ) -> Motion:
     """The motions up to photograph `name`: with one `step` more, T_previous_current (4, 4), metres.
 
@@ -62,7 +66,7 @@ def next_motion(
     moved = _matrix(step)
     length = float(np.linalg.norm(moved[:3, 3]))
     usual = max(config.motions_drift * length, LEAST_STEP_SIGMA_M), config.motions_sigma_deg
-    return before.then(moved, *(usual if sigma is None else _two(sigma, "motion_sigma")))
+    return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
 
 
 def gravity_of(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravity | None:
@@ -86,10 +90,10 @@ def poses_given(
         return None
     if isinstance(poses, (str, PathLike)):
         return poses_of(read_poses(Path(poses)), frames, fspath(poses))
-    return poses_of(named(_rows(poses, images)), frames, "poses")
+    return poses_of(create_trajectory(_list_named_poses(poses, images)), frames, "poses")
 
 
-def _rows(
+def _list_named_poses(
     poses: Mapping[str, Matrix] | Sequence[Matrix | None], images: Images
 ) -> list[tuple[str, npt.NDArray[np.float64]]]:
     if isinstance(poses, Mapping):
@@ -107,7 +111,7 @@ def _matrix(T: Any) -> npt.NDArray[np.float64]:
     return matrix
 
 
-def _two(sigmas: Any, what: str) -> tuple[float, float]:
+def _parse_sigmas(sigmas: Any, what: str) -> tuple[float, float]:
     if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
         raise TypeError(f"{what} must be metres and degrees, (0.01, 2.0), got {sigmas!r}")
     return float(sigmas[0]), float(sigmas[1])

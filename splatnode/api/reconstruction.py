@@ -7,18 +7,18 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from splatnode.api.masks import Masks, finder
-from splatnode.api.photographs import Images, LensChoice, lenses, photographs, with_lens
+from splatnode.api.masks import Masks, make_mask_finder
+from splatnode.api.photographs import Images, LensChoice, apply_lens, lenses, load_frames
 from splatnode.api.poses import Poses, poses_given, sigmas_of
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, metric_changes, pairs_given
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.progress import Tell, told_to_nobody
-from splatnode.recon.config import Config, overlaid
+from splatnode.capture.process.progress import Tell, ignore_progress
+from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.offline import check_baseline, reconstructed
-from splatnode.recon.replay_source import with_masks, with_poses
+from splatnode.recon.offline import check_baseline, reconstruct_source
+from splatnode.recon.replay_source import add_poses, apply_masks
 
 Changes = Mapping[str, Any] | str | PathLike[str]
 
@@ -42,7 +42,7 @@ def reconstruct(
     threads: int | None = None,
     tell: Tell | None = None,
 ) -> Result:
-    """What came of the photographs: the same cameras and Gaussians, to the bit, as of `splatnode replay`.
+    """Reconstructs photographs: the same cameras and Gaussians, to the bit, as `splatnode replay`.
 
     A refusal is a result, too: ask `verdict.publishable`. Several threads may call this at once.
 
@@ -76,40 +76,40 @@ def reconstruct(
 
     Raises TypeError and ValueError where an argument is not what it must be, and FileNotFoundError.
     """
-    telling = tell or told_to_nobody
+    telling = tell or ignore_progress
     check_count("views", views)
     check_count("threads", threads)
-    source = photographs(images, views, every_frame, telling)
-    source = source if masks is None else with_masks(source, finder(masks, images), telling)
-    source = with_lens(source, intrinsics, images)
+    source = load_frames(images, views, every_frame, telling)
+    source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
+    source = apply_lens(source, intrinsics, images)
     trusted = poses is not None and poses_sigma is not None and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
     flags["registration"] = {"trust_poses": True} if trusted else None
-    chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
+    chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
     if trusted and known is not None:
-        source = with_poses(source, known, chosen.metric.poses_sigma_m, chosen.metric.poses_sigma_deg)
+        source = add_poses(source, known, chosen.metric.poses_sigma_m, chosen.metric.poses_sigma_deg)
         known = None  # they are the photographs' own now
     given = Evidence((), known, pairs_given(scale, images, source.frames))
-    made = reconstructed(source, chosen, preset, only_seen, threads, given, tell=telling)
+    made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
 
 
-def configured(
+def build_config(
     preset: str, changes: Changes | None, flags: Mapping[str, Any], scale: Scale | None, of_pictures: bool
-) -> Config:
+) -> ReconstructionConfig:
     """The preset, then what differs from it, then the arguments: what comes later wins."""
     config = named(preset)
     if isinstance(changes, (str, PathLike)):
-        config = overlaid(config, read_yaml(Path(changes)))
+        config = apply_changes(config, read_yaml(Path(changes)))
     elif isinstance(changes, Mapping):
-        config = overlaid(config, changes)
+        config = apply_changes(config, changes)
     elif changes is not None:
         raise TypeError(f"config must be a mapping or a YAML file, got {type(changes).__name__}")
     if scale is not None:
-        config = overlaid(config, {"metric": metric_changes(scale, of_pictures)})
-    return overlaid(config, {name: value for name, value in flags.items() if value is not None})
+        config = apply_changes(config, {"metric": metric_changes(scale, of_pictures)})
+    return apply_changes(config, {name: value for name, value in flags.items() if value is not None})
 
 
 def check_count(name: str, value: int | None) -> None:

@@ -15,11 +15,11 @@ import numpy.typing as npt
 from splatnode.api.camera import Camera, camera_of
 from splatnode.api.view import View, view
 from splatnode.capture.frame import DroppedFrame, Intrinsics
-from splatnode.recon.result.export.prepare import viewer_safe
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.sources import seen
-from splatnode.recon.result.spherical_harmonics import mean_colours
+from splatnode.recon.result.sources import find_confirmed
+from splatnode.recon.result.spherical_harmonics import compute_mean_colours
 from splatnode.recon.result.verdict import Verdict
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Files(Protocol):
-    """What knows how a result is written."""
+    """The files of a result, which know how it is written."""
 
     def write(self, out: Path) -> object:
         """Writes the result folder. Raises ResultWriteError."""
@@ -74,7 +74,7 @@ class Result:
         """
         have = self._snapshot.gaussians
         known = {name: getattr(have, name).copy() for name in ("means", "quats", "scales", "opacities", "sh")}
-        return known | {"colours": mean_colours(have.sh), "seen": seen(have.source_frame)}
+        return known | {"colours": compute_mean_colours(have.sh), "seen": find_confirmed(have.source_frame)}
 
     @property
     def consistent_depth(self) -> float | None:
@@ -109,7 +109,7 @@ class Result:
     def render(
         self, T_world_camera: npt.ArrayLike, K: npt.ArrayLike, size: tuple[int, int], *, threads: int | None = None
     ) -> View:
-        """What a camera at `T_world_camera` (4, 4) with pinhole `K` (3, 3) sees; `size` is (width, height) in pixels.
+        """Renders the camera at `T_world_camera` (4, 4) with pinhole `K` (3, 3); `size` is (width, height) in pixels.
 
         Axes and pixels are those of `Camera`. The work takes at most `threads` threads; None: as many as there are
         processors. Raises ValueError where there is no scene, or these are no camera, and TypeError for other types.
@@ -125,7 +125,7 @@ class Result:
         intrinsics: Lens | None = None,
         near: Located | NotLocated | npt.ArrayLike | None = None,
     ) -> Located | NotLocated:
-        """Where a further photograph was taken, or why that cannot be said: a refusal is a value.
+        """Localizes a query image, or says why it cannot: a refusal is a value.
 
         `image` is a file or a picture, of any camera; `intrinsics` is its lens, if that is known: `Intrinsics`, or K
         (3, 3) in its pixels. `near` is what was found of a photograph that the same camera took shortly before, or
@@ -134,7 +134,7 @@ class Result:
         `claim`: how wrong it may be, with 95 %. `NotLocated` has `code`, `message` and `advice`. Raises ValueError
         where there is no scene to look in, TypeError for other types, and FileNotFoundError.
         """
-        from splatnode.api.locating import localised  # brings what matches photographs
+        from splatnode.api.locating import localize_query  # brings what matches photographs
 
         landmarks = self._snapshot.landmarks
         if landmarks is None:
@@ -142,7 +142,7 @@ class Result:
             if not self.verdict.publishable:
                 why = f"there is none: {self.verdict.code.value}. Ask verdict.publishable first"
             raise ValueError(f"no scene to look for a photograph in: {why}")
-        return localised(landmarks, image, intrinsics, near)
+        return localize_query(landmarks, image, intrinsics, near)
 
     def map(self, *, voxel: float | None = None, up: npt.ArrayLike | None = None) -> OccupancyMap:
         """Which space is free, occupied, or not seen, by depths that two photographs confirm and by nothing else.
@@ -163,7 +163,7 @@ class Result:
         intact, where that cannot be done.
         """
         out = Path(folder)
-        with result_folder(out):
+        with hold_result_folder(out):
             self._files.write(out)
         return out
 
@@ -199,4 +199,4 @@ class Result:
 
 def result_of(snapshot: Snapshot, files: Files, lenses: Mapping[str, Intrinsics] = MappingProxyType({})) -> Result:
     """A snapshot as a program sees it: with the Gaussians that its files would have."""
-    return Result(replace(snapshot, gaussians=viewer_safe(snapshot.gaussians)), files, dict(lenses))
+    return Result(replace(snapshot, gaussians=sanitize_gaussians(snapshot.gaussians)), files, dict(lenses))

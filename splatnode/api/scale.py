@@ -8,11 +8,11 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from splatnode.api.photographs import Images, as_list, frame, names_of
+from splatnode.api.photographs import Images, list_images, make_frame, names_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.right_image import Baseline as Apart
-from splatnode.recon.metric.stereo_pairs import Pair, pairs_of, rights_in
+from splatnode.recon.metric.stereo_pairs import StereoPair, make_pairs, stream_right_images
 
 Baseline: TypeAlias = tuple[str | int, str | int, float]  # two photographs and the metres between their cameras
 
@@ -42,18 +42,18 @@ Scale: TypeAlias = Known | Sequence[Known]
 
 
 def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
-    """What of the configuration's `metric` it sets; `of_pictures`: photographs are named by their places in a list.
+    """Returns the settings of `metric` for this scale; `of_pictures`: photographs are named by their places in a list.
 
     Raises TypeError, and ValueError for markers of two kinds.
     """
     changes: dict[str, Any] = {}
     baselines = []
-    markers = {each for each in _known(scale) if isinstance(each, Marker)}
+    markers = {each for each in _list_scale_sources(scale) if isinstance(each, Marker)}
     if len(markers) > 1:
         raise ValueError(f"scale can have markers of one size and dictionary alone, got {len(markers)} kinds of Marker")
-    for each in _known(scale):
+    for each in _list_scale_sources(scale):
         if isinstance(each, Marker):
-            changes |= _of_marker(each)
+            changes |= _make_marker_settings(each)
         elif isinstance(each, Stereo):
             changes |= {"stereo_m": each.baseline_m, "stereo_sigma_m": each.sigma_m}
         else:
@@ -65,40 +65,44 @@ def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
 
 def is_stereo(scale: Scale | None) -> bool:
     """Whether stereo pairs are among what is known."""
-    return any(isinstance(each, Stereo) for each in _known(scale))
+    return any(isinstance(each, Stereo) for each in _list_scale_sources(scale))
 
 
-def pairs_given(scale: Scale | None, images: Images, frames: Sequence[Frame | DroppedFrame]) -> tuple[Pair, ...]:
+def pairs_given(scale: Scale | None, images: Images, frames: Sequence[Frame | DroppedFrame]) -> tuple[StereoPair, ...]:
     """The stereo pairs of the frames, in which `images` resulted, of several stereo cameras each with their baseline.
 
     Raises TypeError, ValueError, FileNotFoundError.
     """
-    stereos = [each for each in _known(scale) if isinstance(each, Stereo)]
+    stereos = [each for each in _list_scale_sources(scale) if isinstance(each, Stereo)]
     several = len(stereos) > 1  # else the configuration's is theirs
     return tuple(
         replace(pair, baseline=Apart(each.baseline_m, each.sigma_m)) if several else pair
         for each in stereos
-        for pair in pairs_of(frames, _rights(each.right, images, frames))
+        for pair in make_pairs(frames, _load_right_frames(each.right, images, frames))
     )
 
 
-def _rights(right: object, images: Images, frames: Sequence[Frame | DroppedFrame]) -> Iterable[Frame | DroppedFrame]:
+def _load_right_frames(
+    right: object, images: Images, frames: Sequence[Frame | DroppedFrame]
+) -> Iterable[Frame | DroppedFrame]:
     if isinstance(right, (str, PathLike)):
-        return rights_in(Path(right), frames)
-    names, pictures = names_of(images), as_list(right)
+        return stream_right_images(Path(right), frames)
+    names, pictures = names_of(images), list_images(right)
     if len(names) != len(pictures):
         raise ValueError(f"right must have one picture for each of the {len(names)} photographs, got {len(pictures)}")
-    return [frame(each, number, name, number) for number, (name, each) in enumerate(zip(names, pictures, strict=True))]
+    return [
+        make_frame(each, number, name, number) for number, (name, each) in enumerate(zip(names, pictures, strict=True))
+    ]
 
 
-def _known(scale: object) -> Sequence[object]:
-    """What is known, one by one: a sequence of distances, markers and pairs is several."""
+def _list_scale_sources(scale: object) -> Sequence[object]:
+    """Lists the scale sources one by one: a sequence of distances, markers and pairs is several."""
     if isinstance(scale, (list, tuple)) and all(isinstance(each, (list, tuple, Marker, Stereo)) for each in scale):
         return scale
     return (scale,)
 
 
-def _of_marker(marker: Marker) -> dict[str, Any]:
+def _make_marker_settings(marker: Marker) -> dict[str, Any]:
     return {
         "marker_m": marker.side_m,
         "marker_sigma_m": marker.sigma_m,

@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
-from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses
+from splatnode.api.photographs import Lens, Picture, intrinsics_of, lenses, make_frame
 from splatnode.api.poses import gravity_of, next_motion, pose_of
-from splatnode.api.reconstruction import Changes, check_count, configured
+from splatnode.api.reconstruction import Changes, build_config, check_count
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, is_stereo
 from splatnode.capture.frame import Frame
-from splatnode.capture.given_lens import check_fits, seen_through
+from splatnode.capture.given_lens import assign_lens, check_fits
 from splatnode.capture.motion import Motion
-from splatnode.capture.process.printable import LONGEST_NAME, printable
-from splatnode.capture.process.progress import Tell, told_to_nobody
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
+from splatnode.capture.process.progress import Tell, ignore_progress
 from splatnode.capture.quality import Limits
 from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.selection import Config as Selection
@@ -25,11 +25,11 @@ from splatnode.capture.selection import Selector
 from splatnode.capture.stamp import Stamp
 from splatnode.recon import threads as limits
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric.evidence import NOTHING, gathered
-from splatnode.recon.metric.metres import in_metres
-from splatnode.recon.modelling import with_landmarks
-from splatnode.recon.offline import Reconstructed
-from splatnode.recon.pipeline import made_anew
+from splatnode.recon.metric.evidence import NOTHING, gather_evidence
+from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.modelling import add_landmarks
+from splatnode.recon.offline import OfflineResult
+from splatnode.recon.pipeline import rebuild_from_scratch
 from splatnode.recon.replay_source import Source
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -38,7 +38,7 @@ _EACH = 1e9  # frames a second: each is examined
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What became of one photograph of a session, and what is known after it."""
+    """The outcome for one photograph of a session, and the result after it."""
 
     name: str  # of the photograph
     taken: bool  # whether it counts; otherwise `reason` says why it does not
@@ -73,10 +73,10 @@ class Session:
         check_count("threads", threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
-        self._config = configured(preset, config, {"seed": seed}, scale, of_pictures=True)
+        self._config = build_config(preset, config, {"seed": seed}, scale, of_pictures=True)
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
-        self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or told_to_nobody
+        self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress
         self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH, patience_s=0.0), Limits())
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
@@ -122,27 +122,27 @@ class Session:
         right image is none, a name comes again, or the session's lens has the aspect ratio of no photograph so far,
         and RuntimeError after `finish` or `close`.
         """
-        with self._lock, limits.at_most(self._threads):
+        with self._lock, limits.apply_thread_limit(self._threads):
             work = self._open()
             number = len(self._given)
-            frame = self._framed(image, number, name or f"{number:04d}.png", captured_at, intrinsics, camera)
+            frame = self._make_frame(image, number, name or f"{number:04d}.png", captured_at, intrinsics, camera)
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
             given = pose_of(pose, pose_sigma, self._config.metric)
             moved = next_motion(self._motion, frame.name, motion, motion_sigma, self._config.metric)
             came = {"given_pose": given, "motion": moved, "gravity": gravity_of(gravity, gravity_sigma)}
-            frame = replace(frame, **came, right=_right_of(right, baseline_m))
+            frame = replace(frame, **came, right=_make_right_image(right, baseline_m))
             self._motion = moved
             self._given.add(frame.name)
             self._sizes += {(frame.width, frame.height)}.difference(self._sizes)
             decision = self._selector.decide(frame)
             if decision.take:
                 self._frames[frame.name] = frame
-                self._evidence = self._evidence.and_also(gathered((frame,), self._config.metric))
-                work.take(frame)
+                self._evidence = self._evidence.merge(gather_evidence((frame,), self._config.metric))
+                work.add_frame(frame)
                 work.update()
                 made = work.snapshot()  # stereo pairs are measured by landmarks
-                self._snapshot = with_landmarks(made, work.remembered()) if self._evidence.pairs else made
+                self._snapshot = add_landmarks(made, work.find_reconstruction()) if self._evidence.pairs else made
             taken = frame.name in work.names
             left_out = {each.name: each.reason for each in work.dropped}
             return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)
@@ -152,19 +152,19 @@ class Session:
 
         Raises RuntimeError after `finish` or `close`.
         """
-        with self._lock, limits.at_most(self._threads):
-            *_, self._snapshot = made_anew(self._open(), self._tell)
+        with self._lock, limits.apply_thread_limit(self._threads):
+            *_, self._snapshot = rebuild_from_scratch(self._open(), self._tell)
             self.close()
             return self.result
 
     @property
     def result(self) -> Result:
-        """What is known of all photographs so far."""
+        """Returns the result of all photographs so far."""
         with self._lock:
             snapshot = self._snapshot or self._nothing_yet()
-            snapshot = in_metres(snapshot, self._config.metric, self._evidence)
+            snapshot = apply_metric_scale(snapshot, self._config.metric, self._evidence)
             frames = tuple(self._frames.values())
-            made = Reconstructed(snapshot, Source(frames, None, None), self._config.seed, self._preset)
+            made = OfflineResult(snapshot, Source(frames, None, None), self._config.seed, self._preset)
             return result_of(snapshot, made, lenses(frames))
 
     def close(self) -> None:
@@ -188,26 +188,26 @@ class Session:
         work.estimate_soon()
         return work.snapshot()
 
-    def _framed(
+    def _make_frame(
         self, image: Picture, number: int, name: str, captured_at: Stamp | None, lens: Lens | None, camera: str | None
     ) -> Frame:
-        made = frame(image, number, name, time.monotonic_ns(), captured_at)
-        made = made if camera is None else replace(made, camera=printable(camera, LONGEST_NAME))
+        made = make_frame(image, number, name, time.monotonic_ns(), captured_at)
+        made = made if camera is None else replace(made, camera=sanitize_text(camera, LONGEST_NAME))
         if lens is not None:
             known = intrinsics_of(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])
-            return seen_through(made, known)
+            return assign_lens(made, known)
         if self._lens is None:
             return made
         sizes = [*self._sizes, (made.width, made.height)]
         known = intrinsics_of(self._lens, *sizes[0])
         check_fits(known, sizes)
-        return seen_through(made, known)
+        return assign_lens(made, known)
 
 
-def _right_of(picture: Picture | None, baseline_m: float | None) -> RightImage | None:
+def _make_right_image(picture: Picture | None, baseline_m: float | None) -> RightImage | None:
     if picture is None and baseline_m is None:
         return None
     if picture is None or baseline_m is None:
         raise TypeError("right and baseline_m belong together: what the right camera saw, and how far away it stands")
-    return RightImage(grey(frame(picture, 0, "right", 0).image), Baseline(float(baseline_m)))
+    return RightImage(grey(make_frame(picture, 0, "right", 0).image), Baseline(float(baseline_m)))

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon import core
-from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.camera_check import find_camera_problem
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import seen
-from splatnode.recon.result.spherical_harmonics import flat
+from splatnode.recon.result.sources import find_confirmed
+from splatnode.recon.result.spherical_harmonics import make_flat_sh
 
 MOSTLY = 0.5  # of the light that reaches a pixel
 
@@ -35,13 +35,13 @@ def view(
 ) -> View:
     """The Gaussians from a camera of `size` (width, height). Raises ValueError where it is none."""
     (width, height), pose, lens = _size(size), _matrix("T_world_camera", T_world_camera), _matrix("K", K)
-    problem = camera_problem(pose, lens, width, height)
+    problem = find_camera_problem(pose, lens, width, height)
     if problem:
         raise ValueError(f"{problem}. Give a camera's own: camera.T_world_camera, camera.K, (camera.width, ...)")
-    with core.at_most(threads):
+    with core.apply_thread_limit(threads):
         shown = render_arrays(gaussians, pose, lens, width, height, channels=("rgb", "depth"))
-        confirmed = seen(gaussians.source_frame).astype(np.float32)
-        white = replace(gaussians, sh=flat(np.repeat(confirmed[:, None], 3, 1)))  # and all else black
+        confirmed = find_confirmed(gaussians.source_frame).astype(np.float32)
+        white = replace(gaussians, sh=make_flat_sh(np.repeat(confirmed[:, None], 3, 1)))  # and all else black
         light = render_arrays(white, pose, lens, width, height).rgb[..., 0]
     rgb = np.rint(255 * np.clip(shown.rgb, 0.0, 1.0)).astype(np.uint8)
     return View(rgb, shown.depth, light > MOSTLY)

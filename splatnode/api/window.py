@@ -53,7 +53,7 @@ def show(
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         shown = result.save(folder)
         if viewer == "rerun":
-            _run((*(command or python.command(*_RERUN)), str(_recorded(shown))), opened=None)
+            _run((*(command or python.command(*_RERUN)), str(_export_rrd(shown))), opened=None)
         else:
             whole = (*(command or python.command("splatnode", "view")), *_OPTIONS[viewer], *options, folder)
             _run(whole, opened if viewer in _IN_BROWSER else None)
@@ -76,13 +76,13 @@ def _check(viewer: Viewer) -> None:
             )
 
 
-def _recorded(folder: Path) -> Path:
-    """What `splatnode export --to rrd` makes of the result in the folder."""
+def _export_rrd(folder: Path) -> Path:
+    """Exports the result in the folder as `splatnode export --to rrd` does."""
     from splatnode.recon.result.export.formats import rrd
     from splatnode.recon.result.export.stored import StoredResult
 
     path = folder / rrd.DEFAULT_NAME
-    path.write_bytes(rrd.export(StoredResult.at(folder)))
+    path.write_bytes(rrd.export(StoredResult.create_from_path(folder)))
     return path
 
 

@@ -16,7 +16,7 @@ from tests.api.conftest import QUICK, SMALL
 @pytest.fixture(scope="module")
 def between() -> np.ndarray:
     """A photograph from where none of the set was taken."""
-    return synthetic.photograph(SMALL, synthetic._camera_on_path(SMALL, 1.5), 9)
+    return synthetic.render_image(SMALL, synthetic._camera_on_path(SMALL, 1.5), 9)
 
 
 def test_it_is_placed_between_its_neighbours(result, between):

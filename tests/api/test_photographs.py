@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.api.photographs import frame, photographs, pixels
+from splatnode.api.photographs import load_frames, make_frame, make_rgb_image
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import decode_image
@@ -35,7 +35,7 @@ def in_a_file(array: np.ndarray) -> np.ndarray:
     ids=["rgb", "alpha", "grey", "one channel", "16 bits", "not contiguous"],
 )
 def test_an_array_is_taken_as_a_file(array, as_file):
-    found = pixels(array)
+    found = make_rgb_image(array)
     assert np.array_equal(found, in_a_file(np.ascontiguousarray(as_file)))
     assert found.flags.c_contiguous and not np.shares_memory(found, array)
 
@@ -47,26 +47,26 @@ def test_a_pil_image_is_taken_as_its_file(mode):
     if mode == "RGBA":
         picture.putalpha(77)
     picture.save(file, "png")
-    assert np.array_equal(pixels(picture), decode_image(file.getvalue()).image)
+    assert np.array_equal(make_rgb_image(picture), decode_image(file.getvalue()).image)
 
 
 def test_what_alpha_hides_is_no_part_of_a_picture():
     array = PICTURE.copy()
     array[..., 3] = 255
     array[:8, :8, 3] = 0
-    made = frame(array, 0, "0.png", 0)
+    made = make_frame(array, 0, "0.png", 0)
     assert made.mask is not None and not made.mask[:8, :8].any() and made.mask.sum() == 24 * 32 - 64
     image = pytest.importorskip("PIL.Image")
-    assert np.array_equal(frame(image.fromarray(array), 0, "0.png", 0).mask, made.mask)
+    assert np.array_equal(make_frame(image.fromarray(array), 0, "0.png", 0).mask, made.mask)
     nothing = np.dstack([PICTURE[..., :3], np.eye(24, 32, dtype=np.uint8)])
     with pytest.raises(ValueError, match="alpha channel hides 96.9 % of it"):
-        frame(nothing, 0, "0.png", 0)
+        make_frame(nothing, 0, "0.png", 0)
 
 
 def test_pictures_of_twelve_used_bits_are_stretched_alike_and_that_is_told():
     told = []
     dark, bright = DEEP >> 5, DEEP >> 4
-    made = [each for each in photographs([dark, bright], None, True, told.append).frames if isinstance(each, Frame)]
+    made = [each for each in load_frames([dark, bright], None, True, told.append).frames if isinstance(each, Frame)]
     assert np.abs(made[1].image[..., 0].astype(int) - (bright >> 4)).max() <= 1
     assert np.abs(made[0].image[..., 0].astype(int) - (dark >> 4)).max() <= 1
     assert any("12 of 16 bits" in str(line) for line in told)
@@ -74,7 +74,7 @@ def test_pictures_of_twelve_used_bits_are_stretched_alike_and_that_is_told():
 
 def test_a_deep_pil_image_keeps_its_upper_bits():
     image = pytest.importorskip("PIL.Image")
-    assert np.array_equal(pixels(image.fromarray(DEEP)), in_a_file(DEEP))
+    assert np.array_equal(make_rgb_image(image.fromarray(DEEP)), in_a_file(DEEP))
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -87,7 +87,7 @@ def test_a_pil_image_is_upright_and_tells_its_lens_time_and_exposure(orientation
     exposed = {0x829A: rational.IFDRational(1, 125), 0x8827: 400}
     exif.get_ifd(0x8769).update({0x9003: "2024:05:06 10:00:07", 0xA405: 28} | exposed)
     written.save(file, "jpeg", exif=exif, quality=95)
-    made = frame(image.open(file), 0, "a.jpg", 0)
+    made = make_frame(image.open(file), 0, "a.jpg", 0)
     expected = decode_image(file.getvalue())
     assert made.image.shape == expected.image.shape
     assert np.abs(made.image.astype(int) - expected.image).mean() < 1.0

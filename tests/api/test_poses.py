@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import splatnode
-from splatnode.api.photographs import frame as frame_of
+from splatnode.api.photographs import make_frame as frame_of
 from splatnode.api.poses import poses_given, sigmas_of
 from splatnode.capture.cameras import synthetic
 from tests.api.conftest import QUICK, SMALL

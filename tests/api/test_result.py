@@ -10,7 +10,7 @@ import pytest
 
 import splatnode
 from splatnode.api.result import result_of
-from splatnode.recon.result.bounds import axes_of
+from splatnode.recon.result.bounds import compute_axes
 from splatnode.recon.result.rendering import render_arrays
 from tests.support.exported import make_snapshot
 
@@ -30,7 +30,9 @@ def test_the_covariance_is_that_of_the_claim(result):
     for camera in result.cameras:
         claimed = np.linalg.norm(camera.bounds.axes, axis=1)
         assert np.allclose(np.sqrt(7.815 * np.linalg.eigvalsh(camera.covariance)[::-1]), claimed)
-        assert np.allclose(axes_of(camera.covariance, camera.bounds.centre), camera.bounds.axes, rtol=0.05, atol=1e-5)
+        assert np.allclose(
+            compute_axes(camera.covariance, camera.bounds.centre), camera.bounds.axes, rtol=0.05, atol=1e-5
+        )
     assert splatnode.Camera("a", np.eye(4), np.eye(3), 2, 2).covariance is None
 
 

@@ -3,14 +3,14 @@ from __future__ import annotations
 import pytest
 
 import splatnode
-from splatnode.api.photographs import photographs
+from splatnode.api.photographs import load_frames
 from splatnode.api.scale import is_stereo, metric_changes, pairs_given
-from splatnode.recon.config import Config, overlaid
+from splatnode.recon.config import ReconstructionConfig, apply_changes
 
 
 def test_what_is_known_of_the_size_becomes_the_configuration():
     known = [("a.jpg", "b.jpg", 0.5), splatnode.Marker(0.08, sigma_m=0.0002), (0, 2, 1)]
-    metric = overlaid(Config(), {"metric": metric_changes(known, of_pictures=True)}).metric
+    metric = apply_changes(ReconstructionConfig(), {"metric": metric_changes(known, of_pictures=True)}).metric
     assert metric.baselines == (("a.jpg", "b.jpg", 0.5), ("0000.png", "0002.png", 1.0))
     assert (metric.marker_m, metric.marker_sigma_m, metric.marker_dictionary) == (0.08, 0.0002, "4X4_50")
     assert metric_changes(splatnode.Marker(0.1), False)["marker_m"] == 0.1
@@ -29,9 +29,9 @@ def test_what_is_no_scale_is_refused(wrong):
 def test_pairs_are_a_folder_or_one_picture_for_each(folder, arrays):
     stereo = splatnode.Stereo(folder, 0.075)
     assert metric_changes([stereo, ("a", "b", 1)], False)["stereo_m"] == 0.075 and is_stereo(stereo)
-    taken = photographs(folder, None, False, lambda _: None).frames
+    taken = load_frames(folder, None, False, lambda _: None).frames
     assert len(pairs_given(stereo, folder, taken)) == len(taken)  # each is its own partner
-    listed = photographs(arrays, None, False, lambda _: None).frames
+    listed = load_frames(arrays, None, False, lambda _: None).frames
     pairs = pairs_given([splatnode.Stereo(arrays, 0.1)], arrays, listed)
     assert [pair.photograph for pair in pairs] == [frame.name for frame in listed]
     assert pairs_given(splatnode.Marker(0.1), arrays, listed) == ()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.av import Video, _Timeline
-from splatnode.capture.video_process import Span, VideoError, VideoFrame, decoded
+from splatnode.capture.video_process import Span, VideoError, VideoFrame, decode_video
 from tests.support.clips import level_images, level_of, packet_times_s, turn, write_clip, write_sound
 
 COUNT, LIMIT = 20, 1_000_000
@@ -52,7 +52,7 @@ FURTHER = [
 
 def read(file: Path, from_s: float = 0.0, to_s: float | None = None, every: int = 1) -> list[VideoFrame]:
     span = Span(round(from_s * 1e9), None if to_s is None else round(to_s * 1e9))
-    return list(decoded(file, every, LIMIT, span))
+    return list(decode_video(file, every, LIMIT, span))
 
 
 def brightness(frame: VideoFrame) -> float:
@@ -192,7 +192,7 @@ def test_square_pixels_stay_as_they_are(tmp_path):
 def test_pixels_that_become_too_many_are_refused(tmp_path):
     file = write_clip(tmp_path / "a.mp4", "libx264", level_images(2), [0, 40], pixel_aspect=Fraction(2))
     with pytest.raises(VideoError, match="its frames are 192 x 64: more than 10000 pixels"):
-        list(decoded(file, 1, 10_000))
+        list(decode_video(file, 1, 10_000))
 
 
 def test_a_stream_that_changes_its_size_gives_both_sizes(tmp_path):
@@ -247,7 +247,7 @@ def read_to_error(file: Path, from_s: float = 0.0) -> tuple[list[VideoFrame], st
 
 
 def iter_until_error(file: Path, from_s: float, found: list[VideoFrame]) -> list[VideoFrame]:
-    for frame in decoded(file, 1, LIMIT, Span(round(from_s * 1e9))):
+    for frame in decode_video(file, 1, LIMIT, Span(round(from_s * 1e9))):
         found.append(frame)
     return []
 

@@ -21,7 +21,7 @@ def film() -> list[Frame]:
     positions = np.linspace(0, WALK.views - 1, FRAMES)
     cameras = [synthetic._camera_on_path(WALK, float(position)) for position in positions]
     return [
-        Frame(i, f"{i:03d}.png", i * 125_000_000, synthetic.photograph(WALK, camera, i), intrinsics=None)
+        Frame(i, f"{i:03d}.png", i * 125_000_000, synthetic.render_image(WALK, camera, i), intrinsics=None)
         for i, camera in enumerate(cameras)
     ]
 

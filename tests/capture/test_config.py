@@ -8,9 +8,9 @@ import pytest
 
 from splatnode import command_line
 from splatnode.capture.config import CaptureConfig
-from splatnode.capture.process.config import ConfigError, load_config, read_yaml, typed
-from splatnode.recon.config import Config as Reconstruction
-from splatnode.recon.daemon.config import Config as Daemon
+from splatnode.capture.process.config import ConfigError, load_config, parse_config, read_yaml
+from splatnode.recon.config import ReconstructionConfig as Reconstruction
+from splatnode.recon.daemon.config import DaemonConfig as Daemon
 from tests.conftest import ROOT
 
 CAMERAS = [path for path in sorted((ROOT / "configs").glob("*.yaml")) if "camera" in read_yaml(path)]
@@ -70,7 +70,7 @@ def test_the_commented_calibration_can_be_used(tmp_path):
 @pytest.mark.parametrize("kind", ["building", "depthai", "synthetic", "v4l2"])
 def test_a_rate_that_no_camera_has_is_refused(kind, rate):
     with pytest.raises(ConfigError, match="camera.frames_per_second: expected float"):
-        typed({"camera": {"kind": kind, "frames_per_second": rate}}, CaptureConfig)
+        parse_config({"camera": {"kind": kind, "frames_per_second": rate}}, CaptureConfig)
 
 
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)

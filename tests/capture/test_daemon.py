@@ -33,7 +33,7 @@ from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Key, Spool
 from splatnode.capture.messaging.wire import encode
 from splatnode.capture.preview import PreviewHeader, decode_preview
-from splatnode.capture.process.after_ready import Failed
+from splatnode.capture.process.after_ready import FailedAfterReady
 from splatnode.capture.status import CaptureStatus, heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
@@ -211,7 +211,7 @@ def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
         for index in range(3):
             header = FrameHeader(session="0" * 32, sequence=index, mono_ns=0, frame_id=0, name=f"old{index}.png",
                                  stamp_ns=5 * 10**18, intrinsics=None)  # fmt: skip
-            spool.put(Key("0" * 32, index), encode(header, [np.zeros((4, 4, 3), np.uint8)]))
+            spool.store(Key("0" * 32, index), encode(header, [np.zeros((4, 4, 3), np.uint8)]))
     process = start(", loops: 1000")
     with KeyframeClient(network(tmp_path)) as client:
         wait_for(lambda: client.receive(0.05))  # a good one comes after those that are refused
@@ -283,7 +283,7 @@ def test_a_camera_that_fails_after_it_gave_frames_is_no_fault_of_the_configurati
         spool=SpoolConfig(directory=tmp_path / "state"),
         network=network(tmp_path),
     )
-    with pytest.raises(Failed, match="half way"):
+    with pytest.raises(FailedAfterReady, match="half way"):
         capture(config)
 
 

@@ -12,11 +12,11 @@ import zmq
 
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.exif import exif_exposure, read_tags
-from splatnode.capture.exposure_settings import ExposureSettings, as_told
-from splatnode.capture.frame import Frame, Intrinsics, renamed
-from splatnode.capture.lenses.undistort import undistorted
-from splatnode.capture.masks import masked
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, received, to_message
+from splatnode.capture.exposure_settings import ExposureSettings, parse_exposure
+from splatnode.capture.frame import Frame, Intrinsics, rename_frame
+from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.masks import apply_mask
+from splatnode.capture.messaging.keyframe_messages import FrameHeader, decode_frame, encode_frame
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Limits, Numbering, WireError, decode, encode
 from splatnode.capture.recording import INDEX, Recorder, read
@@ -33,14 +33,14 @@ def frame(exposure: ExposureSettings | None = TOLD) -> Frame:
 
 
 def test_light_grows_with_time_and_sensitivity_and_shrinks_with_the_square_of_the_f_number():
-    assert TOLD.log_light == pytest.approx(math.log(0.008))
+    assert TOLD.log_exposure == pytest.approx(math.log(0.008))
     for other, times in (
         (replace(TOLD, time_s=0.016), 2.0),
         (replace(TOLD, iso=200.0), 0.5),
         (replace(TOLD, f_number=4.0), 0.25),
     ):
-        assert other.log_light - TOLD.log_light == pytest.approx(math.log(times))
-    assert ExposureSettings(0.01, 100.0).log_light == pytest.approx(math.log(0.01))
+        assert other.log_exposure - TOLD.log_exposure == pytest.approx(math.log(times))
+    assert ExposureSettings(0.01, 100.0).log_exposure == pytest.approx(math.log(0.01))
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_light_grows_with_time_and_sensitivity_and_shrinks_with_the_square_of_th
 def test_what_no_camera_has_is_refused_and_a_camera_that_tells_it_tells_nothing(told, said):
     with pytest.raises(ValueError, match=said):
         ExposureSettings(*told)
-    assert as_told(*told) == (ExposureSettings(*told[:2]) if len(told) == 3 else None)
+    assert parse_exposure(*told) == (ExposureSettings(*told[:2]) if len(told) == 3 else None)
 
 
 @pytest.mark.parametrize("order", "<>")
@@ -94,14 +94,14 @@ def test_damaged_exif_tells_none_and_raises_nothing():
         for place in rng.integers(8, len(whole), 4):
             damaged[place] = rng.integers(256)
         found = exif_exposure(read_tags(bytes(damaged)))
-        assert found is None or math.isfinite(found.log_light)
+        assert found is None or math.isfinite(found.log_exposure)
 
 
 def test_a_message_without_it_is_that_of_a_splatnode_that_knows_none():
     both = frame(None), frame()
-    without, having = (msgspec.msgpack.decode(to_message(each, Numbering("0" * 32))[1]) for each in both)
+    without, having = (msgspec.msgpack.decode(encode_frame(each, Numbering("0" * 32))[1]) for each in both)
     assert set(having[0]) - set(without[0]) == {"exposure"}
-    header = decode(to_message(frame(), Numbering()), FrameHeader).header
+    header = decode(encode_frame(frame(), Numbering()), FrameHeader).header
     fields = msgspec.to_builtins(header) | {"exposure": {"time_s": -1.0, "iso": 100.0}}
     with pytest.raises(WireError, match="the time of an exposure must be"):
         decode(encode(fields, [frame().image]), FrameHeader)  # pyright: ignore[reportArgumentType]
@@ -110,8 +110,8 @@ def test_a_message_without_it_is_that_of_a_splatnode_that_knows_none():
 @pytest.mark.parametrize("exposure", [None, TOLD, ExposureSettings(0.5, 100.0)])
 def test_messages_recordings_and_checkpoints_keep_it(tmp_path, exposure):
     numbering = Numbering()
-    message = [zmq.Frame(bytes(part)) for part in to_message(frame(exposure), numbering)]
-    sent = received(Key(numbering.session, 0), message, Limits()).frame
+    message = [zmq.Frame(bytes(part)) for part in encode_frame(frame(exposure), numbering)]
+    sent = decode_frame(Key(numbering.session, 0), message, Limits()).frame
     assert isinstance(sent, Frame) and sent.exposure == exposure
     with Recorder(tmp_path / "recorded") as recorder:
         recorder.write(frame(exposure))
@@ -127,8 +127,8 @@ def test_a_frame_that_is_renamed_masked_or_undistorted_keeps_it():
     lens = Intrinsics(32, 24, 30.0, 30.0, 16.0, 12.0, "given", (0.05, 0.0, 0.0, 0.0))
     half = np.arange(32) < 16
     changed = (
-        renamed(frame(), 3, "b.png", 7),
-        masked(frame(), np.tile(half, (24, 1))),
-        undistorted(replace(frame(), intrinsics=lens)),
+        rename_frame(frame(), 3, "b.png", 7),
+        apply_mask(frame(), np.tile(half, (24, 1))),
+        undistort_frame(replace(frame(), intrinsics=lens)),
     )
     assert [each.exposure for each in changed if isinstance(each, Frame)] == [TOLD] * 3

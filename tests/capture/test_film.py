@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from splatnode.capture import film
-from splatnode.recon.auditing.stations import Film, recordings
+from splatnode.recon.auditing.stations import Film, find_recordings
 from splatnode.recon.batch import sources
 from splatnode.recon.batch.answer import Outcome
 from splatnode.recon.batch.write_back import write_back
@@ -52,7 +52,7 @@ def test_a_batch_and_an_audit_take_parts_of_a_video(video, tmp_path):
     part = Path(f"{video}#t=1,3")
     (one,) = sources.recordings([part], tmp_path / "out")
     assert (one.name, one.source) == ("film_t=1,3", str(part.resolve()))
-    (visit,) = recordings([part])
+    (visit,) = find_recordings([part])
     assert visit.problem == "" and list(visit.cameras.values()) == [Film(part)]
     row = Outcome(one.name, one.source, "OK", "", True, *[None] * 6, 1.0, None, 1.0, 0, 0.0)
     assert list(write_back([row], tmp_path / "out", in_place=False)) == [], "a video has nothing that is written into"

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import LARGEST_IMAGE, DroppedFrame, Frame, Intrinsics, framed, renamed
+from splatnode.capture.frame import LARGEST_IMAGE, DroppedFrame, Frame, Intrinsics, make_frame, rename_frame
 
 
 def test_K_and_its_size_of_a_resized_image():
@@ -68,14 +68,14 @@ OUT_OF_BOUNDS = {
 @pytest.mark.parametrize("change", OUT_OF_BOUNDS.values(), ids=OUT_OF_BOUNDS)
 def test_what_keeps_no_bounds_is_no_frame_and_is_left_out_with_the_reason(change):
     good = {"frame_id": 0, "name": "a.jpg", "stamp_ns": 0, "image": image(4, 5), "intrinsics": None}
-    assert isinstance(framed(**good), Frame)
+    assert isinstance(make_frame(**good), Frame)
     with pytest.raises(ValueError):
         Frame(**(good | change))
-    dropped = framed(**(good | change))
+    dropped = make_frame(**(good | change))
     assert isinstance(dropped, DroppedFrame) and dropped.reason.startswith("it cannot be used: ")
     if not {"image"} & change.keys():
         kept = {key: value for key, value in (good | change).items() if key not in ("image", "intrinsics")}
-        assert renamed(Frame(**good), **kept) == dropped
+        assert rename_frame(Frame(**good), **kept) == dropped
 
 
 def test_frame_size():

@@ -6,15 +6,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import Frame, renamed
-from splatnode.capture.given_pose import LARGEST_M, given_pose
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, to_message
+from splatnode.capture.frame import Frame, rename_frame
+from splatnode.capture.given_pose import LARGEST_M, make_given_pose
+from splatnode.capture.messaging.keyframe_messages import FrameHeader, encode_frame
 from splatnode.capture.messaging.wire import Numbering, decode
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.recon.daemon.checkpoint.stored_frame import file_name, read_frame, write_frame
 
 MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
-POSE = given_pose(MOVED, 0.02, 1.5)
+POSE = make_given_pose(MOVED, 0.02, 1.5)
 
 
 def frame(pose=POSE) -> Frame:
@@ -23,7 +23,7 @@ def frame(pose=POSE) -> Frame:
 
 def test_a_pose_is_its_matrix_and_how_unsure_it_is():
     assert np.array_equal(POSE.matrix, MOVED) and (POSE.sigma_m, POSE.sigma_deg) == (0.02, 1.5)
-    assert renamed(frame(), 3, "b.png", 7).given_pose == POSE  # pyright: ignore[reportAttributeAccessIssue]
+    assert rename_frame(frame(), 3, "b.png", 7).given_pose == POSE  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize(
@@ -41,15 +41,17 @@ def test_a_pose_is_its_matrix_and_how_unsure_it_is():
 )
 def test_what_is_no_pose_is_refused(T, sigmas, said):
     with pytest.raises(ValueError, match=said):
-        given_pose(T, *sigmas)
+        make_given_pose(T, *sigmas)
 
 
 def test_a_message_without_a_pose_is_that_of_a_splatnode_that_knows_none():
     """To the byte of its header, which an earlier receiver refuses for a field that it does not know."""
-    without, having = (msgspec.msgpack.decode(to_message(frame(pose), Numbering("0" * 32))[1]) for pose in (None, POSE))
+    without, having = (
+        msgspec.msgpack.decode(encode_frame(frame(pose), Numbering("0" * 32))[1]) for pose in (None, POSE)
+    )
     assert "given_pose" not in without[0]
     assert set(having[0]) == {*without[0], "given_pose"}
-    assert decode(to_message(frame(), Numbering()), FrameHeader).header.given_pose == POSE
+    assert decode(encode_frame(frame(), Numbering()), FrameHeader).header.given_pose == POSE
 
 
 @pytest.mark.parametrize("pose", [None, POSE])

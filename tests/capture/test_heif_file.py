@@ -18,7 +18,7 @@ from splatnode.capture import heif_file, image_file
 from splatnode.capture.cameras import folder, watched
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.image_file import UnusableImage, check_whole, decode_image, decode_photograph
+from splatnode.capture.image_file import UnusableImage, check_whole, decode_any_image, decode_image
 from splatnode.capture.pi_heif import BASE_BYTES, BYTES_A_PIXEL
 from splatnode.capture.stamp import Clock, Stamp
 from tests.conftest import ROOT
@@ -54,7 +54,7 @@ def as_avif(orientation: int, pixels: np.ndarray | None = None) -> bytes:
 
 @pytest.mark.parametrize("data", [TURNED, as_avif(6)], ids=["heic", "avif"])
 def test_what_the_file_and_its_exif_both_turn_is_turned_once(data):
-    image, intrinsics, captured_at, exposure, *_ = decode_photograph(data)
+    image, intrinsics, captured_at, exposure, *_ = decode_any_image(data)
     assert exposure == (None if data is TURNED else ExposureSettings(0.008, 400.0))
     assert image.shape == (80, 60, 3) and image.dtype == np.uint8
     np.testing.assert_allclose(corners(image), [BLUE, RED, YELLOW, GREEN], atol=12)
@@ -64,16 +64,16 @@ def test_what_the_file_and_its_exif_both_turn_is_turned_once(data):
 
 
 def test_what_is_not_turned_stays():
-    np.testing.assert_allclose(corners(decode_photograph(as_avif(1)).image), [RED, GREEN, BLUE, YELLOW], atol=12)
+    np.testing.assert_allclose(corners(decode_any_image(as_avif(1)).image), [RED, GREEN, BLUE, YELLOW], atol=12)
 
 
 def test_alpha_is_dropped_and_grey_becomes_colour_and_ten_bits_eight():
-    alpha = decode_photograph((PHOTOGRAPHS / "alpha.heic").read_bytes()).image
+    alpha = decode_any_image((PHOTOGRAPHS / "alpha.heic").read_bytes()).image
     np.testing.assert_allclose(corners(alpha), [RED, GREEN, BLUE, YELLOW], atol=12)
-    grey = decode_photograph((PHOTOGRAPHS / "grey.heic").read_bytes()).image
+    grey = decode_any_image((PHOTOGRAPHS / "grey.heic").read_bytes()).image
     assert grey.shape == (60, 80, 3) and np.array_equal(grey[..., 0], grey[..., 2])
     np.testing.assert_allclose(grey[5, 5], (76, 76, 76), atol=6)
-    ten = decode_photograph((PHOTOGRAPHS / "ten_bits.heic").read_bytes()).image
+    ten = decode_any_image((PHOTOGRAPHS / "ten_bits.heic").read_bytes()).image
     assert ten.shape == (90, 120, 3) and 60 < ten.mean() < 195 and ten.std() > 20
 
 
@@ -109,9 +109,9 @@ def test_a_watched_folder_waits_until_one_is_whole(tmp_path):
 
 
 def test_the_bound_holds_before_anything_is_decoded():
-    assert decode_photograph(TURNED, 80 * 60).image.shape == (80, 60, 3)
+    assert decode_any_image(TURNED, 80 * 60).image.shape == (80, 60, 3)
     with pytest.raises(UnusableImage, match=r"80: more than 4799 pixels; make it smaller"):
-        decode_photograph(TURNED, 80 * 60 - 1)
+        decode_any_image(TURNED, 80 * 60 - 1)
 
 
 def stating(data: bytes, width: int, height: int) -> bytes:
@@ -145,7 +145,7 @@ def decoded(files: list[bytes], bounds: int) -> tuple[int, int]:
     refused = 0
     for file in files:
         try:
-            image = decode_photograph(file, bounds).image
+            image = decode_any_image(file, bounds).image
         except UnusableImage:
             refused += 1
         else:

@@ -12,7 +12,15 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.masks import UnusableMask, all_masked, as_mask, filled, in_files, masked, read_mask
+from splatnode.capture.masks import (
+    UnusableMask,
+    apply_mask,
+    fill_masked,
+    mask_frames,
+    open_masks,
+    parse_mask,
+    read_mask,
+)
 from splatnode.capture.process.config import load_config
 from tests.capture.cameras.test_folder import ORIENTATION, with_exif
 
@@ -39,35 +47,38 @@ def write(path, mask, white=WHITE):
 def test_what_is_hidden_is_filled_from_around_it_and_the_rest_is_as_it_was():
     picture = np.full((48, 64, 3), 90, np.uint8)
     picture[~MASK] = (255, 0, 255)
-    found = masked(frame(image=picture), MASK)
+    found = apply_mask(frame(image=picture), MASK)
     assert isinstance(found, Frame) and found.encoded is None
     assert np.array_equal(found.image, np.full_like(picture, 90)) and np.array_equal(found.mask, MASK)
-    assert np.array_equal(filled(NOISE, MASK)[MASK], NOISE[MASK])
+    assert np.array_equal(fill_masked(NOISE, MASK)[MASK], NOISE[MASK])
 
 
 def test_the_fill_follows_its_surroundings():
     ramp = np.repeat(np.linspace(0, 255, 200)[None, :, None], 100, 0).repeat(3, 2).astype(np.uint8)
     hidden = np.ones((100, 200), bool)
     hidden[30:70, 80:120] = False
-    assert np.abs(filled(np.where(hidden[..., None], ramp, 255).astype(np.uint8), hidden) - ramp.astype(int)).max() < 30
+    assert (
+        np.abs(fill_masked(np.where(hidden[..., None], ramp, 255).astype(np.uint8), hidden) - ramp.astype(int)).max()
+        < 30
+    )
 
 
 def test_masks_of_one_frame_add_up():
     other = np.ones((48, 64), bool)
     other[:10] = False
-    assert np.array_equal(mask_of(masked(replace(frame(), mask=MASK), other)), MASK & other)
+    assert np.array_equal(mask_of(apply_mask(replace(frame(), mask=MASK), other)), MASK & other)
 
 
 def test_a_mask_of_another_size_is_refused_with_both_sizes():
     expected = "32 x 24 pixels (aspect 1.333), its photograph 64 x 48 (aspect 1.333)"
     with pytest.raises(UnusableMask, match=re.escape(expected)):
-        masked(frame(), np.ones((24, 32), bool))
+        apply_mask(frame(), np.ones((24, 32), bool))
 
 
 def test_a_photograph_of_which_the_mask_leaves_nearly_nothing_is_left_out():
     almost = np.zeros((48, 64), bool)
     almost[0, :30] = True
-    found = masked(frame(), almost)
+    found = apply_mask(frame(), almost)
     assert isinstance(found, DroppedFrame)
     assert "leaves 1.0 % of it" in found.reason and "black is ignored; is it inverted?" in found.reason
 
@@ -75,8 +86,8 @@ def test_a_photograph_of_which_the_mask_leaves_nearly_nothing_is_left_out():
 @pytest.mark.parametrize(("name", "white"), [("a.png", 255), ("a.png", 1), ("a.jpg.png", 255), ("a.tif", 255)])
 def test_a_folder_has_masks_by_stem_or_whole_name(tmp_path, name, white):
     write(tmp_path / name, MASK, white)
-    assert np.array_equal(in_files(tmp_path)(frame()), MASK)
-    assert in_files(tmp_path)(frame("b.jpg")) is None
+    assert np.array_equal(open_masks(tmp_path)(frame()), MASK)
+    assert open_masks(tmp_path)(frame("b.jpg")) is None
 
 
 def test_the_noise_of_a_jpeg_is_no_mask(tmp_path):
@@ -84,7 +95,7 @@ def test_the_noise_of_a_jpeg_is_no_mask(tmp_path):
 
 
 def test_a_file_is_the_mask_of_all_photographs(tmp_path):
-    find = in_files(write(tmp_path / "body.png", MASK))
+    find = open_masks(write(tmp_path / "body.png", MASK))
     assert all(np.array_equal(find(frame(name)), MASK) for name in ("a.jpg", "b.jpg"))
 
 
@@ -92,7 +103,7 @@ def test_photographs_without_a_mask_are_used_whole_and_told(tmp_path):
     write(tmp_path / "a.png", MASK)
     told = []
     found = list(
-        all_masked([frame("a.jpg"), frame("b.jpg"), DroppedFrame("c", "damaged")], in_files(tmp_path), told.append)
+        mask_frames([frame("a.jpg"), frame("b.jpg"), DroppedFrame("c", "damaged")], open_masks(tmp_path), told.append)
     )
     assert mask_of(found[0]) is not None and mask_of(found[1]) is None and found[2].name == "c"
     assert told == ["used whole, because there is no mask of it: b.jpg"]
@@ -100,19 +111,19 @@ def test_photographs_without_a_mask_are_used_whole_and_told(tmp_path):
 
 def test_folders_that_cannot_be_masks_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="is not there; give a folder of masks: white"):
-        in_files(tmp_path / "absent")
+        open_masks(tmp_path / "absent")
     with pytest.raises(UnusableMask, match="holds no masks; each must be an image named as its photograph"):
-        in_files(tmp_path)
+        open_masks(tmp_path)
     write(tmp_path / "a.png", MASK)
     write(tmp_path / "a.tif", MASK)
     with pytest.raises(UnusableMask, match=r"two masks of one photograph, a.png and a.tif; remove one"):
-        in_files(tmp_path)
+        open_masks(tmp_path)
 
 
 def test_a_mask_that_is_no_image_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no image")
     with pytest.raises(UnusableMask, match=r"the mask a.png cannot be read: "):
-        in_files(tmp_path)(frame())
+        open_masks(tmp_path)(frame())
 
 
 @pytest.mark.parametrize("orientation", [3, 6, 8])
@@ -132,9 +143,9 @@ def test_a_mask_turns_with_its_photograph(tmp_path, orientation):
 
 def test_arrays_are_masks():
     for given in (MASK, MASK.astype(np.uint8), MASK * 255.0, np.repeat(MASK[..., None], 3, 2).astype(np.uint8)):
-        assert np.array_equal(as_mask(given), MASK)
+        assert np.array_equal(parse_mask(given), MASK)
     with pytest.raises(TypeError, match="a mask must be an array"):
-        as_mask(np.zeros(5))
+        parse_mask(np.zeros(5))
 
 
 def test_the_body_mask_of_a_camera_hides_the_same_of_every_frame(tmp_path):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.frame import Frame, renamed
+from splatnode.capture.frame import Frame, rename_frame
 from splatnode.capture.gravity import Gravity
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, to_message
+from splatnode.capture.messaging.keyframe_messages import FrameHeader, encode_frame
 from splatnode.capture.messaging.wire import Numbering, WireError, decode, encode
 from splatnode.capture.motion import Motion
 from splatnode.capture.recording import INDEX, Recorder, read
@@ -19,7 +19,7 @@ from splatnode.recon.daemon.checkpoint.stored_frame import file_name, read_frame
 
 STEP = np.eye(4)
 STEP[:3, :3], STEP[:3, 3] = Rotation.from_rotvec([0.0, 0.3, 0.0]).as_matrix(), [0.1, 0.0, 0.5]
-MOTION = Motion("a.png").then(STEP, 0.03, 3.0).then(STEP, 0.04, 4.0)
+MOTION = Motion("a.png").append_step(STEP, 0.03, 3.0).append_step(STEP, 0.04, 4.0)
 GRAVITY = Gravity((0.0, 9.81, 0.2), 1.5)
 
 
@@ -34,10 +34,10 @@ def test_steps_add_up_and_what_they_are_unsure_by_squares():
     bent = STEP.copy()
     bent[:3, :3] *= 1.001  # not quite a rotation, as a sender may round it
     for _ in range(2000):
-        long = long.then(bent, 0.01, 1.0)
+        long = long.append_step(bent, 0.01, 1.0)
     np.testing.assert_allclose(long.matrix[:3, :3] @ long.matrix[:3, :3].T, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(GRAVITY.direction @ GRAVITY.direction, 1.0)
-    assert renamed(frame(), 3, "b.png", 7).motion == MOTION  # pyright: ignore[reportAttributeAccessIssue]
+    assert rename_frame(frame(), 3, "b.png", 7).motion == MOTION  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize(
@@ -48,8 +48,8 @@ def test_steps_add_up_and_what_they_are_unsure_by_squares():
         (lambda: replace(MOTION, sigma_m=-1.0), "sigmas of a motion must be 0 or more"),
         (lambda: replace(MOTION, sigma_deg=float("nan")), "sigmas of a motion must be 0 or more"),
         (lambda: replace(MOTION, T_start_current=(1.0,) * 16), "a motion must be a rigid motion"),
-        (lambda: MOTION.then(STEP[:3], 0.1, 1.0), r"\(4, 4\), got \(3, 4\)"),
-        (lambda: MOTION.then(STEP, 0.0, 1.0), "sigmas of a step must be above 0"),
+        (lambda: MOTION.append_step(STEP[:3], 0.1, 1.0), r"\(4, 4\), got \(3, 4\)"),
+        (lambda: MOTION.append_step(STEP, 0.0, 1.0), "sigmas of a step must be above 0"),
         (lambda: Gravity((0.0, 0.0, 0.0)), "not zero"),
         (lambda: Gravity((float("nan"), 0.0, 1.0)), "a direction of three numbers"),
         (lambda: Gravity((0.0, 0.0, 1.0), 0.0), "sigma of gravity must be above 0"),
@@ -62,9 +62,9 @@ def test_what_is_none_is_refused(made, said):
 
 def test_a_message_without_them_is_that_of_a_splatnode_that_knows_none():
     none, both = frame(None, None), frame()
-    without, having = (msgspec.msgpack.decode(to_message(each, Numbering("0" * 32))[1]) for each in (none, both))
+    without, having = (msgspec.msgpack.decode(encode_frame(each, Numbering("0" * 32))[1]) for each in (none, both))
     assert set(having[0]) - set(without[0]) == {"motion", "gravity"}
-    header = decode(to_message(both, Numbering()), FrameHeader).header
+    header = decode(encode_frame(both, Numbering()), FrameHeader).header
     assert (header.motion, header.gravity) == (MOTION, GRAVITY)
     fields = msgspec.to_builtins(header) | {"gravity": {"down": [0.0, 0.0, 0.0], "sigma_deg": 1.0}}
     with pytest.raises(WireError, match="not zero"):

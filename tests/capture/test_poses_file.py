@@ -18,7 +18,7 @@ from splatnode.capture.given_pose import are_rigid, rigid_problem
 from splatnode.capture.poses_file import PosesFileError, Trajectory, poses_of, read_poses
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.export import export_scene
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.write import write_result_folder
 from tests.recon.metric.test_poses import NAMES, TRUE, scene
 
 SEEN = np.zeros((8, 8, 3), np.uint8)
@@ -33,7 +33,7 @@ def frame(name: str, frame_id: int = 0, seconds: float | None = None, clock: Clo
 def saved(tmp_path_factory) -> Path:
     """A result whose cameras are known, in every format that it writes."""
     out = tmp_path_factory.mktemp("saved")
-    finish(scene(), out, seed=0, preset_name="fast")
+    write_result_folder(scene(), out, seed=0, preset_name="fast")
     export_scene(out, "colmap", out / "again")
     return out
 
@@ -57,7 +57,7 @@ def test_a_binary_model_is_read(saved, tmp_path):
 def test_times_between_two_poses_are_interpolated(tmp_path):
     file = tmp_path / "odometry.txt"
     file.write_text("# time x y z qx qy qz qw\n100.0 0 0 0 0 0 0 1\n100.5 1 0 0 0 0 0.7071067811865476 0.70710678\n")
-    found = read_poses(file).of(
+    found = read_poses(file).find_poses(
         [frame("a.png", 0, 100.25), frame("b.png", 1, 100.51), frame("c.png", 2, 101.0), frame("d.png", 3)]
     )
     assert list(found) == ["a.png", "b.png"]
@@ -70,16 +70,16 @@ def test_whole_seconds_are_those_of_a_recording_and_else_may_number_the_frames(t
     file = tmp_path / "odometry.txt"
     file.write_text("".join(f"{second} {second} 0 0 0 0 0 1\n" for second in range(5)))
     timed = [frame(f"{number}.png", number, number / 10, Clock.RECORDING) for number in range(40)]
-    found = read_poses(file).of(timed)
+    found = read_poses(file).find_poses(timed)
     np.testing.assert_allclose([T[0, 3] for T in found.values()], np.arange(40) / 10, atol=1e-9)
-    numbered = read_poses(file).of([frame("a.png", 3), frame("b.png", 4, 1.7e9)])
+    numbered = read_poses(file).find_poses([frame("a.png", 3), frame("b.png", 4, 1.7e9)])
     assert [T[0, 3] for T in numbered.values()] == [3.0, 4.0]
 
 
 def test_a_trajectory_may_name_photographs(tmp_path):
     file = tmp_path / "poses.tum"
     file.write_text("a.jpg 1 2 3 0 0 0 1\nb.jpg 4 5 6 0 0 0 1\n")
-    found = read_poses(file).of([frame("b.jpg"), frame("c.jpg")])
+    found = read_poses(file).find_poses([frame("b.jpg"), frame("c.jpg")])
     assert list(found) == ["b.jpg"] and found["b.jpg"][:3, 3].tolist() == [4.0, 5.0, 6.0]
 
 
@@ -169,7 +169,7 @@ def test_a_time_is_looked_up_without_a_look_at_all_others(tmp_path):
     trajectory = Trajectory(seconds=seconds, Ts=np.broadcast_to(np.eye(4), (len(seconds), 4, 4)))
     frames = [frame(f"{number}.png", number) for number in range(500)]
     began = time.process_time()
-    assert len(trajectory.of(frames)) == 500
+    assert len(trajectory.find_poses(frames)) == 500
     taken_s = time.process_time() - began
     began = time.process_time()
     for _ in range(50):

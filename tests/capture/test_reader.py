@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.nothing_new import NothingNew
-from splatnode.capture.reader import Config, Reader, State
+from splatnode.capture.nothing_new import KeepAlive
+from splatnode.capture.reader import Config, Reader, ReaderState
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.messaging.test_sockets import wait_for
 
@@ -35,7 +35,7 @@ def read_all(reader):
     def finished():
         if (item := reader.next(0.05)) is not None:
             items.append(item)
-        return reader.state is State.FINISHED
+        return reader.state is ReaderState.FINISHED
 
     wait_for(finished)
     return items
@@ -64,7 +64,7 @@ def test_a_recording_is_not_finished_before_all_of_it_was_read():
         states = [reader.state]
         while reader.next(0.05) is not None:
             states.append(reader.state)
-    assert states == [State.STREAMING, State.STREAMING, State.FINISHED]
+    assert states == [ReaderState.STREAMING, ReaderState.STREAMING, ReaderState.FINISHED]
 
 
 def test_of_a_live_camera_the_newest_are_read():
@@ -111,16 +111,16 @@ def test_a_loss_is_over_once_the_camera_is_there_though_it_has_no_frame(clock):
             raise CameraUnavailable("cannot watch the folder")
         while not lost.is_set():
             back.set()
-            yield NothingNew()
+            yield KeepAlive()
             time.sleep(0.001)
         raise CameraUnavailable("cannot watch the folder")
 
     def is_lost_and_back():
         lost.set()
-        wait_for(lambda: reader.state is State.DEGRADED and "cannot watch" in reader.why)
+        wait_for(lambda: reader.state is ReaderState.DEGRADED and "cannot watch" in reader.why)
         back.clear()
         lost.clear()
-        wait_for(lambda: back.is_set() and reader.state is State.STARTING and not reader.why)
+        wait_for(lambda: back.is_set() and reader.state is ReaderState.STARTING and not reader.why)
         assert reader.next(0) is None
 
     with Reader(camera, live=False, config=QUICK) as reader:
@@ -141,7 +141,7 @@ def test_while_it_is_lost_it_says_so(clock):
 
     with Reader(camera, live=True, config=QUICK) as reader:
         assert reader.next(60).name == "0"
-        wait_for(lambda: reader.state is State.DEGRADED and "no camera" in reader.why)
+        wait_for(lambda: reader.state is ReaderState.DEGRADED and "no camera" in reader.why)
         clock.s += 1.1
         with pytest.raises(CameraUnavailable, match="no frame|no camera"):
             while True:
@@ -167,9 +167,9 @@ def test_a_silent_camera_is_degraded_and_then_given_up(clock):
 
     with Reader(camera, live=True, config=QUICK) as reader, contextlib.ExitStack() as end:
         end.callback(closing.set)
-        assert reader.next(60) is not None and reader.state is State.STREAMING
+        assert reader.next(60) is not None and reader.state is ReaderState.STREAMING
         clock.s += 0.3
-        assert reader.state is State.DEGRADED
+        assert reader.state is ReaderState.DEGRADED
         clock.s += 1.1
         with pytest.raises(CameraUnavailable, match="no frame for 1 s"):
             while True:
@@ -187,7 +187,7 @@ def test_a_camera_of_damaged_frames_alone_is_degraded_and_then_given_up(clock):
         assert reader.next(60) is not None
         wait_for(lambda: isinstance(reader.next(60), DroppedFrame))
         clock.s += 0.3
-        wait_for(lambda: isinstance(reader.next(60), DroppedFrame) and reader.state is State.DEGRADED)
+        wait_for(lambda: isinstance(reader.next(60), DroppedFrame) and reader.state is ReaderState.DEGRADED)
         clock.s += 1.1
         with pytest.raises(CameraUnavailable, match="no frame for 1 s that can be used; the last: the driver says"):
             while True:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import folder
-from splatnode.capture.frame import DroppedFrame, Frame, renamed
+from splatnode.capture.frame import DroppedFrame, Frame, rename_frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.messaging.keyframe_messages import to_message
+from splatnode.capture.messaging.keyframe_messages import encode_frame
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.recording import Recorder, read
 from splatnode.capture.right_image import Baseline, RightImage
@@ -30,13 +30,13 @@ def same(found, right) -> bool:
 
 
 def test_a_frame_of_another_name_keeps_it():
-    other = renamed(frame(), 3, "b.png", 7)
+    other = rename_frame(frame(), 3, "b.png", 7)
     assert isinstance(other, Frame) and same(other.right, RIGHT)
 
 
 def test_a_message_without_one_is_that_of_a_splatnode_that_knows_none():
     without, having = (
-        msgspec.msgpack.decode(to_message(frame(each), Numbering("0" * 32))[1]) for each in (None, RIGHT)
+        msgspec.msgpack.decode(encode_frame(frame(each), Numbering("0" * 32))[1]) for each in (None, RIGHT)
     )
     assert set(having[0]) == {*without[0], "baseline"} and len(without[1]) == 1 and len(having[1]) == 2
 

@@ -15,11 +15,11 @@ from splatnode.capture.selection import (
     REMEMBERED_BLURS,
     REMEMBERED_VIEWS,
     Config,
-    Motion,
+    CornerMotion,
     Selector,
+    explain_decision,
     measure,
     track,
-    what_it_adds,
 )
 from tests.support import synthetic
 
@@ -152,22 +152,22 @@ def test_parallax_is_what_no_homography_explains():
     motion = measure(corners, moved, everything, 320)
     assert motion.parallax > 0.005
     assert motion.median == pytest.approx(np.median(30 / depths) / 320, rel=1e-5)
-    assert measure(corners, moved, np.arange(60) < 5, 320) == Motion(1.0, 0.0, 0.0)
+    assert measure(corners, moved, np.arange(60) < 5, 320) == CornerMotion(1.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
     ("motion", "what"),
     [
-        (Motion(0.3, 0.0, 0.0), "coverage"),
-        (Motion(0.0, 0.1, 0.0), "motion"),
-        (Motion(0.0, 0.05, 0.02), "parallax"),
-        (Motion(0.1, 0.05, 0.005), None),
+        (CornerMotion(0.3, 0.0, 0.0), "coverage"),
+        (CornerMotion(0.0, 0.1, 0.0), "motion"),
+        (CornerMotion(0.0, 0.05, 0.02), "parallax"),
+        (CornerMotion(0.1, 0.05, 0.005), None),
     ],
 )
 def test_reasons(motion, what):
-    reason, adds = what_it_adds(motion, Config())
+    reason, adds = explain_decision(motion, Config())
     assert adds == (what is not None) and reason.startswith(what or "adds too little")
-    assert not what_it_adds(motion, Config(), strictness=10)[1]
+    assert not explain_decision(motion, Config(), strictness=10)[1]
 
 
 def test_the_built_in_capture_is_taken_whole():

@@ -5,14 +5,14 @@ from __future__ import annotations
 import msgspec
 
 from splatnode.capture.status import CaptureStatus
-from splatnode.capture.status_words import _NOT_PRINTED, _WORDS, described
+from splatnode.capture.status_words import _NOT_PRINTED, _WORDS, describe_heartbeat
 from splatnode.recon.daemon.status import ReconStatus
 
 RECON = {"state": "growing", "keyframe": 7, "queue": 17, "delay_s": 240.1, "keyframe_s": 26.4, "camera_moved": False}
 
 
 def test_a_heartbeat_is_told_in_words_with_units():
-    assert described("recon", RECON) == [
+    assert describe_heartbeat("recon", RECON) == [
         "recon: growing",
         "  last keyframe           number 7",
         "  keyframes waiting       17",
@@ -23,7 +23,7 @@ def test_a_heartbeat_is_told_in_words_with_units():
 
 
 def test_what_is_not_known_yet_is_not_told():
-    assert described("recon", {"state": "waiting", "keyframe": -1, "keyframe_s": None, "problem": ""}) == [
+    assert describe_heartbeat("recon", {"state": "waiting", "keyframe": -1, "keyframe_s": None, "problem": ""}) == [
         "recon: waiting"
     ]
 
@@ -36,7 +36,7 @@ def test_a_node_that_is_loading_says_so_and_no_zeros():
         "delay_s": 2.0,
         "delay": "25 keyframes are being loaded",
     }
-    assert described("recon", fields) == [
+    assert describe_heartbeat("recon", fields) == [
         "recon: loading",
         "  delay                   2 s",
         "  because                 25 keyframes are being loaded",
@@ -46,7 +46,7 @@ def test_a_node_that_is_loading_says_so_and_no_zeros():
 def test_each_place_is_told_in_a_line_of_its_own():
     here = {"scene_id": "scene-0002", "state": "here", "verdict": "OK", "keyframes": 1, "left_out": 0, "seconds": 4.2}
     left = {"scene_id": "scene-0001", "state": "left", "verdict": "OK", "keyframes": 12, "left_out": 3, "rss_mb": 512.0}
-    assert described("recon", {"state": "growing", "newest_places": [left, here]}) == [
+    assert describe_heartbeat("recon", {"state": "growing", "newest_places": [left, here]}) == [
         "recon: growing",
         "  places                  scene-0001: left, OK, 12 photographs, 3 left out, 0 s of work, 512 MB",
         "                          scene-0002: here, OK, 1 photograph, 4 s of work, 0 MB",

@@ -14,7 +14,7 @@ import pytest
 
 from splatnode.capture.cameras.video import Config, stream
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.video_process import BASE_BYTES, BYTES_A_PIXEL, Span, VideoError, VideoFrame, decoded
+from splatnode.capture.video_process import BASE_BYTES, BYTES_A_PIXEL, Span, VideoError, VideoFrame, decode_video
 from tests.support.crafted import Crafted, videos
 from tests.support.crafted.bounded import MARGIN, readings
 
@@ -60,7 +60,7 @@ def test_a_decoder_ends_with_its_reader(tmp_path):
     small = next(file for file in videos() if file.name == "container.avi")
     (tmp_path / "a.avi").write_bytes(small.data)
     before = _children()
-    frames = decoded(tmp_path / "a.avi", 1, LIMIT)
+    frames = decode_video(tmp_path / "a.avi", 1, LIMIT)
     assert next(frames).image.shape == (48, 64, 3)
     assert _children() - before
     del frames
@@ -72,7 +72,7 @@ def test_a_decoder_that_ends_early_is_told_after_the_frames_before(tmp_path, mon
     (tmp_path / "a.avi").write_bytes(small.data)
 
     def failing(*_):
-        frames = decoded(tmp_path / "a.avi", 1, LIMIT)
+        frames = decode_video(tmp_path / "a.avi", 1, LIMIT)
         yield from itertools.islice(frames, 2)
         raise VideoError("its decoder ended (-11)")
 
@@ -92,7 +92,7 @@ def test_a_video_that_was_cut_is_told_after_its_frames(tmp_path, span, whole):
     writer.release()
     data = (tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
-    found = list(until_error(decoded(tmp_path / "cut.avi", 1, LIMIT, span)))
+    found = list(until_error(decode_video(tmp_path / "cut.avi", 1, LIMIT, span)))
     errors = [item for item in found if isinstance(item, VideoError)]
     count = len(found) - len(errors)
     assert count == 5 if whole else 5 < count < 36
@@ -115,7 +115,7 @@ def test_frames_pass_unchanged(tmp_path):
     for frame in frames:
         writer.write(frame)
     writer.release()
-    found = [frame.image[:, :, ::-1] for frame in decoded(tmp_path / "a.avi", 1, LIMIT)]
+    found = [frame.image[:, :, ::-1] for frame in decode_video(tmp_path / "a.avi", 1, LIMIT)]
     np.testing.assert_array_equal(found, frames)
 
 

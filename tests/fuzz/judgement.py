@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.process.config_text import ConfigError
-from splatnode.capture.process.printable import LONGEST_LINE, printable_lines
+from splatnode.capture.process.printable import LONGEST_LINE, sanitize_lines
 from splatnode.command_line import exit_code, explain
 
 MOST_SECONDS = 1.0  # of processor time, for one case
@@ -54,7 +54,7 @@ def _contents(value: Any) -> Iterable[tuple[str, Any]]:
 def problem_of_refusal(error: BaseException) -> str:
     """What is wrong with how a refusal is told; empty where nothing is."""
     code = exit_code(error)
-    text = explain(error, code) if isinstance(error, Exception) else printable_lines(error)
+    text = explain(error, code) if isinstance(error, Exception) else sanitize_lines(error)
     lines = text.split("\n")
     if code == _INTERNAL and isinstance(error, (ValueError, OSError)):
         return f"it is called an internal error: {text[:200]}"

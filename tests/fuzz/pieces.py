@@ -24,7 +24,7 @@ from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.stored import read_gaussians
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.verdict import Code
 from tests.fuzz.interrupted import Piece, Tell
 from tests.support.exported import make_gaussians, make_snapshot, write
@@ -62,14 +62,14 @@ def _spooling(disk: Path, tell: Tell) -> None:
         spool.remove(Key(SESSION, sequence))
     tell("setting 1 aside")
     if Key(SESSION, 1) in spool:
-        spool.set_aside(Key(SESSION, 1), "1.png", "refused by recon")
+        spool.move_to_quarantine(Key(SESSION, 1), "1.png", "refused by recon")
     _put(spool, 4, tell)
     spool.close()
 
 
 def _put(spool: Spool, sequence: int, tell: Tell) -> None:
     with contextlib.suppress(SpoolFull):
-        spool.put(Key(SESSION, sequence), _parts(sequence))
+        spool.store(Key(SESSION, sequence), _parts(sequence))
         tell(f"put {sequence}")
 
 
@@ -87,7 +87,7 @@ def _spool_after(disk: Path, told: list[str]) -> None:
     aside = spool.quarantine.newest(9)
     assert all(each.file.endswith("-1.frame") or each.reason == "its reason was lost" for each in aside), aside
     assert len(aside) <= 1 and len(list(spool.quarantine.directory.glob("*.frame"))) == len(aside)
-    spool.put(Key(SESSION, 9), _parts(9))
+    spool.store(Key(SESSION, 9), _parts(9))
     spool.close()
     assert list(_spool(disk))[-1] == Key(SESSION, 9)
 
@@ -112,7 +112,8 @@ def _storing(disk: Path, tell: Tell) -> None:
     doing = partial(_doing, tell)
     for sequence in range(3):
         doing(
-            f"put {sequence}", lambda sequence=sequence: store.put(ReceivedFrame(SESSION, sequence, _frame(sequence)))
+            f"put {sequence}",
+            lambda sequence=sequence: store.add_frame(ReceivedFrame(SESSION, sequence, _frame(sequence))),
         )
     for number in range(2):
         for name in MADE_ANEW:
@@ -122,25 +123,25 @@ def _storing(disk: Path, tell: Tell) -> None:
             )
     doing("forget 1", lambda: store.forget("1.png", "blurred"))
     dropped = ReceivedFrame(SESSION, 3, DroppedFrame("3.png", "black"))
-    doing("drop 3", lambda: store.put(dropped))
-    doing("put 4", lambda: store.put(ReceivedFrame(SESSION, 4, _frame(4))))
+    doing("drop 3", lambda: store.add_frame(dropped))
+    doing("put 4", lambda: store.add_frame(ReceivedFrame(SESSION, 4, _frame(4))))
     first = store._names.get("4.png", store._next)
-    doing("place", lambda: store.leave_place(first))
-    doing("put 5", lambda: store.put(ReceivedFrame(SESSION, 5, _frame(5))))
+    doing("place", lambda: store.leave_submap(first))
+    doing("put 5", lambda: store.add_frame(ReceivedFrame(SESSION, 5, _frame(5))))
     doing("save graph 2", lambda: store.save("graph", _Thing(2), _arrays(2)))
     doing("finish", lambda: _finishing(store))
-    doing("retract 0", lambda: store.retract_elsewhere("0.png", ["scene-0001"]))
+    doing("retract 0", lambda: store.request_removal("0.png", ["scene-0001"]))
     doing("retracting 0", lambda: _retracting(store))
     store.close()
 
 
 def _finishing(store: Store) -> None:
     """Takes the place that was left among the finished ones, as the daemon does once its scene is final."""
-    for folder in left.folders(store.directory):
+    for folder in left.list_left_folders(store.directory):
         with contextlib.closing(Store(folder)) as kept:
             kept.save("codes", _Thing(3), _arrays(3))
-            kept.remove_shown()
-            kept.finish()
+            kept.remove_scene_files()
+            kept.finalize()
 
 
 def _retracting(store: Store) -> None:
@@ -150,7 +151,7 @@ def _retracting(store: Store) -> None:
         if folder is not None:
             with contextlib.closing(Store(folder)) as kept:
                 kept.forget(name, "retracted")
-        store.was_retracted(scene, name)
+        store.confirm_removal(scene, name)
 
 
 def _doing(tell: Tell, what: str, work: Callable[[], object]) -> None:
@@ -171,35 +172,35 @@ def _store_after(disk: Path, told: list[str]) -> None:
     for stored in frames.values():
         assert np.array_equal(stored.frame.image, _frame(stored.key[1]).image)
     promised = {sequence for sequence in (0, 1, 2, 4, 5) if f"put {sequence}" in told}
-    seen = {sequence for _, sequence in store.seen}
+    seen = {sequence for _, sequence in store.frame_keys}
     assert promised <= seen, f"would be taken twice: {promised - seen}"
     gone = {1} if "begin forget 1" in told else set()
     gone |= {0, 1, 2} if "begin place" in told else set()
     assert promised - gone <= set(frames), f"lost: {promised - gone - set(frames)}"
     if "forget 1" in told:
-        assert 1 not in frames and ("1.png" in {each.name for each in store.dropped} or "begin place" in told)
+        assert 1 not in frames and ("1.png" in {each.name for each in store.frames_dropped} or "begin place" in told)
     if "place" in told:
         assert not {0, 1, 2} & set(frames) and store.scene_id == "scene-0002"
     _left_after(store, promised & {0, 2}, told)
-    assert not {stored.frame.name for stored in frames.values()} & {each.name for each in store.dropped}
+    assert not {stored.frame.name for stored in frames.values()} & {each.name for each in store.frames_dropped}
     assert not list(disk.rglob("*.damaged")), "a whole frame was called damaged"
     for name in MADE_ANEW:
         _made_anew_after(store, name, told, another_place=store.scene_id == "scene-0002")
-    again = store.put(ReceivedFrame(SESSION, 6, _frame(6)))
+    again = store.add_frame(ReceivedFrame(SESSION, 6, _frame(6)))
     assert again is not None and all(again.number > stored.number for stored in frames.values())
     store.close()
 
 
 def _left_after(store: Store, promised: set[int], told: list[str]) -> None:
     """A place is here, in left/ or in finished/, whole each way."""
-    folders = [*left.folders(store.directory), *left.finished(store.directory)]
+    folders = [*left.list_left_folders(store.directory), *left.list_finished_folders(store.directory)]
     assert len(folders) == (store.scene_id == "scene-0002"), folders
     if "retract 0" in told and folders:
         _retracting(store)
         promised = promised - {0}
     elif "begin retract 0" in told:
         promised = promised - {0}
-    folders = [*left.folders(store.directory), *left.finished(store.directory)]
+    folders = [*left.list_left_folders(store.directory), *left.list_finished_folders(store.directory)]
     for folder in folders:
         with contextlib.closing(Store(folder)) as kept:
             frames = {stored.key[1] for stored in kept.frames()}
@@ -224,23 +225,23 @@ def _old_result(disk: Path) -> None:
 
 
 def _new_result(disk: Path, _: Tell) -> None:
-    with result_folder(disk / "out"):
+    with hold_result_folder(disk / "out"):
         write(replace(make_snapshot(), gaussians=make_gaussians(seed=9)), disk / "out", preview=b"new")
 
 
 def _refused_result(disk: Path, _: Tell) -> None:
-    with result_folder(disk / "out"):
+    with hold_result_folder(disk / "out"):
         write(make_snapshot(Code.NO_PARALLAX, publishable=False), disk / "out")
 
 
 def _result_after(disk: Path, _: list[str]) -> None:
     out = disk / "out"
-    with result_folder(out):
+    with hold_result_folder(out):
         pass
     no_leftovers(disk)
     if any(path.is_file() for path in out.rglob("*")):
         whole(out)
-    with result_folder(out):
+    with hold_result_folder(out):
         write(make_snapshot(), out, preview=b"again")
     whole(out)
     assert (out / "preview.png").read_bytes() == b"again"

@@ -15,13 +15,13 @@ from splatnode.capture.messaging.keyframes import KeyframeServer
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Spool
-from splatnode.capture.process.config import typed
+from splatnode.capture.process.config import parse_config
 from splatnode.command_line import main
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.daemon import Daemon
-from splatnode.recon.daemon.status import State
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.daemon.status import ReconState
+from splatnode.recon.result.folder import hold_result_folder
 from tests.bench.node.trial import RECON
 from tests.fuzz.interrupted import Piece, Tell, in_a_fork
 from tests.fuzz.pieces import no_leftovers, whole
@@ -49,7 +49,7 @@ def _replaying(disk: Path, _: Tell) -> None:
 def _replayed_after(disk: Path, told: list[str]) -> None:
     out = disk / "out"
     if out.exists():
-        with result_folder(out):
+        with hold_result_folder(out):
             pass
         if any(path.is_file() for path in out.rglob("*")):
             whole(out)
@@ -75,7 +75,7 @@ def _growing(disk: Path, tell: Tell) -> None:
     """A node, until its scene has all keyframes, is finished and exported."""
     _silent(disk)
     recon = {"checkpoint": str(disk / "checkpoint"), "out": str(disk / "out"), "status_every_s": 0.1}
-    config = typed(RECON | {"reconstruction": RECIPE} | recon, Config)
+    config = parse_config(RECON | {"reconstruction": RECIPE} | recon, DaemonConfig)
     config = msgspec.structs.replace(config, network=_network(disk))
     stopping = threading.Event()
     with KeyframeServer(config.network, Spool(SpoolConfig(directory=disk))) as server, Daemon(config, stopping) as node:
@@ -86,7 +86,7 @@ def _growing(disk: Path, tell: Tell) -> None:
         finally:
             stopping.set()
             ending.join()
-    tell(node._status().problem or "whole")
+    tell(node._make_status().problem or "whole")
 
 
 def _until_finished(server: KeyframeServer, node: Daemon, stopping: threading.Event) -> None:
@@ -94,8 +94,8 @@ def _until_finished(server: KeyframeServer, node: Daemon, stopping: threading.Ev
     while not stopping.is_set():
         with contextlib.suppress(OSError):
             server.serve(0.05)
-        status = node._status()
-        if status.problem or (status.state is State.IDLE and status.keyframes == VIEWS and not server.queued):
+        status = node._make_status()
+        if status.problem or (status.state is ReconState.IDLE and status.keyframes == VIEWS and not server.num_queued):
             stopping.set()
 
 

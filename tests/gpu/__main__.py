@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from splatnode.recon.jobs.cores import usable_cores
-from splatnode.recon.rasterize.device import DeviceUnavailable, chosen, in_words
+from splatnode.recon.rasterize.device import DeviceUnavailable, choose_device, format_device
 from tests.gpu.agreement import Figure, figures, whole_figures
 from tests.gpu.speed import milliseconds, refinement_ms
 
@@ -28,11 +28,11 @@ def main() -> int:
     parser.add_argument("--out", type=Path, metavar="FILE", help="where to write the figures as JSON")
     arguments = parser.parse_args()
     try:
-        device = chosen("cuda")
+        device = choose_device("cuda")
     except DeviceUnavailable as error:
         print(error, file=sys.stderr)
         return error.exit_code
-    print(in_words("cuda", device), flush=True)
+    print(format_device("cuda", device), flush=True)
     found: list[Figure] = []
     for figure in figures(device):
         found.append(figure)

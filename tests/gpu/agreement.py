@@ -15,15 +15,15 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder as folder_camera
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.cli import held_out_quality
-from splatnode.recon.config import overlaid, preset
+from splatnode.recon.cli import evaluate_held_out_views
+from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.evaluate.demo import write_capture
 from splatnode.recon.offline import run
 from splatnode.recon.optimize.adam import Adam
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-from splatnode.recon.optimize.refinement import Config, refine
+from splatnode.recon.optimize.refinement import RefinementConfig, refine
 from splatnode.recon.rasterize import dispatch, reference
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.scene.scene import Scene
@@ -137,12 +137,15 @@ def _refinement(device: torch.device, iterations: int, computing: Computing) -> 
     truth = photographed()
     begun = turned(disturbed(truth))
     config = structs.replace(
-        Config(), iterations=iterations, checkpoints=(), control=ControlChoice("prune", prune.Config(min_iterations=0))
+        RefinementConfig(),
+        iterations=iterations,
+        checkpoints=(),
+        control=ControlChoice("prune", prune.Config(min_iterations=0)),
     )
 
     def refined(on: torch.device) -> Scene:
-        *_, end = refine(begun.on(on), config, seed=0)
-        return end.on(torch.device("cpu"))
+        *_, end = refine(begun.move_to_device(on), config, seed=0)
+        return end.move_to_device(torch.device("cpu"))
 
     expected = refined(torch.device("cpu"))
     with computing():
@@ -167,9 +170,9 @@ def whole_figures(device: Device, folder: Path, preset_name: str = "fast") -> tu
     split = write_capture(folder, synthetic.Config())
     scores, seconds = [], {}
     for on in ("cpu", device):
-        config = overlaid(preset(preset_name), {"device": on})
+        config = apply_changes(preset(preset_name), {"device": on})
         snapshot = run(folder_camera.stream(folder_camera.Config(folder=folder / "images", names=split.train)), config)
-        scores.append(held_out_quality(snapshot, folder, split, on))
+        scores.append(evaluate_held_out_views(snapshot, folder, split, on))
         seconds[f"built-in capture, {preset_name}, refinement on {on}, s"] = snapshot.seconds["optimise"]
     differences = {name: float(scores[1][name] or 0) - float(scores[0][name] or 0) for name in ("psnr", "ssim")}
     return [

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.start import find_start, foundation
-from splatnode.recon.modelling import begin_scene
+from splatnode.recon.evaluate.start import extract_start_config, find_start
+from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize.adam import Adam
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-from splatnode.recon.optimize.refinement import Config, refine
+from splatnode.recon.optimize.refinement import RefinementConfig, refine
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.scene.scene import Scene
 from tests.bench.speed.rasterize import CASES, LRS, Case, bumpy_surface
@@ -91,18 +91,20 @@ def refinement_ms(device: torch.device) -> dict[str, float]:
     """The median of an iteration of the built-in capture's refinement on the processor and on `device`."""
     config = preset("balanced")
     steps = structs.replace(config.optimize, iterations=STEPS, checkpoints=())
-    scene = begin_scene(find_start(list(synthetic.stream(synthetic.Config())), foundation(config)).estimate, config)
+    scene = create_initial_scene(
+        find_start(list(synthetic.stream(synthetic.Config())), extract_start_config(config)).estimate, config
+    )
     assert scene is not None  # the built-in capture is known to give one
     found: dict[str, float] = {}
     for on in (torch.device("cpu"), device):
-        taken = list(_between_steps(scene.on(on), steps))
+        taken = list(_between_steps(scene.move_to_device(on), steps))
         name = f"built-in capture, balanced, {len(scene.gaussians)} Gaussians at first, on {on.type}"
         found[f"{name}, ms an iteration"] = _median(taken)
         found[f"{name}, s of the first iteration"] = 1e-3 * taken[0]
     return found
 
 
-def _between_steps(scene: Scene, steps: Config) -> Iterator[float]:
+def _between_steps(scene: Scene, steps: RefinementConfig) -> Iterator[float]:
     """Milliseconds from the end of each step to that of the next one."""
     times = [time.perf_counter()]
     for _ in refine(scene, steps, seed=0, gone_on=lambda _: times.append(time.perf_counter())):

@@ -29,7 +29,7 @@ def test_gsplats_own_pytorch_agrees_with_the_core():
 
 @needs_gpu
 def test_a_gpu_agrees_with_the_processor():
-    if (obstacle := gsplat.obstacle()) is not None:
+    if (obstacle := gsplat.find_unavailable_reason()) is not None:
         pytest.skip(f"needs the extra cuda: {obstacle}")
     for figure in figures(torch.device("cuda")):
         assert figure.kept, figure
@@ -37,7 +37,7 @@ def test_a_gpu_agrees_with_the_processor():
 
 @needs_gpu
 def test_a_reconstruction_on_a_gpu_is_as_good(tmp_path):
-    if (obstacle := gsplat.obstacle()) is not None:
+    if (obstacle := gsplat.find_unavailable_reason()) is not None:
         pytest.skip(f"needs the extra cuda: {obstacle}")
     for figure in whole_figures("cuda", tmp_path)[0]:
         assert figure.kept, figure

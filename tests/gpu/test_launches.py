@@ -7,8 +7,8 @@ from msgspec import structs
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from splatnode.recon.optimize.fit import Fit
-from splatnode.recon.optimize.refinement import Config
+from splatnode.recon.optimize.fit import Trainer
+from splatnode.recon.optimize.refinement import RefinementConfig
 from tests.support import gsplat_by_torch
 from tests.support.known_scene import photographed
 
@@ -78,7 +78,7 @@ def test_a_step_has_few_launches(monkeypatch):
         ("_make_lazy_cuda_func", _kernel),
     ):
         monkeypatch.setattr(f"gsplat.cuda._wrapper.{name}", substitute)
-    fit = Fit(photographed(), structs.replace(Config(), control=None), seed=0)
+    fit = Trainer(photographed(), structs.replace(RefinementConfig(), control=None), seed=0)
     fit.step(1, 0.1)  # what is computed once
     with _Counted() as counted:
         fit.step(2, 0.1)

@@ -75,7 +75,7 @@ def test_the_picture_that_an_earlier_run_showed_is_removed_and_others_stay(tmp_p
     for name in ("live.png", "mine.png"):
         (pictures / name).write_bytes(b"a picture")
     with cli._viewer(argparse.Namespace(out=tmp_path, view=False)) as show:
-        assert show is offline.shown_to_nobody
+        assert show is offline.ignore_snapshot
     assert [path.name for path in pictures.iterdir()] == ["mine.png"]
 
 

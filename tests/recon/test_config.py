@@ -6,38 +6,38 @@ import msgspec
 import pytest
 
 from splatnode.capture.process.config import ConfigError
-from splatnode.recon.config import Config, overlaid, preset
-from splatnode.recon.result.export.formats.ply import ply_bytes
+from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
+from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 
 
 def test_of_two_limits_the_tighter_one_holds():
-    assert Config().most_gaussians is None
-    assert Config(max_gaussians=900).most_gaussians == 900
-    assert Config(max_gaussians=900, max_mb=1.0).most_gaussians == 900
-    by_size = Config(max_gaussians=90_000, max_mb=1.0).most_gaussians
+    assert ReconstructionConfig().most_gaussians is None
+    assert ReconstructionConfig(max_gaussians=900).most_gaussians == 900
+    assert ReconstructionConfig(max_gaussians=900, max_mb=1.0).most_gaussians == 900
+    by_size = ReconstructionConfig(max_gaussians=90_000, max_mb=1.0).most_gaussians
     assert by_size is not None and by_size < 90_000
-    assert 0.999e6 < ply_bytes(by_size, 1) <= 1e6
+    assert 0.999e6 < compute_ply_bytes(by_size, 1) <= 1e6
 
 
 def test_more_begin_than_may_stay_only_where_something_takes_them_away():
-    limited = Config(max_gaussians=1000)
+    limited = ReconstructionConfig(max_gaussians=1000)
     assert limited.first_gaussians == 2000
-    assert Config().first_gaussians is None
+    assert ReconstructionConfig().first_gaussians is None
     free = msgspec.structs.replace(limited.optimize, control=None)
     assert msgspec.structs.replace(limited, optimize=free).first_gaussians == 1000
 
 
 def test_a_file_changes_a_control_or_leaves_it_out():
-    changed = overlaid(preset("fast"), {"optimize": {"control": {"least_change": 0.5}}})
+    changed = apply_changes(preset("fast"), {"optimize": {"control": {"least_change": 0.5}}})
     control = changed.optimize.control
     assert control is not None and (control.kind, control.config.least_change) == ("prune", 0.5)
     assert changed.optimize.iterations == preset("fast").optimize.iterations
-    assert overlaid(preset("fast"), {"optimize": {"control": None}}).optimize.control is None
+    assert apply_changes(preset("fast"), {"optimize": {"control": None}}).optimize.control is None
 
 
 def test_seconds_of_the_ladder_are_no_option_any_more():
     with pytest.raises(ConfigError, match=r"ladder\.seconds: unknown key; allowed here: work, most_s"):
-        overlaid(Config(), {"ladder": {"seconds": 60.0}})
+        apply_changes(ReconstructionConfig(), {"ladder": {"seconds": 60.0}})
 
 
 @pytest.mark.parametrize(
@@ -58,4 +58,4 @@ def test_seconds_of_the_ladder_are_no_option_any_more():
 def test_what_no_scene_can_have_is_refused_by_name(changes):
     ((name, value),) = changes.items()
     with pytest.raises(ConfigError, match=name if not isinstance(value, dict) else f"{name}.{next(iter(value))}"):
-        overlaid(Config(), changes)
+        apply_changes(ReconstructionConfig(), changes)

@@ -19,19 +19,19 @@ def test_the_figures_are_those_that_were_measured():
 
 def said(count: int, side: tuple[int, int] = (640, 480)) -> list[float]:
     """The numbers of the line: how many, megapixels, shortest, longest, least, most."""
-    line = cost.in_words([side] * count)
+    line = cost.format_cost([side] * count)
     assert line is not None and "\n" not in line
     return [float(number) for number in re.findall(r"[0-9.]+", line)]
 
 
 def test_of_a_few_photographs_nothing_is_said():
-    assert cost.in_words([(4000, 3000)] * cost.FEW) is None
-    assert cost.in_words([(640, 480)] * (cost.FEW + 1)) is not None
+    assert cost.format_cost([(4000, 3000)] * cost.FEW) is None
+    assert cost.format_cost([(640, 480)] * (cost.FEW + 1)) is not None
 
 
 @pytest.mark.parametrize(("views", "seconds", "megabytes"), cost.MEASURED[-2:])
 def test_what_was_measured_lies_within_what_is_said(views, seconds, megabytes):
-    line = cost.in_words([(640, 480)] * views)
+    line = cost.format_cost([(640, 480)] * views)
     assert line is not None and line.startswith(f"{views} photographs, ")
     *_, shortest, longest, least, most = said(views)
     unit = 60 if "minutes" in line else 1

@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import PROVISIONAL, continued
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import PROVISIONAL, extend_reconstruction
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.incremental import IncrementalReconstruction, Known
+from splatnode.recon.incremental import IncrementalReconstruction, StreamState
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.memory import Memory
+from splatnode.recon.memory import ReconstructionCache
 from splatnode.recon.registration import continuation, register
 from splatnode.recon.verification import reflection
 from tests.support.synthetic import photographs, places, view_graph
 
-CONFIG = Config()
-REGISTRATION = register.Config()
+CONFIG = ReconstructionConfig()
+REGISTRATION = register.RegistrationConfig()
 
 
 @pytest.fixture(scope="module")
@@ -27,19 +27,19 @@ def graph() -> ViewGraph:
     return view_graph(photographs()[:4])
 
 
-def holding(graph: ViewGraph, memory: Memory | None = None) -> IncrementalReconstruction:
+def holding(graph: ViewGraph, memory: ReconstructionCache | None = None) -> IncrementalReconstruction:
     """A reconstruction that has the keyframes of `graph`, and remembers these estimates."""
-    known = Known(graph, ViewGraph(graph.config), memory=memory or Memory())
+    known = StreamState(graph, ViewGraph(graph.config), memory=memory or ReconstructionCache())
     return IncrementalReconstruction(CONFIG, known)
 
 
 def first(graph: ViewGraph, count: int) -> ViewGraph:
-    return graph.without({keyframe.name for keyframe in graph.keyframes[count:]})
+    return graph.remove_keyframes({keyframe.name for keyframe in graph.keyframes[count:]})
 
 
 def test_cameras_of_further_keyframes_are_those_that_a_registration_of_all_finds(graph):
     known = register.register(*_of(first(graph, 3)), REGISTRATION)
-    extended = continuation.extended(*_of(graph), known.cameras, REGISTRATION)
+    extended = continuation.extend_registration(*_of(graph), known.cameras, REGISTRATION)
     anew = register.register(*_of(graph), REGISTRATION)
     assert [camera.index for camera in extended.cameras] == [camera.index for camera in anew.cameras] == [0, 1, 2, 3]
     Ts, expected = (np.stack([camera.T_world_camera for camera in found.cameras]) for found in (extended, anew))
@@ -55,43 +55,43 @@ def test_a_lens_of_which_nothing_is_known_has_to_be_registered(graph):
     other = replace(graph.keyframes[3].frame, image=np.ascontiguousarray(graph.keyframes[3].frame.image[:, :150]))
     keyframes = [*graph.keyframes[:3], replace(graph.keyframes[3], frame=other)]
     known = register.register(*_of(first(graph, 3)), REGISTRATION)
-    assert continuation.extended(keyframes, graph.pairs, known.cameras, REGISTRATION) is None
+    assert continuation.extend_registration(keyframes, graph.pairs, known.cameras, REGISTRATION) is None
 
 
 def test_a_further_keyframe_is_accepted_provisionally_and_then_for_good(graph):
     before = holding(first(graph, 3))
     assert not before.estimate_soon().verdict.provisional
-    work = holding(graph, before.known.memory)
+    work = holding(graph, before.state.memory)
     soon = work.estimate_soon()
     assert soon.verdict.publishable and soon.verdict.provisional and PROVISIONAL in soon.verdict.message
     assert [camera.name for camera in soon.evidence.cameras] == graph.names
-    assert work.proven == set(graph.names[:3])
+    assert work.publishable_names == set(graph.names[:3])
     claimed = soon.bounds
     thorough = work.estimate_thoroughly()
     for name, bounds in thorough.bounds.items():
         assert bounds.rotation_deg <= claimed[name].rotation_deg
         assert bounds.centre_percent <= claimed[name].centre_percent
         assert bounds.focal_percent <= claimed[name].focal_percent
-    assert thorough.publishable and not thorough.verdict.provisional and work.proven == set(graph.names)
+    assert thorough.publishable and not thorough.verdict.provisional and work.publishable_names == set(graph.names)
     assert work.estimate_soon() is thorough
 
 
 def test_two_keyframes_are_no_start_for_a_quick_estimate(graph):
     pair = holding(first(graph, 2)).estimate_soon()
-    assert len(pair.graph.keyframes) == 2 and continued(pair, first(graph, 3), Config()) is None
+    assert (
+        len(pair.graph.keyframes) == 2 and extend_reconstruction(pair, first(graph, 3), ReconstructionConfig()) is None
+    )
 
 
 def test_a_mirrored_photograph_is_not_accepted_provisionally(graph):
     """Where a place is symmetric, the mirror image of a photograph fits to the pixel: only its details tell."""
     photograph = graph.keyframes[3]
-    features = replace(
-        photograph.features, descriptors=reflection.mirrored_descriptors(photograph.features.descriptors)
-    )
+    features = replace(photograph.features, descriptors=reflection.mirror_descriptors(photograph.features.descriptors))
     fitting = replace(graph, keyframes=(*graph.keyframes[:3], replace(photograph, features=features)))
     before = holding(first(graph, 3))
     assert before.estimate_soon().publishable
-    assert holding(fitting, before.known.memory).estimate_quickly() is None
-    assert holding(graph, before.known.memory).estimate_quickly().publishable  # the same photograph as it is
+    assert holding(fitting, before.state.memory).estimate_quickly() is None
+    assert holding(graph, before.state.memory).estimate_quickly().publishable  # the same photograph as it is
 
 
 def test_another_place_is_not_accepted_provisionally():
@@ -99,7 +99,7 @@ def test_another_place_is_not_accepted_provisionally():
     here_and_there = view_graph([*frames[:3], frames[4]])
     before = holding(first(here_and_there, 3))
     assert before.estimate_soon().publishable
-    assert not holding(here_and_there, before.known.memory).estimate_soon().verdict.provisional
+    assert not holding(here_and_there, before.state.memory).estimate_soon().verdict.provisional
 
 
 def test_work_that_is_abandoned_leaves_what_was_known(graph):
@@ -108,10 +108,10 @@ def test_work_that_is_abandoned_leaves_what_was_known(graph):
 
     before = holding(first(graph, 3))
     before.estimate_soon()
-    work = holding(graph, before.known.memory)
+    work = holding(graph, before.state.memory)
     with pytest.raises(InterruptedError):
         work.estimate_thoroughly(pause)
-    assert work.known.memory is before.known.memory and work.estimate_soon().verdict.provisional
+    assert work.state.memory is before.state.memory and work.estimate_soon().verdict.provisional
 
 
 def test_a_thorough_estimate_can_be_abandoned_at_any_of_its_stages(graph):
@@ -128,7 +128,7 @@ def test_a_thorough_estimate_can_be_abandoned_at_any_of_its_stages(graph):
         work = holding(fresh)
         with pytest.raises(InterruptedError):
             work.estimate_thoroughly(pause)
-        assert work.proven == frozenset() and work.remembered() is None
+        assert work.publishable_names == frozenset() and work.find_reconstruction() is None
         assert len(work.graph.pending) == max(6 - moment, 0)  # what was compared by then is kept
         assert work.estimate_thoroughly().publishable
 
@@ -137,7 +137,7 @@ def test_what_was_refused_is_remembered_whatever_the_order():
     frames = places(seeds=(0, 1))
     work = holding(view_graph([frames[0], frames[3]]))
     assert not work.estimate_thoroughly().publishable
-    assert work.was_refused(work.names[::-1]) and not work.was_refused(work.names[:1])
+    assert work.is_rejected(work.names[::-1]) and not work.is_rejected(work.names[:1])
 
 
 def test_a_snapshot_computes_nothing(graph):
@@ -146,7 +146,7 @@ def test_a_snapshot_computes_nothing(graph):
         work.snapshot()
     work.estimate_soon()
     assert work.snapshot().verdict.publishable
-    work.retract({graph.names[0]})
+    work.remove_keyframes({graph.names[0]})
     with pytest.raises(RuntimeError, match="estimate_soon"):
         work.snapshot()
 

@@ -10,17 +10,17 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
-from splatnode.recon.config import overlaid, preset
+from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.offline import run
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.vignetting import light_at
+from splatnode.recon.scene.vignetting import relative_illumination
 from tests.support.synthetic import SMALL, photographs
 
-CONFIG = overlaid(preset("preview"), {"size": 320})
+CONFIG = apply_changes(preset("preview"), {"size": 320})
 GAINS = (0.55, 1.0, 0.8, 1.0, 0.6, 1.0)
 
 
@@ -31,7 +31,7 @@ def exposed(frame: Frame) -> Frame:
 
 @lru_cache(maxsize=3)
 def snapshot_of(differing: bool, enabled: bool = True) -> Snapshot:
-    config = overlaid(CONFIG, {"light": {"enabled": enabled}})
+    config = apply_changes(CONFIG, {"light": {"enabled": enabled}})
     return run([exposed(each) if differing else each for each in photographs()], config)
 
 
@@ -41,8 +41,8 @@ def held_out_psnr(snapshot: Snapshot) -> float:
     known = np.stack([true[camera.frame_id][0] for camera in snapshot.cameras])
     similarity = align_cameras(known, np.stack([camera.T_world_camera for camera in snapshot.cameras]))
     K, errors = snapshot.cameras[0].K, []
-    for T, _ in synthetic.held_out_cameras(SMALL):
-        photograph = synthetic.photograph(SMALL, (T, K), 99) / 255.0
+    for T, _ in synthetic.evaluation_cameras(SMALL):
+        photograph = synthetic.render_image(SMALL, (T, K), 99) / 255.0
         shown = render_arrays(snapshot.gaussians, similarity.camera(T), K, SMALL.width, SMALL.height).rgb
         gain = (shown * photograph).sum((0, 1)) / (shown * shown).sum((0, 1))
         errors.append(((gain * shown - photograph) ** 2).mean())
@@ -94,7 +94,7 @@ FALLOFF = 0.9  # two fifths of the light reach the corners
 
 
 def dimmed(frame: Frame) -> Frame:
-    light = light_at(FALLOFF, frame.width, frame.height)[..., None]
+    light = relative_illumination(FALLOFF, frame.width, frame.height)[..., None]
     return replace(frame, image=np.rint(frame.image * light).astype(np.uint8), encoded=None)
 
 
@@ -112,10 +112,10 @@ LATER = (1.0, 1.0, 1.0, 0.6, 0.5, 1.0)  # the camera closes its iris on the way
 
 def grown(enabled: bool) -> IncrementalReconstruction:
     """A scene that took its photographs one at a time, and was begun with those of one exposure."""
-    work = IncrementalReconstruction(overlaid(CONFIG, {"light": {"enabled": enabled}}))
+    work = IncrementalReconstruction(apply_changes(CONFIG, {"light": {"enabled": enabled}}))
     for frame in photographs():
         dimmed = np.rint(frame.image * LATER[frame.frame_id]).astype(np.uint8)
-        work.take(replace(frame, image=dimmed, encoded=None))
+        work.add_frame(replace(frame, image=dimmed, encoded=None))
         work.update()
     return work
 

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image
 from splatnode.recon import preparation
-from splatnode.recon.config import Config, preset
+from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.matching import features, pair_matching, two_view
@@ -48,7 +48,7 @@ def failing_for(name: str, function, error: Exception = FAULT):
 def test_thumbnails_beside_photographs_are_left_out_by_name_with_their_size():
     views = photographs()[:4]
     thumbnails = [shrunk(views[0], side, f"thumbnail_{side}.jpg") for side in (48, 64, 80)]
-    kept, dropped, rejected = screen_all([*thumbnails, *views], Config().screening)
+    kept, dropped, rejected = screen_all([*thumbnails, *views], ReconstructionConfig().screening)
     assert [frame.name for frame in kept] == [view.name for view in views]
     assert [frame.name for frame in dropped] == ["thumbnail_48.jpg", "thumbnail_64.jpg", "thumbnail_80.jpg"]
     assert "too small" in dropped[0].reason and "48 x 36 pixels" in dropped[0].reason
@@ -57,9 +57,9 @@ def test_thumbnails_beside_photographs_are_left_out_by_name_with_their_size():
 
 def test_small_photographs_alone_and_a_set_of_two_scales_are_used():
     small = [shrunk(view, 96, view.name) for view in photographs()[:3]]
-    assert len(screen_all(small, Config().screening)[0]) == 3
+    assert len(screen_all(small, ReconstructionConfig().screening)[0]) == 3
     mixed = [shrunk(photographs()[0], 120, "a.jpg"), shrunk(photographs()[1], 320, "b.jpg")]
-    assert len(screen_all(mixed, Config().screening)[0]) == 2
+    assert len(screen_all(mixed, ReconstructionConfig().screening)[0]) == 2
 
 
 def test_a_thumbnail_is_matched_without_a_fault(caplog):
@@ -67,13 +67,13 @@ def test_a_thumbnail_is_matched_without_a_fault(caplog):
     names = "beside_thumbnail.jpg", "thumbnail.jpg"
     images = [decode_image((PHOTOGRAPHS / name).read_bytes()).image for name in names]
     frames = [Frame(index, name, index, images[index], None) for index, name in enumerate(names)]
-    graph = match(prepare_all(frames, Config())[0], Config().matching)
+    graph = match(prepare_all(frames, ReconstructionConfig())[0], ReconstructionConfig().matching)
     assert not graph.pairs and "beside_thumbnail.jpg and thumbnail.jpg" in caplog.text
 
 
 @pytest.mark.parametrize("error", [FAULT, np.linalg.LinAlgError("SVD did not converge")])
 def test_a_pair_on_which_a_library_fails_shares_nothing(monkeypatch, caplog, error):
-    keyframes, _ = prepare_all(photographs()[:3], Config())
+    keyframes, _ = prepare_all(photographs()[:3], ReconstructionConfig())
     estimate = two_view.estimate
     first = keyframes[0]
 
@@ -86,17 +86,17 @@ def test_a_pair_on_which_a_library_fails_shares_nothing(monkeypatch, caplog, err
 
     monkeypatch.setattr(two_view, "estimate", fail)
     with caplog.at_level(logging.WARNING):
-        graph = match(keyframes, Config().matching)
+        graph = match(keyframes, ReconstructionConfig().matching)
     assert set(graph.pairs) == {(1, 2)}
     assert first.name in caplog.text and "sharing nothing" in caplog.text
     assert not any(points.any() for points in moving_points(graph))
 
 
 def test_an_error_of_ours_in_a_pair_surfaces(monkeypatch):
-    keyframes, _ = prepare_all(photographs()[:2], Config())
+    keyframes, _ = prepare_all(photographs()[:2], ReconstructionConfig())
     monkeypatch.setattr(pair_matching, "_estimate_geometry", lambda *_: {}["ours"])
     with pytest.raises(KeyError):
-        match(keyframes, Config().matching)
+        match(keyframes, ReconstructionConfig().matching)
 
 
 def test_a_photograph_in_which_no_features_can_be_found_is_left_out(monkeypatch, caplog):
@@ -109,7 +109,7 @@ def test_a_photograph_in_which_no_features_can_be_found_is_left_out(monkeypatch,
         return extract(image, config)
 
     monkeypatch.setattr(features, "extract", fail)
-    keyframes, dropped = prepare_all(views, Config())
+    keyframes, dropped = prepare_all(views, ReconstructionConfig())
     assert [keyframe.name for keyframe in keyframes] == [views[0].name, views[2].name]
     assert [frame.name for frame in dropped] == [views[1].name] and "sample_size" in dropped[0].reason
     assert views[1].name in caplog.text
@@ -120,29 +120,29 @@ def test_a_lens_that_folds_one_photograph_costs_that_one_and_of_all_it_is_the_le
     width, height = views[0].width, views[0].height
     folding = Intrinsics(width, height, width, width, width / 2, height / 2, "given", (-0.5, 0.0))
     one = [views[0], replace(views[1], intrinsics=folding), views[2]]
-    keyframes, dropped = prepare_all(one, Config())
+    keyframes, dropped = prepare_all(one, ReconstructionConfig())
     assert len(keyframes) == 2 and "folds the picture over" in dropped[0].reason
     with pytest.raises(UnusableFrame, match="folds the picture over"):
-        prepare_all([replace(view, intrinsics=folding) for view in views], Config())
+        prepare_all([replace(view, intrinsics=folding) for view in views], ReconstructionConfig())
 
 
 def test_a_stream_goes_on_without_the_frame_that_cannot_be_prepared(monkeypatch):
     views = photographs()[:2]
     work = IncrementalReconstruction(preset("preview"))
-    monkeypatch.setattr(preparation, "undistorted", failing_for(views[1].name, preparation.undistorted))
+    monkeypatch.setattr(preparation, "undistort_frame", failing_for(views[1].name, preparation.undistort_frame))
     for view in views:
-        work.take(view)
+        work.add_frame(view)
     assert work.names == [views[0].name]
     assert [frame.name for frame in work.dropped] == [views[1].name]
     assert "sample_size" in work.dropped[0].reason
 
 
 def test_a_photograph_that_cannot_be_tilted_keeps_its_plain_features(monkeypatch, caplog):
-    keyframe = prepare_all(photographs()[:1], Config())[0][0]
-    monkeypatch.setattr("splatnode.recon.matching.match._add_tilted_features", failing_for(keyframe.name, None))
-    from splatnode.recon.matching.match import _with_tilted_features
+    keyframe = prepare_all(photographs()[:1], ReconstructionConfig())[0][0]
+    monkeypatch.setattr("splatnode.recon.matching.match._add_affine_features", failing_for(keyframe.name, None))
+    from splatnode.recon.matching.match import _try_affine_features
 
-    assert _with_tilted_features(keyframe, (1.6,), Config().matching) is keyframe
+    assert _try_affine_features(keyframe, (1.6,), ReconstructionConfig().matching) is keyframe
     assert f"{keyframe.name} is matched without simulated tilts" in caplog.text
 
 
@@ -151,12 +151,12 @@ def test_stereo_begins_without_the_points_on_which_a_library_fails(monkeypatch, 
     K = np.array([[32.0, 0.0, 16.0], [0.0, 32.0, 12.0], [0.0, 0.0, 1.0]])
     view = stereo.StereoView(image, K, np.eye(4), (1.0, 4.0), "view.jpg")
     points = stereo.SparsePoints(np.array([[5.0, 5.0]]), np.array([2.0]))
-    level = stereo._level(view, 0)
-    assert stereo._start_or_unknown(view, level, points).inverse_depth.max() == 0.5
+    level = stereo._make_level(view, 0)
+    assert stereo._initialize_or_unknown(view, level, points).inverse_depth.max() == 0.5
 
     def fail(*_, **__):
         raise FAULT
 
     monkeypatch.setattr(cv2, "distanceTransformWithLabels", fail)
-    assert stereo._start_or_unknown(view, level, points).inverse_depth.max() == 0.0
+    assert stereo._initialize_or_unknown(view, level, points).inverse_depth.max() == 0.0
     assert "view.jpg" in caplog.text

@@ -18,7 +18,7 @@ from splatnode.recon.geometry import (
     multiply_quats,
     project,
     quat_from_matrix,
-    to_camera,
+    transform_to_camera,
     twist_gradient,
 )
 
@@ -210,10 +210,10 @@ def test_a_world_point_is_projected_where_its_camera_sees_it():
     T_world_camera[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # looks along the world's x
     T_world_camera[:3, 3] = 1.0, 2.0, 3.0
     K = np.array([[100.0, 0, 50], [0, 200.0, 40], [0, 0, 1]])
-    in_camera = to_camera(np.array([[3.0, 2.5, 2.0], [-1.0, 2.0, 3.0]]), T_world_camera)
+    in_camera = transform_to_camera(np.array([[3.0, 2.5, 2.0], [-1.0, 2.0, 3.0]]), T_world_camera)
     np.testing.assert_allclose(in_camera, [[1, 0.5, 2], [0, 0, -2]], atol=1e-12)
     pixels = project(in_camera, K)
     np.testing.assert_allclose(pixels[0], [100 * 1 / 2 + 50, 200 * 0.5 / 2 + 40])
     assert np.isfinite(pixels).all()  # behind the camera they mean nothing, and are numbers all the same
-    in_float32 = to_camera(torch.tensor([[3.0, 2.5, 2.0]]), torch.from_numpy(T_world_camera).float())
+    in_float32 = transform_to_camera(torch.tensor([[3.0, 2.5, 2.0]]), torch.from_numpy(T_world_camera).float())
     torch.testing.assert_close(in_float32, torch.tensor([[1.0, 0.5, 2.0]]))

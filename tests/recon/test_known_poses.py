@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.given_pose import given_pose
+from splatnode.capture.given_pose import make_given_pose
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import Config, overlaid, preset
-from splatnode.recon.estimation import Estimate, estimate_cameras, estimate_depth
+from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.metric.metres import in_metres
+from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.offline import run
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 
 SIGMA_M, SIGMA_DEG = 0.003, 0.1  # of 3 m to the scene
 MARGIN = 1.5  # of 95 % bounds, which one error in twenty is beyond
-TRUSTING = overlaid(preset("preview"), {"registration": {"trust_poses": True}})
+TRUSTING = apply_changes(preset("preview"), {"registration": {"trust_poses": True}})
 TRUE = synthetic.scene_cameras(SMALL)
 
 
@@ -39,7 +39,7 @@ def told(Ts: dict[int, Array], frames: tuple[Frame, ...] | None = None) -> list[
         K = TRUE[frame.frame_id][1]
         lens = Intrinsics(frame.width, frame.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given")
         T = Ts.get(frame.frame_id)
-        pose = None if T is None else given_pose(T, SIGMA_M, SIGMA_DEG)
+        pose = None if T is None else make_given_pose(T, SIGMA_M, SIGMA_DEG)
         found.append(replace(frame, intrinsics=lens, given_pose=pose))
     return found
 
@@ -57,11 +57,13 @@ def noisy(seed: int = 0) -> dict[int, Array]:
 
 @lru_cache(maxsize=1)
 def matched() -> ViewGraph:
-    alone = overlaid(TRUSTING, {"registration": {"trust_poses": False}, "quick": True})
+    alone = apply_changes(TRUSTING, {"registration": {"trust_poses": False}, "quick": True})
     return estimate_frame_cameras(told({}), load_prior(alone), alone, Clock())[0].graph
 
 
-def estimated(Ts: dict[int, Array], config: Config = TRUSTING, graph: ViewGraph | None = None) -> Estimate:
+def estimated(
+    Ts: dict[int, Array], config: ReconstructionConfig = TRUSTING, graph: ViewGraph | None = None
+) -> Reconstruction:
     graph = graph or matched()
     frames = {frame.name: frame for frame in told(Ts)}
     keyframes = tuple(
@@ -71,10 +73,10 @@ def estimated(Ts: dict[int, Array], config: Config = TRUSTING, graph: ViewGraph 
     return estimate_cameras(replace(graph, keyframes=keyframes), (), config)
 
 
-def assert_bounds_hold(estimate: Estimate, but: int | None = None, as_given: bool = True) -> None:
+def assert_bounds_hold(estimate: Reconstruction, but: int | None = None, as_given: bool = True) -> None:
     """Errors in the given world are within the bounds, and these within the sigmas of the poses that were given."""
-    assert estimate.given is not None and estimate.registration is not None
-    given = estimate.given
+    assert estimate.prior_world is not None and estimate.registration is not None
+    given = estimate.prior_world
     for camera in estimate.registration.cameras:
         if camera.index == but:
             continue
@@ -92,8 +94,8 @@ def assert_bounds_hold(estimate: Estimate, but: int | None = None, as_given: boo
 def test_all_are_placed_within_their_bounds_in_the_given_world_and_none_is_named(seed: int) -> None:
     estimate = estimated(noisy(seed))
     assert estimate.verdict.code is Code.OK, estimate.verdict.message
-    assert estimate.given is not None and not estimate.given.deviations
-    assert len(estimate.placed) == len(TRUE)
+    assert estimate.prior_world is not None and not estimate.prior_world.deviations
+    assert len(estimate.publishable_camera_names) == len(TRUE)
     assert_bounds_hold(estimate)
 
 
@@ -105,10 +107,10 @@ def test_a_false_pose_is_named_with_its_residual_and_its_image_placed_by_the_oth
     Ts[3][:3, :3] = Ts[3][:3, :3] @ Rotation.from_euler("y", turn_deg, degrees=True).as_matrix()
     Ts[3][:3, 3] += [0.0, 0.0, shift_m]
     estimate = estimated(Ts)
-    assert estimate.given is not None
-    names = [estimate.graph.keyframes[each.index].frame.frame_id for each in estimate.given.deviations]
+    assert estimate.prior_world is not None
+    names = [estimate.graph.keyframes[each.index].frame.frame_id for each in estimate.prior_world.deviations]
     assert names == [3]
-    (deviation,) = estimate.given.deviations
+    (deviation,) = estimate.prior_world.deviations
     assert deviation.degrees == pytest.approx(turn_deg, abs=0.5)
     assert deviation.metres == pytest.approx(shift_m, abs=0.02)
     false = photographs()[3].name
@@ -119,22 +121,22 @@ def test_a_false_pose_is_named_with_its_residual_and_its_image_placed_by_the_oth
 
 def test_images_without_matches_are_where_their_poses_say() -> None:
     names = [frame.name for frame in photographs()]
-    graph = matched().without(names[2:]).without_pairs_of(names)
+    graph = matched().remove_keyframes(names[2:]).forget_pairs(names)
     assert len(graph.keyframes) == 2 and not graph.pairs
     estimate = estimated(noisy(3), graph=graph)
-    assert estimate.publishable and len(estimate.placed) == 2
+    assert estimate.publishable and len(estimate.publishable_camera_names) == 2
     assert_bounds_hold(estimate)
 
 
 def test_a_wall_without_texture_is_answered_with_the_bounds_of_the_poses() -> None:
     grey = tuple(replace(frame, image=np.full_like(frame.image, 128)) for frame in photographs()[:2])
-    alone = estimate_cameras(_blank(grey), (), overlaid(TRUSTING, {"registration": {"trust_poses": False}}))
+    alone = estimate_cameras(_blank(grey), (), apply_changes(TRUSTING, {"registration": {"trust_poses": False}}))
     assert alone.verdict.code is Code.LOW_TEXTURE
     estimate = estimate_cameras(_blank(grey), (), TRUSTING)
     assert estimate.publishable
     for bounds in estimate.bounds.values():
-        assert estimate.given is not None
-        assert estimate.given.scale * bounds.centre == pytest.approx(2.795 * SIGMA_M, rel=0.05)
+        assert estimate.prior_world is not None
+        assert estimate.prior_world.scale * bounds.centre == pytest.approx(2.795 * SIGMA_M, rel=0.05)
         assert bounds.rotation_deg == pytest.approx(2.795 * SIGMA_DEG, rel=0.05)
     assert len(estimate_depth(estimate, load_prior(TRUSTING)).pointmaps) == 2
 
@@ -160,32 +162,34 @@ def _blank(frames: tuple[Frame, ...]) -> ViewGraph:
 def test_poses_of_a_part_place_the_others() -> None:
     Ts = noisy(5)
     estimate = estimated({index: Ts[index] for index in (0, 2, 5)})
-    assert estimate.given is not None and len(estimate.placed) == len(TRUE)
-    assert len(estimate.given.held) == 3
+    assert estimate.prior_world is not None and len(estimate.publishable_camera_names) == len(TRUE)
+    assert len(estimate.prior_world.held) == 3
     assert estimate.registration is not None
     for camera in estimate.registration.cameras:
         true = TRUE[estimate.graph.keyframes[camera.index].frame.frame_id][0]
-        centre = estimate.given.scale * estimate.given.rotation @ camera.T_world_camera[:3, 3]
-        assert np.linalg.norm(centre + estimate.given.translation - true[:3, 3]) < 0.02
+        centre = estimate.prior_world.scale * estimate.prior_world.rotation @ camera.T_world_camera[:3, 3]
+        assert np.linalg.norm(centre + estimate.prior_world.translation - true[:3, 3]) < 0.02
 
 
 def test_an_offset_of_all_poses_is_reported_as_one_and_taken_out() -> None:
     X = np.eye(4)
     X[:3, :3] = Rotation.from_euler("x", 4.0, degrees=True).as_matrix()
     estimate = estimated({index: T @ X for index, T in noisy(6).items()})
-    assert estimate.given is not None and estimate.given.offset is not None
-    assert abs(estimate.given.offset.degrees - 4.0) < 3.0 * np.degrees(estimate.given.offset.turn_sigma) < 3.0
+    assert estimate.prior_world is not None and estimate.prior_world.offset is not None
+    assert (
+        abs(estimate.prior_world.offset.degrees - 4.0) < 3.0 * np.degrees(estimate.prior_world.offset.turn_sigma) < 3.0
+    )
     assert_bounds_hold(estimate, as_given=False)
-    assert "hand-eye" in estimate.verdict.advice and not estimate.given.deviations
+    assert "hand-eye" in estimate.verdict.advice and not estimate.prior_world.deviations
 
 
 def test_poses_that_are_only_checked_hold_nothing() -> None:
-    estimate = estimated(noisy(0), overlaid(TRUSTING, {"registration": {"trust_poses": False}}))
-    assert estimate.given is None and estimate.evidence is not None
+    estimate = estimated(noisy(0), apply_changes(TRUSTING, {"registration": {"trust_poses": False}}))
+    assert estimate.prior_world is None and estimate.evidence is not None
 
 
 def test_the_scene_is_in_the_given_world_and_in_metres() -> None:
-    snapshot = in_metres(run(told(noisy(7)), TRUSTING), TRUSTING.metric)
+    snapshot = apply_metric_scale(run(told(noisy(7)), TRUSTING), TRUSTING.metric)
     assert snapshot.scale.metric and "hold the cameras" in str(snapshot.scale.sentence)
     assert len(snapshot.cameras) == len(TRUE) and len(snapshot.gaussians)
     for camera in snapshot.cameras:

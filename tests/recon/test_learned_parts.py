@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.capture.process.config import typed
+from splatnode.capture.process.config import parse_config
 from splatnode.recon import priors
-from splatnode.recon.config import Config, PriorChoice
+from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.doctor import findings
-from splatnode.recon.learned_parts import LearnedPart, learned_parts, obstacle
+from splatnode.recon.learned_parts import LearnedPart, find_unavailable_reason, list_learned_parts
 from splatnode.recon.networks import weight_catalogue
 from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
 
-PARTS = learned_parts()
+PARTS = list_learned_parts()
 PATCHMATCHNET = next(part for part in PARTS if part.name == "patchmatchnet")
 
 
@@ -38,17 +38,17 @@ def test_the_doctor_names_each_with_its_remedy_and_licence(monkeypatch, tmp_path
 
 def test_weights_that_are_there_are_checked(monkeypatch, tmp_path, shared):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(shared / "weights"))
-    assert obstacle(PATCHMATCHNET) == ""
+    assert find_unavailable_reason(PATCHMATCHNET) == ""
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
     (file,) = PATCHMATCHNET.weights
     (tmp_path / file).parent.mkdir()
     Path(tmp_path / file).write_bytes(b"something else")
-    assert "it has 14 bytes instead of 972171" in obstacle(PATCHMATCHNET)
+    assert "it has 14 bytes instead of 972171" in find_unavailable_reason(PATCHMATCHNET)
 
 
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
 def test_a_missing_package_comes_first(part: LearnedPart):
-    assert obstacle(replace(part, package="no_such_package")) == "pip install no_such_package"
+    assert find_unavailable_reason(replace(part, package="no_such_package")) == "pip install no_such_package"
 
 
 NEW_PRIOR = """
@@ -72,10 +72,10 @@ def test_a_new_prior_is_its_file_and_an_entry_of_the_catalogue(monkeypatch, tmp_
     monkeypatch.setattr(priors, "__path__", [*priors.__path__, str(tmp_path)])
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.delitem(sys.modules, "splatnode.recon.priors.ours", raising=False)
-    chosen = typed({"prior": {"kind": "ours", "strength": 0.7}}, Config).prior
+    chosen = parse_config({"prior": {"kind": "ours", "strength": 0.7}}, ReconstructionConfig).prior
     assert chosen.config.strength == 0.7 and chosen.module.load(chosen.config).matcher is None
-    (part,) = (part for part in learned_parts() if part.name == "ours")
-    assert "ours/ours.pth is not in the catalogue of weights" in obstacle(part)
+    (part,) = (part for part in list_learned_parts() if part.name == "ours")
+    assert "ours/ours.pth is not in the catalogue of weights" in find_unavailable_reason(part)
     entry = Weights("ours/ours.pth", "a test", "CC0", "https://example.org/ours.pth", None, None)
     monkeypatch.setattr(weight_catalogue, "CATALOGUE", (*CATALOGUE, entry))
     (told,) = (finding for finding in findings() if finding.name == "ours")

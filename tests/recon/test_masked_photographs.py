@@ -12,8 +12,8 @@ import pytest
 import splatnode
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
-from splatnode.capture.masks import masked
-from splatnode.recon.config import overlaid, preset
+from splatnode.capture.masks import apply_mask
+from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching import features
@@ -23,7 +23,7 @@ from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.report import build_report
 from tests.support.synthetic import SMALL, errors, photographs
 
-CONFIG = overlaid(preset("preview"), {"size": 320})
+CONFIG = apply_changes(preset("preview"), {"size": 320})
 ROWS, MARGIN = 200, 30  # below this row lies what is hidden; so near to it held-out views show what it hides
 HIDDEN = np.ones((SMALL.height, SMALL.width), bool)
 HIDDEN[ROWS:] = False
@@ -40,7 +40,7 @@ def with_garbage(frame: Frame) -> Frame:
 @lru_cache(maxsize=2)
 def snapshot_of(hidden: bool):
     """Of the photographs, as they are or with masked garbage."""
-    return run([masked(with_garbage(each), HIDDEN) if hidden else each for each in photographs()], CONFIG)
+    return run([apply_mask(with_garbage(each), HIDDEN) if hidden else each for each in photographs()], CONFIG)
 
 
 def held_out_psnr(snapshot) -> float:
@@ -49,8 +49,8 @@ def held_out_psnr(snapshot) -> float:
     known = np.stack([true[camera.frame_id][0] for camera in snapshot.cameras])
     similarity = align_cameras(known, np.stack([camera.T_world_camera for camera in snapshot.cameras]))
     K, found = snapshot.cameras[0].K, []
-    for camera in synthetic.held_out_cameras(SMALL):
-        photograph = synthetic.photograph(SMALL, camera, 99) / 255.0
+    for camera in synthetic.evaluation_cameras(SMALL):
+        photograph = synthetic.render_image(SMALL, camera, 99) / 255.0
         shown = render_rgb(snapshot.gaussians, similarity.camera(camera[0]), K, SMALL.width, SMALL.height)
         found.append(((np.asarray(shown) - photograph) ** 2)[20 : ROWS - MARGIN].mean())
     return float(-10 * np.log10(np.mean(found)))
@@ -77,7 +77,7 @@ def test_the_report_has_the_share_that_is_hidden_of_each_photograph():
 
 
 def test_no_feature_lies_on_or_near_what_is_hidden():
-    keyframe = prepare(masked(with_garbage(photographs()[0]), HIDDEN), CONFIG)
+    keyframe = prepare(apply_mask(with_garbage(photographs()[0]), HIDDEN), CONFIG)
     margin = features.MASK_MARGIN * SMALL.width
     assert len(keyframe.features.points) > 500
     assert keyframe.features.points[:, 1].max() < ROWS - margin + 1

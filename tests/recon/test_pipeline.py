@@ -12,30 +12,30 @@ from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.progress import Step, Tell, told_to_nobody
-from splatnode.recon.config import PREVIEW, Config
-from splatnode.recon.evaluate.appearance import Splats
-from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.capture.process.progress import ProgressStep, Tell, ignore_progress
+from splatnode.recon.config import PREVIEW, ReconstructionConfig
+from splatnode.recon.evaluate.appearance import GaussianAppearance
+from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.same_lens import mean_intrinsics
+from splatnode.recon.evaluate.same_lens import average_intrinsics
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.optimize import refinement
 from splatnode.recon.pipeline import reconstruct, reconstruct_stream
 from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.result.consistent_depth import percent
+from splatnode.recon.result.consistent_depth import format_percent
 from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.synthetic import SMALL, errors, photographs, places, pure_rotation
 
-CONFIG = Config(
+CONFIG = ReconstructionConfig(
     size=320,
     preview=replace(PREVIEW, iterations=5),
-    optimize=refinement.Config(iterations=150, checkpoints=(50,)),
+    optimize=refinement.RefinementConfig(iterations=150, checkpoints=(50,)),
 )
-QUICK = replace(CONFIG, size=160, optimize=refinement.Config(iterations=10, checkpoints=()))
+QUICK = replace(CONFIG, size=160, optimize=refinement.RefinementConfig(iterations=10, checkpoints=()))
 MIN_PSNR = 29.2  # dB, of held-out photographs: 1 dB less than they reach with any instruction set
 MAX_GAUSSIANS = 50_000
 BLURRED = DroppedFrame("blurred.png", "blurred by 9 pixels")
@@ -70,7 +70,7 @@ def three() -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def told() -> list[Step | str]:
+def told() -> list[ProgressStep | str]:
     """What was told while `quick` was made."""
     return []
 
@@ -81,7 +81,9 @@ def quick(told) -> Snapshot:
     return last(three(), QUICK, told.append)
 
 
-def last(frames: Sequence[Frame | DroppedFrame], config: Config, tell: Tell = told_to_nobody) -> Snapshot:
+def last(
+    frames: Sequence[Frame | DroppedFrame], config: ReconstructionConfig, tell: Tell = ignore_progress
+) -> Snapshot:
     *_, final = reconstruct(frames, config, tell)
     return final
 
@@ -93,28 +95,28 @@ def by_name(snapshot: Snapshot) -> dict[str, np.ndarray]:
 def held_out_psnr(snapshot: Snapshot, index: int) -> float:
     """Of the photograph midway between cameras `index` and `index` + 1, from the pose that equation 18 finds."""
     true = synthetic.scene_cameras(SMALL)
-    T_world_camera, K = synthetic.held_out_cameras(SMALL)[index]
-    image = torch.from_numpy(synthetic.photograph(SMALL, (T_world_camera, K), 100 + index)).float() / 255
+    T_world_camera, K = synthetic.evaluation_cameras(SMALL)[index]
+    image = torch.from_numpy(synthetic.render_image(SMALL, (T_world_camera, K), 100 + index)).float() / 255
     to_estimated = align_cameras(
         np.stack([true[camera.frame_id][0] for camera in snapshot.cameras]),
         np.stack([camera.T_world_camera for camera in snapshot.cameras]),
     )
-    K = mean_intrinsics(snapshot.cameras, SMALL.width, SMALL.height)
+    K = average_intrinsics(snapshot.cameras, SMALL.width, SMALL.height)
     start = to_estimated.camera(T_world_camera)
-    aligned = find_test_pose(Splats(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
+    aligned = find_test_pose(GaussianAppearance(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
     rendered = render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height)
     return psnr(torch.from_numpy(rendered), image)
 
 
 def test_who_waits_hears_what_is_done_in_order_and_of_each_photograph_once(quick, told):
     assert quick.verdict.publishable
-    doing = dict.fromkeys(step.doing for step in told if isinstance(step, Step))
+    doing = dict.fromkeys(step.doing for step in told if isinstance(step, ProgressStep))
     wanted = ["finding points to match", "matching", "finding and checking the cameras", "estimating depth"]
     assert [step for step in doing if step != "matching weak pairs again"] == [*wanted, "refining the scene"]
     names = [frame.name for frame in three()]
     said = [line for line in told if isinstance(line, str)]
     assert said == [f"{place} of 3: {name} shares points with 2 others" for place, name in enumerate(names, start=1)]
-    steps = [step.done for step in told if isinstance(step, Step) and step.doing == "refining the scene"]
+    steps = [step.done for step in told if isinstance(step, ProgressStep) and step.doing == "refining the scene"]
     assert steps == list(range(1, quick.iterations + 1))
 
 
@@ -150,7 +152,7 @@ def test_a_dropped_frame_is_named_in_the_snapshots_that_follow(streamed):
 def test_the_verdict_tells_how_much_depth_other_views_confirm(snapshots, request):
     final = request.getfixturevalue(snapshots)[-1]
     assert all(0.3 < camera.consistent_depth < 1.0 for camera in final.cameras)
-    told = f"Other views confirm the depth of {percent(final.consistent_depth)} of the pixels."
+    told = f"Other views confirm the depth of {format_percent(final.consistent_depth)} of the pixels."
     assert final.verdict.message.endswith(told)
     coarse = request.getfixturevalue("at_hand")[0]
     assert coarse.consistent_depth is None and "confirm" not in coarse.verdict.message
@@ -198,7 +200,7 @@ def test_the_order_of_frames_does_not_matter(streamed, at_hand):
     one, other = streamed[-1], at_hand[-1]
     names = sorted(by_name(one))
     assert names == sorted(by_name(other))
-    found = camera_errors(
+    found = compare_cameras(
         np.stack([by_name(one)[name] for name in names]),
         np.stack([by_name(other)[name] for name in names]),
         np.stack([one.cameras[0].K] * len(names)),
@@ -218,7 +220,7 @@ def test_the_same_frames_and_seed_give_the_same_scene_to_the_bit(quick):
 
 
 def test_a_bound_on_gaussians_and_a_budget_of_seconds_are_kept(quick):
-    long = refinement.Config(iterations=1_000_000, checkpoints=())
+    long = refinement.RefinementConfig(iterations=1_000_000, checkpoints=())
     final = last(three(), replace(QUICK, max_gaussians=400, budget_s=1e-3, optimize=long))
     assert final.verdict.code == Code.OK and final.final
     assert 200 <= len(final.gaussians) <= 400 < len(quick.gaussians)
@@ -236,9 +238,9 @@ def test_a_new_estimate_is_shown_after_a_ruined_scene():
     wild = replace(QUICK.optimize.rates, means=1.0, means_unit="depth", log_scales=1.0)
     work = IncrementalReconstruction(replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
     for frame in three():
-        work.take(frame)
+        work.add_frame(frame)
     work.rebuild()
-    *_, ruined = work.refine(work.begun, work.config.optimize)
+    *_, ruined = work.refine(work.initial_scene, work.config.optimize)
     work.show(ruined)
     assert ruined.scene is None and work.snapshot().verdict.code is Code.DIVERGED
     work.update()

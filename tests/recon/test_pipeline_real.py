@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -18,7 +18,7 @@ from splatnode.recon.verification.decision import decide, refuse_before_registra
 from splatnode.recon.verification.verify import verify
 from tests.support.synthetic import view_graph
 
-CONFIG = Config()
+CONFIG = ReconstructionConfig()
 
 
 def real(shared: Path, name: str, views: int | None = None, step: int = 1) -> tuple[ViewGraph, CameraErrors, Verdict]:
@@ -27,11 +27,11 @@ def real(shared: Path, name: str, views: int | None = None, step: int = 1) -> tu
     scene = load_scene(folder)
     names = list(scene.paths)[::step] if views is None else load_split(folder, list(scene.paths), views).train
     graph = view_graph(scene.frames(names))
-    found = register.register(graph.keyframes, graph.pairs, register.Config())
+    found = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     cameras = found.cameras if found else ()
     true = [scene.cameras.get(names[camera.index]) for camera in cameras]
     pairs = [(camera, truth) for camera, truth in zip(cameras, true, strict=True) if truth]
-    measured = camera_errors(
+    measured = compare_cameras(
         np.array([camera.T_world_camera for camera, _ in pairs]).reshape(-1, 4, 4),
         np.array([truth.T_world_camera for _, truth in pairs]).reshape(-1, 4, 4),
         np.array([np.diag([camera.focal, camera.focal, 1.0]) for camera, _ in pairs]).reshape(-1, 3, 3),

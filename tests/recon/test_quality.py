@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from splatnode.recon.config import overlaid, preset
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.config import apply_changes, preset
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import load_scene
@@ -23,7 +23,7 @@ def test_held_out_views_of_a_real_scene_are_as_good_as_they_were(shared):
     folder = shared / "scenes" / "fountain_p11"
     scene = load_scene(folder)
     split = load_split(folder, list(scene.paths), VIEWS)
-    *_, final = reconstruct(scene.frames(split.train), overlaid(preset("fast"), BUDGET))
+    *_, final = reconstruct(scene.frames(split.train), apply_changes(preset("fast"), BUDGET))
     assert final.verdict.publishable
     row = evaluate(
         final,
@@ -31,7 +31,7 @@ def test_held_out_views_of_a_real_scene_are_as_good_as_they_were(shared):
         split,
         Run("fast", 0, None, final.seconds, None),
         rasterize=rasterize,
-        networks=Networks(alex=None, vgg=None),
+        networks=PerceptualNetworks(alex=None, vgg=None),
         settings=Settings(alignment_steps=20),
     )
     assert row.psnr > MIN_PSNR

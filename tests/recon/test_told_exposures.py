@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate
-from splatnode.recon.modelling import begin_scene
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.scene.scene import Scene
 from tests.support.row_of_views import graph_of, maps_of, registration_of
@@ -20,7 +20,7 @@ def begun(exposures: dict[int, ExposureSettings]) -> Scene:
     """Photographs that are too small to share enough pixels."""
     graph, maps = graph_of(4, exposures), maps_of(range(4))
     verdict = Verdict(Code.OK, "", "", publishable=True)
-    scene = begin_scene(Estimate(graph, registration_of(4), None, verdict, maps), Config())
+    scene = create_initial_scene(Reconstruction(graph, registration_of(4), None, verdict, maps), ReconstructionConfig())
     assert scene is not None
     return scene
 

@@ -14,10 +14,10 @@ import pytest
 
 import splatnode.recon.viewer_process
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import read_yaml, typed
+from splatnode.capture.process.config import parse_config, read_yaml
 from splatnode.recon.cli import LOOK_EVERY
 from splatnode.recon.config import preset
-from splatnode.recon.offline import with_looks
+from splatnode.recon.offline import set_preview_interval
 from splatnode.recon.viewer_process import viewer
 from tests.viewer.test_cli import snapshot
 
@@ -40,7 +40,7 @@ def test_the_viewer_finds_the_run_wherever_temporary_files_lie(tmp_path, monkeyp
         monkeypatch.setattr(tempfile, "tempdir", folder)
         with viewer(tmp_path, copy):
             pass
-        network = typed(read_yaml(tmp_path / "seen.yaml")["network"], Network)
+        network = parse_config(read_yaml(tmp_path / "seen.yaml")["network"], Network)
         assert network.directory is not None and network.directory.parent == Path(folder)
 
 
@@ -65,7 +65,7 @@ def test_showing_waits_for_nobody_and_a_failed_run_ends_the_viewer(tmp_path, mon
 
 def test_looks_change_nothing_but_the_looks():
     config = preset("balanced")
-    looked = with_looks(config, LOOK_EVERY)
+    looked = set_preview_interval(config, LOOK_EVERY)
     assert set(looked.optimize.looks) >= {LOOK_EVERY, 2 * LOOK_EVERY}
     assert all(0 < look < config.optimize.iterations for look in looked.optimize.looks)
     same = msgspec.structs.replace(looked.optimize, looks=())

@@ -7,18 +7,18 @@ import threading
 import pytest
 
 from splatnode.recon.core import default_threads
-from splatnode.recon.workers import each, in_turn
+from splatnode.recon.workers import map_parallel, map_parallel_lazily
 
 
 def test_results_are_in_order_and_arguments_go_together():
-    assert each(pow, [2, 3, 4], [3, 2, 1]) == [8, 9, 4]
-    assert each(abs, []) == []
+    assert map_parallel(pow, [2, 3, 4], [3, 2, 1]) == [8, 9, 4]
+    assert map_parallel(abs, []) == []
 
 
 def test_work_is_done_beside_the_caller_and_its_errors_are_raised():
-    assert threading.get_ident() not in each(lambda _: threading.get_ident(), range(4))
+    assert threading.get_ident() not in map_parallel(lambda _: threading.get_ident(), range(4))
     with pytest.raises(ZeroDivisionError):
-        each(lambda x: 1 / x, [1, 0])
+        map_parallel(lambda x: 1 / x, [1, 0])
 
 
 def test_results_come_in_the_order_of_the_items():
@@ -30,8 +30,8 @@ def test_results_come_in_the_order_of_the_items():
         first_may_end.set()
         return 10 * item
 
-    assert list(in_turn(slow_first, range(20))) == [10 * item for item in range(20)]
-    assert list(in_turn(slow_first, [])) == []
+    assert list(map_parallel_lazily(slow_first, range(20))) == [10 * item for item in range(20)]
+    assert list(map_parallel_lazily(slow_first, [])) == []
 
 
 def test_an_error_comes_in_the_place_of_its_result():
@@ -40,7 +40,7 @@ def test_an_error_comes_in_the_place_of_its_result():
             raise ValueError("the third")
         return item
 
-    results = in_turn(fails, range(10))
+    results = map_parallel_lazily(fails, range(10))
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(ValueError, match="the third"):
         next(results)
@@ -48,7 +48,7 @@ def test_an_error_comes_in_the_place_of_its_result():
 
 def test_who_stops_asking_begins_no_more():
     begun = []
-    results = in_turn(begun.append, range(1000))
+    results = map_parallel_lazily(begun.append, range(1000))
     next(results)
     results.close()  # pyright: ignore[reportAttributeAccessIssue]
     assert len(begun) <= default_threads() + 2

@@ -12,9 +12,9 @@ from typing import Any
 
 import splatnode
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.process.progress import Step
+from splatnode.capture.process.progress import ProgressStep
 from splatnode.capture.stamp import Stamp
-from splatnode.recon.locating.outcome import Claim
+from splatnode.recon.locating.outcome import LocalizationBounds
 from splatnode.recon.occupancy.upright import Upright
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.verdict import Verdict
@@ -49,7 +49,7 @@ _CLASSES = (
     "Stereo",
 )
 _WIDE = 110  # characters
-_FURTHER = (Verdict, Bounds, Claim, Upright, DroppedFrame, Stamp, Step)  # what these lead to
+_FURTHER = (Verdict, Bounds, LocalizationBounds, Upright, DroppedFrame, Stamp, ProgressStep)  # what these lead to
 
 
 def page() -> str:

@@ -11,8 +11,8 @@ from typing import Any
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.process.config import Plugin
 from splatnode.recon.config import PRESETS
-from splatnode.recon.config import Config as Reconstruction
-from splatnode.recon.daemon.config import Config as Daemon
+from splatnode.recon.config import ReconstructionConfig as Reconstruction
+from splatnode.recon.daemon.config import DaemonConfig as Daemon
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from tests.reference.options import REQUIRED, Option, Section, has_fields, sections
 

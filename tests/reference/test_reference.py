@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from splatnode.capture.config import CaptureConfig
-from splatnode.recon.daemon.config import Config as Daemon
+from splatnode.recon.daemon.config import DaemonConfig as Daemon
 from tests.conftest import ROOT
 from tests.reference.comments import field_comments
 from tests.reference.options import REQUIRED, Option, sections, undescribed, values

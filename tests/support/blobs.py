@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from splatnode.recon.evaluate.perceptual import no_networks
+from splatnode.recon.evaluate.perceptual import create_empty_networks
 from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.geometry import Similarity, exp_se3
@@ -22,7 +22,7 @@ WIDTH, HEIGHT = 96, 72
 K = np.array([[90.0, 0, 48], [0, 90.0, 36], [0, 0, 1]])
 NAMES = [f"{i:02d}.png" for i in range(8)]
 SPLIT = Split(("00.png", "04.png", "07.png"), ("01.png", "03.png"))
-NO_NETWORKS = no_networks()
+NO_NETWORKS = create_empty_networks()
 QUICK = Settings(alignment_steps=20, alignment_levels=1)
 
 

@@ -23,7 +23,7 @@ _ALPHA_MIN, _ALPHA_MAX, _TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4  # of gsplat's
 def install(monkeypatch: pytest.MonkeyPatch) -> None:
     """Gaussians on the processor are treated as if they were on a GPU, from the dispatch to gsplat's kernels."""
     wrapper = pytest.importorskip("gsplat.cuda._wrapper", reason="needs gsplat (the extra named cuda brings it)")
-    monkeypatch.setattr(dispatch, "by_core", lambda tensor: False)
+    monkeypatch.setattr(dispatch, "is_on_cpu", lambda tensor: False)
     check = gsplat.check_input
     monkeypatch.setattr(gsplat, "check_input", lambda *given: check(*given[:-1], "cpu"))
     monkeypatch.setattr(wrapper, "_FullyFusedProjection", types.SimpleNamespace(apply=_project))

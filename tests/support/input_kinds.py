@@ -36,9 +36,9 @@ def stereo_halves(views: int, baseline_m: float = 0.065) -> tuple[tuple[np.ndarr
     """What a stereo camera's left and right half see of the built-in place."""
     config = synthetic.Config(views=views, width=480, height=360, samples=1, noise=0.0)
     cameras = synthetic.scene_cameras(config)
-    rights = [synthetic.right_of(camera, baseline_m) for camera in cameras]
+    rights = [synthetic.offset_right_camera(camera, baseline_m) for camera in cameras]
     return tuple(
-        (_noisy(synthetic.photograph(config, left), 2 * i), _noisy(synthetic.photograph(config, right), 2 * i + 1))
+        (_noisy(synthetic.render_image(config, left), 2 * i), _noisy(synthetic.render_image(config, right), 2 * i + 1))
         for i, (left, right) in enumerate(zip(cameras, rights, strict=True))
     )
 
@@ -80,7 +80,7 @@ def turned(views: int, plain: bool = False) -> tuple[tuple[Frame, ...], tuple[np
     """A table on a turntable, 10 degrees a view, before a room or something plain; masks (H, W), True on the table."""
     builder = Builder(0, 400.0)
     table(builder, PALETTES[0], 0.0, 0.0, 0.0)
-    background = building.photograph(building.Config(width=480, height=360), 20).astype(np.float32)
+    background = building.render_image(building.Config(width=480, height=360), 20).astype(np.float32)
     if plain:
         background[:] = 120.0
     K = np.array([[525.0, 0.0, 240.0], [0.0, 525.0, 180.0], [0.0, 0.0, 1.0]])

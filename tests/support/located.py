@@ -9,8 +9,8 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.cast import Camera
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate, estimate_cameras
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import Similarity, align_cameras
 from splatnode.recon.locating.outcome import Located
 from splatnode.recon.result.landmarks import Landmarks
@@ -21,7 +21,7 @@ PLACE = synthetic.Config(views=6, width=480, height=360)
 
 @dataclass(frozen=True, eq=False)
 class KnownPlace:
-    estimate: Estimate
+    estimate: Reconstruction
     landmarks: Landmarks
     to_scene: Similarity  # from the built-in capture's world
 
@@ -29,7 +29,7 @@ class KnownPlace:
 @lru_cache(maxsize=1)
 def known_place() -> KnownPlace:
     """Six photographs, registered and verified."""
-    estimate = estimate_cameras(view_graph(photographs(PLACE)), (), Config())
+    estimate = estimate_cameras(view_graph(photographs(PLACE)), (), ReconstructionConfig())
     assert estimate.landmarks is not None
     true = np.stack([T for T, _ in synthetic.scene_cameras(PLACE)])
     landmarks = estimate.landmarks
@@ -38,8 +38,8 @@ def known_place() -> KnownPlace:
 
 def photograph(index: int) -> tuple[np.ndarray, Camera]:
     """Midway between two photographs of the scene, with its true camera."""
-    camera = synthetic.held_out_cameras(PLACE)[index]
-    return synthetic.photograph(PLACE, camera, 100 + index), camera
+    camera = synthetic.evaluation_cameras(PLACE)[index]
+    return synthetic.render_image(PLACE, camera, 100 + index), camera
 
 
 def turned(camera: Camera, degrees: float) -> Camera:

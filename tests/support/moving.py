@@ -14,7 +14,7 @@ from splatnode.capture.frame import Frame
 def look_of(seed: int) -> np.ndarray:
     """(H, W, 3) of the built-in place of this seed."""
     config = synthetic.Config(seed=seed)
-    return synthetic.photograph(config, synthetic.scene_cameras(config)[0])
+    return synthetic.render_image(config, synthetic.scene_cameras(config)[0])
 
 
 def pasted(frame: Frame, share: float, seed: int, look: np.ndarray) -> tuple[Frame, np.ndarray]:

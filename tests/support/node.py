@@ -18,9 +18,9 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.capture.process.config import typed
-from splatnode.recon.daemon.status import ReconStatus, State
-from splatnode.recon.result.message import LiveScene, SceneHeader, camera_record, from_message
+from splatnode.capture.process.config import parse_config
+from splatnode.recon.daemon.status import ReconState, ReconStatus
+from splatnode.recon.result.message import LiveScene, SceneHeader, decode_snapshot, make_camera_record
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.conftest import ROOT
 
@@ -40,7 +40,7 @@ class Node:
         self.folder = folder
         (folder / "run").mkdir(mode=0o700, parents=True)
         network = {"directory": str(folder / "run")} | (network or {})
-        self.network = typed(network, Network)
+        self.network = parse_config(network, Network)
         self.configs = {
             "capture": {"network": network, "spool": {"directory": str(folder)}} | camera,
             "recon": {
@@ -129,7 +129,7 @@ class Viewer:
 
     def hear(self, timeout_s: float) -> LiveScene | None:
         message = self._client.poll(timeout_s)
-        return None if message is None else from_message(message)
+        return None if message is None else decode_snapshot(message)
 
     def wait(self, until: Callable[[LiveScene], bool], patience_s: float = PATIENCE_S) -> LiveScene | None:
         """The first scene for which `until` holds; None where none comes in time."""
@@ -175,9 +175,9 @@ def finished(views: int) -> Callable[[LiveScene], bool]:
 def heartbeat(numbering: Numbering, tracked: CameraEstimate | None) -> ReconStatus:
     """Of a daemon whose scene is finished, with the live camera `tracked`."""
     return ReconStatus(
-        **numbering.next(), state=State.IDLE, uptime_s=1.0, scene_id="place", keyframe=2, queue=0, keyframes=2,
+        **numbering.next(), state=ReconState.IDLE, uptime_s=1.0, scene_id="place", keyframe=2, queue=0, keyframes=2,
         num_gaussians=225, iterations=500, final=True, verdict="OK", message="", bounds="", keyframe_s=None,
         delay_s=0.0, delay="", unfinished=0, scenes=0, maps=0, loops=0, newest_places=(), refused=0,
         duplicates=0, rss_mb=100.0,
-        camera_moved=None, moved="", problem="", tracked=camera_record(tracked) if tracked else None,
+        camera_moved=None, moved="", problem="", tracked=make_camera_record(tracked) if tracked else None,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.recon.result.message import to_message
+from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from tests.support.node import heartbeat
 
@@ -44,7 +44,7 @@ class PretendNode:
         with StateServer(RECON_SCENE, self.network) as server, Publisher(RECON_STATUS, self.network) as heartbeats:
             while not self._closing.is_set():
                 while not self._waiting.empty():
-                    server.publish(*to_message(*self._waiting.get(), numbering.next()))
+                    server.publish(*encode_snapshot(*self._waiting.get(), numbering.next()))
                 if time.monotonic() - beaten > _HEARTBEAT_S:
                     beaten = time.monotonic()
                     heartbeats.send(heartbeat(numbering, self.tracked))

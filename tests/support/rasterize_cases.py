@@ -40,7 +40,9 @@ def random_case(seed: int, count: int = COUNT, bases: int = 16, width: int = WID
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     T_world_camera = torch.eye(4, dtype=torch.float64)
-    T_world_camera[:3, :3] = reference.rotations(torch.tensor([[1.0, 0, 0, 0]]).double() + 0.1 * normal(1, 4))[0]
+    T_world_camera[:3, :3] = reference.compute_rotations(torch.tensor([[1.0, 0, 0, 0]]).double() + 0.1 * normal(1, 4))[
+        0
+    ]
     T_world_camera[:3, 3] = 0.2 * normal(3)
     K = torch.tensor([[0.9 * width, 0, 0.51 * width], [0, 0.93 * width, 0.48 * height], [0, 0, 1]]).double()
     return rounded(

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 
 REPORT = {
     "verdict": {"code": "OK", "message": "All 3 photographs were placed.", "advice": "", "publishable": True},
@@ -25,7 +25,7 @@ REFUSAL = {
 }
 
 
-def simulated(recording: Recording, folder: Path) -> Sequence[str]:
+def simulated(recording: BatchRecording, folder: Path) -> Sequence[str]:
     """Runs the shell command that is the recording's source; its folder is $OUT, and the report `$REPORT`."""
     told = f"OUT='{folder}' REPORT='{json.dumps(REPORT)}' REFUSAL='{json.dumps(REFUSAL)}'"
     return ["sh", "-c", f"{told}; {recording.source}"]

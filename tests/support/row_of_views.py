@@ -15,7 +15,7 @@ from splatnode.recon.matching import config as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import RegisteredCamera, Registration
-from splatnode.recon.scene.initialisation import Config, initial_scene
+from splatnode.recon.scene.initialisation import SceneInitializationConfig, initialize_scene
 from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 
@@ -40,7 +40,7 @@ def graph_of(count: int, exposures: Mapping[int, ExposureSettings] = MappingProx
     ]
     pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
     matches = {(i, j): SimpleNamespace(matches=np.zeros((100 - 9 * (j - i), 2))) for i, j in pairs}
-    return ViewGraph(matching.Config(), tuple(keyframes), matches)
+    return ViewGraph(matching.MatchingConfig(), tuple(keyframes), matches)
 
 
 def registration_of(count: int, world: Similarity | None = None) -> Registration:
@@ -71,4 +71,4 @@ def maps_of(indices: range) -> dict[str, Pointmap]:
 
 def scene_of(count: int, graph: ViewGraph) -> Scene:
     images = {keyframe.name: keyframe.image for keyframe in graph.keyframes}
-    return initial_scene(list(maps_of(range(count)).values()), images, Config())
+    return initialize_scene(list(maps_of(range(count)).values()), images, SceneInitializationConfig())

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatnode.recon.evaluate.stability.places import Place, Places
+from splatnode.recon.evaluate.stability.places import ScenesByMotion, TrialScene
 from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera
 
 K = np.array([[200.0, 0.0, 120.0], [0.0, 200.0, 90.0], [0.0, 0.0, 1.0]])
@@ -22,7 +22,7 @@ def on_arc(degrees: float, distance: float = 3.0) -> np.ndarray:
     return T_world_camera
 
 
-def three_places(folder: Path) -> Places:
+def three_places(folder: Path) -> ScenesByMotion:
     """Three places of twelve photographs each, 6 degrees apart; pixels without a meaning."""
     rng = np.random.default_rng(0)
     made = []
@@ -35,5 +35,5 @@ def three_places(folder: Path) -> Places:
             cv2.imwrite(str(folder / name / image_name), image)
         cameras = {n: TrueCamera(on_arc(6.0 * i), K, WIDTH, HEIGHT) for i, n in enumerate(names)}
         scene = EvaluationScene(name, {n: folder / name / n for n in names}, cameras)
-        made.append(Place(scene, names))
-    return Places(tuple(made))
+        made.append(TrialScene(scene, names))
+    return ScenesByMotion(tuple(made))

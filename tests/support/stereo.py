@@ -11,5 +11,5 @@ from tests.support.marked import Marker, photographs
 
 def right_photographs(config: synthetic.Config, baseline_m: float, markers: Sequence[Marker] = ()) -> list[Frame]:
     """The partners of the photographs of `config`, rectified: the right camera has the left one's axes and lens."""
-    cameras = [synthetic.right_of(camera, baseline_m) for camera in synthetic.scene_cameras(config)]
+    cameras = [synthetic.offset_right_camera(camera, baseline_m) for camera in synthetic.scene_cameras(config)]
     return photographs(config, cameras, markers, first_seed=1000)

@@ -16,8 +16,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.cast import Camera, cast
 from splatnode.capture.diorama.layout import BRICK_WALL, place
 from splatnode.capture.frame import Frame
-from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
-from splatnode.recon.frames.keyframe import Keyframe, modelled_image
+from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.recon.frames.keyframe import Keyframe, resize_image
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.matching.match import Matcher, match
@@ -38,7 +38,7 @@ def photographs(config: synthetic.Config = SMALL) -> tuple[Frame, ...]:
 def errors(snapshot: Snapshot, config: synthetic.Config = SMALL) -> CameraErrors:
     """The snapshot's cameras against those that took the photographs of `config`."""
     true = synthetic.scene_cameras(config)
-    return camera_errors(
+    return compare_cameras(
         np.stack([camera.T_world_camera for camera in snapshot.cameras]),
         np.stack([true[camera.frame_id][0] for camera in snapshot.cameras]),
         np.stack([camera.K for camera in snapshot.cameras]),
@@ -68,7 +68,7 @@ def pure_rotation_cameras(config: synthetic.Config = SMALL, step_deg: float = 8.
 
 def pure_rotation(config: synthetic.Config = SMALL, step_deg: float = 8.0) -> list[Frame]:
     cameras = pure_rotation_cameras(config, step_deg)
-    return renumbered(synthetic.photograph(config, camera, index) for index, camera in enumerate(cameras))
+    return renumbered(synthetic.render_image(config, camera, index) for index, camera in enumerate(cameras))
 
 
 def places(config: synthetic.Config = SMALL, seeds: tuple[int, ...] = (0, 1)) -> list[Frame]:
@@ -131,12 +131,12 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
 
 
 def view_graph(
-    frames: Iterable[Frame], matcher: Matcher | None = None, config: matching.Config | None = None
+    frames: Iterable[Frame], matcher: Matcher | None = None, config: matching.MatchingConfig | None = None
 ) -> ViewGraph:
     """The frames as keyframes, each compared with all before it."""
-    config = config or matching.Config()
+    config = config or matching.MatchingConfig()
     found = ((frame, features.extract(frame.image, config.features)) for frame in frames)
-    return match((Keyframe(frame, modelled_image(frame.image, 320), known) for frame, known in found), config, matcher)
+    return match((Keyframe(frame, resize_image(frame.image, 320), known) for frame, known in found), config, matcher)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.cycles import Cycles
-from splatnode.recon.verification.decision import Config, decide
+from splatnode.recon.verification.cycles import CycleConsistency
+from splatnode.recon.verification.decision import DecisionConfig, decide
 from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.lens import Distortion
@@ -52,7 +52,7 @@ def pair(matches: int = 200, turned: bool = False) -> TwoView:
 
 def graph(num_frames: int, pairs: dict[tuple[int, int], TwoView], plain: tuple[int, ...] = ()) -> ViewGraph:
     keyframes = tuple(keyframe(i, PLAIN if i in plain else RICH) for i in range(num_frames))
-    return ViewGraph(matching.Config(), keyframes, pairs)
+    return ViewGraph(matching.MatchingConfig(), keyframes, pairs)
 
 
 def all_pairs(num_frames: int, turned: tuple[tuple[int, int], ...] = ()) -> dict[tuple[int, int], TwoView]:
@@ -106,7 +106,7 @@ def evidence(
         reflection=Reflection(("0.png",), -0.2),
         flatness=0.5,
         mirrored_cost=10.0,
-        cycles=Cycles(1, 0.1, 0.1, 0.1, 0.5),
+        cycles=CycleConsistency(1, 0.1, 0.1, 0.1, 0.5),
         median_angle_deg=10.0,
         rms_px=0.3,
         focal=Errors(0.01, 0.01, 0.01),
@@ -120,7 +120,9 @@ def evidence(
 def verdict(count: int, doubtful: dict[int, dict[str, object]] | None = None, **what: object) -> Verdict:
     """Of `count` frames that were all placed."""
     indices = tuple(range(count))
-    return decide(graph(count, all_pairs(count)), registration(indices), evidence(indices, doubtful, **what), Config())
+    return decide(
+        graph(count, all_pairs(count)), registration(indices), evidence(indices, doubtful, **what), DecisionConfig()
+    )
 
 
 def refused(given: Verdict | None, code: Code) -> Verdict:

@@ -86,10 +86,10 @@ def walk(step: float = STEP) -> tuple[WalkScene, WalkScene]:
     one = together(wall(0.0, 2.0, step), far_shell((1.0, 0.0, 0.0), 1.4))
     two = together(wall(1.0, 3.0, step), far_shell((1.8, 0.0, 0.25), 4.0))
     away = SECOND.inverse()
-    moved = tuple(away.camera(each) for each in second)
+    moved = tuple(away.transform_camera(each) for each in second)
     return (
         WalkScene("scene-0001", one, first, IDENTITY),
-        WalkScene("scene-0002", away.gaussians(two), moved, SECOND),
+        WalkScene("scene-0002", away.transform_gaussians(two), moved, SECOND),
     )
 
 
@@ -129,7 +129,7 @@ def place(scene_id: str, **values: object) -> dict:
 
 def depths_of(scene: WalkScene) -> dict[str, np.ndarray]:
     """How far away the wall is in each photograph, in the scene's own unit: a value for 2 x 2 pixels."""
-    distances = {each.name: 1.0 - scene.placement.camera(each).T_world_camera[2, 3] for each in scene.cameras}
+    distances = {each.name: 1.0 - scene.placement.transform_camera(each).T_world_camera[2, 3] for each in scene.cameras}
     size = HEIGHT // 2, WIDTH // 2
     return {name: np.full(size, far / scene.placement.scale, np.float16) for name, far in distances.items()}
 

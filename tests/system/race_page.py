@@ -8,7 +8,7 @@ from math import exp, log, sqrt
 from pathlib import Path
 from statistics import median
 
-from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, margins
+from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, compute_margins
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.records import read_bench
 from tests.bench.quality import race_chart
@@ -27,7 +27,7 @@ def ends() -> list[Row]:
 
 def lines() -> list[str]:
     """A line of the table for each case; those that were refused are told with their verdict."""
-    by_measure = [{(each.scene, each.views): each for each in margins(ends(), measure)} for measure in WHOLE]
+    by_measure = [{(each.scene, each.views): each for each in compute_margins(ends(), measure)} for measure in WHOLE]
     found = []
     ours = [row for row in ends() if row.method == OURS]
     for case, row in {(row.scene, row.views): row for row in ours}.items():
@@ -41,7 +41,7 @@ def lines() -> list[str]:
 
 def summary() -> str:
     """What is lost, then what is won."""
-    whole, shown = ([margins(ends(), measure) for measure in measures] for measures in (WHOLE, SHOWN))
+    whole, shown = ([compute_margins(ends(), measure) for measure in measures] for measures in (WHOLE, SHOWN))
     lost = [_lost(each, digits) for each, digits in zip(whole, DIGITS, strict=True)]
     means, seen = _leads(whole), _leads(shown)
     sizes = _beside()[LARGEST][0].size
@@ -55,7 +55,7 @@ def summary() -> str:
 
 def certain() -> str:
     """How much of the leads is the seeds' chance, from the cases where the best other has several, too."""
-    whole = [margins(ends(), measure) for measure in WHOLE]
+    whole = [compute_margins(ends(), measure) for measure in WHOLE]
     known = [[(each.lead, each.error) for each in found if each.error is not None] for found in whole]
     errors = [
         f"{sqrt(sum(error**2 for _, error in found) / len(found) / len(every)):.{digits}f}".replace("0.", ".")
@@ -135,7 +135,7 @@ def seeds() -> str:
 
 def quick() -> str:
     """What `fast` wins and loses beside the best other."""
-    leads = _leads([margins(ends(), measure, "fast") for measure in WHOLE])
+    leads = _leads([compute_margins(ends(), measure, "fast") for measure in WHOLE])
     beside = _beside()
     times = [point.time for method in ("fast", *SEEDED[1:], LARGEST) if (point := beside[method][0]).time]
     mcmc, pixel, largest = (f"{each / times[0]:.1f}" for each in times[1:])
@@ -148,7 +148,7 @@ def quick() -> str:
 
 def thorough() -> str:
     """What `quality` wins and loses beside the best other."""
-    found = [margins(ends(), measure, "quality") for measure in WHOLE]
+    found = [compute_margins(ends(), measure, "quality") for measure in WHOLE]
     leads = _leads(found)
     ahead = [sum(margin.lead >= 0 for margin in each) for each in found]
     ratio = exp(sum(log(margin.ours / margin.best) for margin in found[2]) / len(found[2])) - 1
@@ -163,7 +163,7 @@ def thorough() -> str:
 
 def headlines() -> list[str]:
     """The lines of the README's table: of the default, and of `quality`."""
-    beside, found, best = _beside(), margins(ends(), WHOLE[0]), margins(ends(), WHOLE[0], "quality")
+    beside, found, best = _beside(), compute_margins(ends(), WHOLE[0]), compute_margins(ends(), WHOLE[0], "quality")
     quality = beside["quality"][0]
     share = f"a {beside[LARGEST][0].size:.0f}th of InstantSplat-XL's Gaussians"
     return [

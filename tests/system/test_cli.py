@@ -20,7 +20,7 @@ from splatnode import command_line
 from splatnode.capture.process import packages
 from splatnode.capture.process.verb import Verb
 from splatnode.recon.result.export import ResultWriteError
-from splatnode.recon.result.export.format import format_names
+from splatnode.recon.result.export.format import list_format_names
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.verbs import EXPORT_FORMATS
@@ -216,7 +216,7 @@ def test_the_second_signal_ends_a_process_at_once():
         "from splatnode.capture.process import stop_signals\n"
         "now = [0.0]\n"
         "stop_signals.time.monotonic = lambda: now[0]\n"
-        "stop_signals.on_first((signal.SIGTERM, signal.SIGINT), lambda: print('stopping', flush=True))\n"
+        "stop_signals.handle_first_signal((signal.SIGTERM, signal.SIGINT), lambda: print('stopping', flush=True))\n"
         "for now[0], number in ((0.0, 15), (0.1, 15), (0.2, 2), (0.8, 2)):\n"
         "    signal.raise_signal(number)\n"
         "    print('goes on', flush=True)\n"
@@ -292,7 +292,7 @@ def test_bench_lists_are_parsed():
 
 
 def test_export_offers_the_formats_that_there_are():
-    assert tuple(format_names()) == EXPORT_FORMATS
+    assert tuple(list_format_names()) == EXPORT_FORMATS
 
 
 def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):

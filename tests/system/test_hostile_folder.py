@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from splatnode.recon.batch.command import replay
-from splatnode.recon.batch.sources import Recording
-from splatnode.recon.jobs.call import packed
+from splatnode.recon.batch.sources import BatchRecording
+from splatnode.recon.jobs.call import pack_call
 from splatnode.recon.jobs.calls import Task, engine, run_here
-from splatnode.recon.jobs.child import Child, Limits, finished
+from splatnode.recon.jobs.child import Child, Limits, wait_for_end
 from splatnode.recon.jobs.version import own_version
 from splatnode.viewer.probe import probe_window
 from splatnode.viewer.splash import splash
@@ -39,20 +39,20 @@ def test_batch_runs_none_nor_do_its_children_and_their_decoders(tmp_path, trace)
 
 def test_a_call_runs_none(tmp_path, trace):
     """As bench and stability make them."""
-    tasks = iter([Task("cwd", packed(os.getcwd))])
+    tasks = iter([Task("cwd", pack_call(os.getcwd))])
     with engine(1, None) as on:
         ((_, answer),) = on.answers(lambda: next(tasks, None), Limits(), tmp_path / "calls")
     assert answer.value() == str(trace.parent) and not trace.exists()
 
 
 def test_a_call_of_a_cluster_runs_none(trace):
-    answer = run_here(packed(partial(divmod, 7, 2)), Limits(), own_version())
+    answer = run_here(pack_call(partial(divmod, 7, 2)), Limits(), own_version())
     assert answer.value() == (3, 1) and not trace.exists()
 
 
 def test_the_command_of_a_recording_runs_none(tmp_path, trace):
-    command = replay(["--help"], Recording("a", "nothing"), tmp_path / "a")
-    end = finished(Child.started(command, tmp_path / "log", (min(os.sched_getaffinity(0)),)), Limits())
+    command = replay(["--help"], BatchRecording("a", "nothing"), tmp_path / "a")
+    end = wait_for_end(Child.start(command, tmp_path / "log", (min(os.sched_getaffinity(0)),)), Limits())
     assert end.exit_code == 0 and "--preset" in (tmp_path / "log").read_text() and not trace.exists()
 
 

@@ -18,7 +18,7 @@ from splatnode import command_line
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.cameras.folder import Config, frame_name, stream
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.recording import Recorder
 from splatnode.recon.daemon import control
 from tests.support.hostile import TEXTS, unprintable
@@ -165,7 +165,7 @@ def test_what_was_recorded_is_printable_and_two_stay_two(tmp_path, text):
             recorder.write(DroppedFrame("y", "z"))
     index = tmp_path / "recording" / "splatnode-frames.jsonl"
     lines = [json.loads(line) for line in index.read_text().splitlines()]
-    names = (f"a{text}", f"b{text}", printable(f"a{text}"))  # what somebody wrote who knows how names are shown
+    names = (f"a{text}", f"b{text}", sanitize_text(f"a{text}"))  # what somebody wrote who knows how names are shown
     for number, line in enumerate(lines):
         line["name"] = names[number // 2]
         line.update({"reason": text} if line["type"] == "dropped" else {})

@@ -17,8 +17,8 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_MAP, RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.recon.occupancy.message import to_message as map_message
-from splatnode.recon.result.message import to_message
+from splatnode.recon.occupancy.message import encode_map as map_message
+from splatnode.recon.result.message import encode_snapshot
 from tests.conftest import ROOT
 from tests.support.exported import make_snapshot
 from tests.support.occupied import small_map
@@ -34,7 +34,11 @@ def test_a_program_of_the_page_prints_the_scene(program, tmp_path):
     numbers = Numbering()
     with StateServer(RECON_SCENE, Network(directory=tmp_path)) as node:
         printed = printed_by(
-            program, node, lambda: to_message(scene, "scene-0001", numbers.next()), scene.cameras[-1].name, tmp_path
+            program,
+            node,
+            lambda: encode_snapshot(scene, "scene-0001", numbers.next()),
+            scene.cameras[-1].name,
+            tmp_path,
         )
     assert scene.verdict.code.value in printed and scene.cameras[-1].name in printed
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from splatnode.recon.occupancy.occupancy_map import State
-from splatnode.recon.result.write import finish
+from splatnode.recon.occupancy.occupancy_map import VoxelState
+from splatnode.recon.result.write import write_result_folder
 from tests.conftest import ROOT
 from tests.support.occupied import room_snapshot
 
@@ -14,7 +14,7 @@ PAGE = (ROOT / "docs" / "occupancy.md").read_text(encoding="utf-8")
 
 
 def test_the_example_in_python_makes_a_map(tmp_path: Path, monkeypatch, capsys):
-    finish(room_snapshot(), tmp_path / "demo", seed=0, preset_name="fast")
+    write_result_folder(room_snapshot(), tmp_path / "demo", seed=0, preset_name="fast")
     monkeypatch.chdir(tmp_path)
     (example,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
     exec(compile(example, "docs/occupancy.md", "exec"), {})
@@ -26,4 +26,4 @@ def test_the_example_in_python_makes_a_map(tmp_path: Path, monkeypatch, capsys):
 
 def test_the_page_has_every_state():
     told = {int(number): name for name, number in re.findall(r"^\| ([a-z ]+) \((\d)\) \|", PAGE, re.MULTILINE)}
-    assert told == {state.value: state.name.lower().replace("_", " ") for state in State}
+    assert told == {state.value: state.name.lower().replace("_", " ") for state in VoxelState}

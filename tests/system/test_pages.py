@@ -16,10 +16,10 @@ from splatnode.capture.messaging import commands, keyframe_messages, services, s
 from splatnode.capture.motion import Motion
 from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import CaptureStatus
-from splatnode.recon.daemon.control import Retract
-from splatnode.recon.daemon.status import ReconStatus, State
+from splatnode.recon.daemon.control import RemoveKeyframe
+from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.occupancy.message import MapHeader, MapRecord
-from splatnode.recon.result.export.format import format_names
+from splatnode.recon.result.export.format import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
 from tests.conftest import ROOT
@@ -93,11 +93,11 @@ SECTIONS = {
     "Fields that all headers have": wire.Header,
 }
 ROWS = (
-    Retract,
-    commands.Seen,
+    RemoveKeyframe,
+    commands.MarkProblemsSeen,
     commands.Answer,
     keyframe_messages.Ready,
-    keyframe_messages.Served,
+    keyframe_messages.ConsumerStatus,
     keyframe_messages.Delivery,
     keyframe_messages.FrameHeader,
     keyframe_messages.DroppedHeader,
@@ -135,7 +135,7 @@ def test_every_service_state_and_field_of_a_lens_is_told():
     assert {(each.name, each.pattern.name.lower(), str(each.tcp_port)) for each in both} == set(rows)
     records = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings)
     of_records = [name for record in records for name in record.__dataclass_fields__]
-    named = [f"`{each.value}`" for each in State] + [f"`{name}`" for name in of_records]
+    named = [f"`{each.value}`" for each in ReconState] + [f"`{name}`" for name in of_records]
     assert not [name for name in named if name not in page]
     assert f"`SPLAT`, then one byte with the version ({wire.VERSION})" in page and all(
         f"`{dtype}`" in page for dtype in wire.DTYPES
@@ -144,7 +144,7 @@ def test_every_service_state_and_field_of_a_lens_is_told():
 
 def test_every_export_format_is_told():
     table = text("docs/files.md").partition("## Export\n")[2].partition("\n## ")[0]
-    assert sorted(re.findall(r"^\| `(\w+)` \| `", table, re.MULTILINE)) == format_names()
+    assert sorted(re.findall(r"^\| `(\w+)` \| `", table, re.MULTILINE)) == list_format_names()
 
 
 def test_every_camera_is_told():

@@ -57,11 +57,11 @@ def reader(tmp_path_factory) -> Path:
         (folder / "photos" / f"view_{index:03d}.png").write_bytes(encode_png(frame.image))
     further = {"further": (PLACE, 1.5), "elsewhere": (msgspec.structs.replace(PLACE, seed=1), 1.0)}
     for name, (place, position) in further.items():
-        image = synthetic.photograph(place, synthetic._camera_on_path(place, position), 9)
+        image = synthetic.render_image(place, synthetic._camera_on_path(place, position), 9)
         (folder / f"{name}.png").write_bytes(encode_png(image))
     film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 8, (PLACE.width, PLACE.height))
     for position in np.linspace(0, PLACE.views - 1, FILMED):
-        image = synthetic.photograph(PLACE, synthetic._camera_on_path(PLACE, float(position)), 0)
+        image = synthetic.render_image(PLACE, synthetic._camera_on_path(PLACE, float(position)), 0)
         film.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     film.release()
     (folder / "run").mkdir(mode=0o700)

@@ -19,7 +19,7 @@ from splatnode.capture.messaging.network import Network, NetworkError, runtime_d
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.spool import Config, Spool
 from splatnode.capture.messaging.state import StateServer
-from splatnode.capture.process.private import NotPrivate
+from splatnode.capture.process.private import NotOwnerOnly
 from splatnode.recon.daemon.checkpoint.store import Store
 from tests.conftest import ROOT
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
@@ -101,7 +101,7 @@ def test_state_is_not_kept_in_what_another_user_prepared(shared_tmp, what, how):
         "checkpoint": lambda: Store(shared_tmp / "checkpoint"),
         "frames": lambda: Store(shared_tmp / "spool"),
     }[what]
-    with pytest.raises(NotPrivate, match=r"--checkpoint|spool\.directory"):
+    with pytest.raises(NotOwnerOnly, match=r"--checkpoint|spool\.directory"):
         begin()
     assert not any(path.with_name(f"{path.name}.ours").iterdir())
 
@@ -118,8 +118,8 @@ def test_nothing_of_the_first_user_can_be_read_or_changed_by_the_second(shared_t
             server.offer(Frame(0, "a.png", 0, image, None))
             store = Store(shared_tmp / "recon")
             resources.callback(store.close)
-            store.put(ReceivedFrame("0" * 32, 0, Frame(0, "a.png", 0, image, None)))
-            store.begin_place(1)
+            store.add_frame(ReceivedFrame("0" * 32, 0, Frame(0, "a.png", 0, image, None)))
+            store.begin_submap(1)
             keys.allow(shared_tmp / "keys", "laptop", keys.create_keys(shared_tmp / "keys"))
             everything = sorted(shared_tmp.rglob("*"))
             names = {path.name for path in everything}
@@ -133,7 +133,7 @@ def test_nothing_of_the_first_user_can_be_read_or_changed_by_the_second(shared_t
 def test_a_file_of_another_user_is_not_taken_for_ours(tmp_path, shared_tmp, caplog):  # noqa: F811
     spool, store = Spool(Config(tmp_path)), Store(tmp_path / "recon")
     image = np.zeros((6, 8, 3), np.uint8)
-    store.put(ReceivedFrame("0" * 32, 0, Frame(0, "a.png", 0, image, None)))
+    store.add_frame(ReceivedFrame("0" * 32, 0, Frame(0, "a.png", 0, image, None)))
     spool.close()
     store.close()
     (frame,) = (tmp_path / "recon" / "frames").glob("*.frame")

@@ -26,16 +26,16 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.recon.result.camera_check import camera_problem
-from splatnode.recon.result.depth_message import depth_header
+from splatnode.recon.result.camera_check import find_camera_problem
+from splatnode.recon.result.depth_message import make_depth_header
 from splatnode.recon.result.export import SceneFileError, write_result
-from splatnode.recon.result.message import to_message
+from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer import cli
 from splatnode.viewer.probe import Probe, probe_window
-from splatnode.viewer.sources import Live, load_result
+from splatnode.viewer.sources import LiveSource, load_result
 from tests.conftest import ROOT
 from tests.support.node import heartbeat
 from tests.viewer.test_scene import camera, moment, wall
@@ -251,9 +251,9 @@ def test_a_window_is_opened_smaller_where_the_processor_draws_it():
 
 def test_cameras_that_nobody_can_look_through_are_told():
     one = camera(0.3)
-    assert not camera_problem(one.T_world_camera, one.K, one.width, one.height)
+    assert not find_camera_problem(one.T_world_camera, one.K, one.width, one.height)
     one.T_world_camera[0, 0] += 0.5
-    assert "rigid motion" in camera_problem(one.T_world_camera, one.K, one.width, one.height)
+    assert "rigid motion" in find_camera_problem(one.T_world_camera, one.K, one.width, one.height)
 
 
 @pytest.fixture
@@ -274,7 +274,7 @@ def node(tmp_path):
         thread.join()
 
 
-def wait_for(source: Live):
+def wait_for(source: LiveSource):
     deadline = time.monotonic() + 60
     while (found := source.take()) is None and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -286,8 +286,8 @@ def test_a_viewer_that_comes_late_sees_the_newest_scene(node):
     server, network = node
     numbering = Numbering()
     for _ in range(3):
-        server.publish(*to_message(snapshot(), "place", numbering.next()))
-    source = Live(network)
+        server.publish(*encode_snapshot(snapshot(), "place", numbering.next()))
+    source = LiveSource(network)
     there = wait_for(source)
     assert there.snapshot.sequence == 2 and there.scene_id == "place"
     assert len(there.snapshot.gaussians) == 225 and list(there.snapshot.images) == ["0.png", "1.png"]
@@ -303,12 +303,12 @@ def test_a_viewer_joins_the_share_of_confirmed_depth_to_its_scene(node, first):
     cameras = tuple(replace(each, consistent_depth=0.5 + 0.1 * n) for n, each in enumerate(made.cameras))
     made = replace(made, cameras=cameras)
     with StateServer(RECON_DEPTH, network) as of_depth:
-        source = Live(network)
+        source = LiveSource(network)
         publish = [
             lambda numbers: of_depth.publish(
-                depth_header(made, "place", numbers["sequence"], depths.next() | {"session": numbers["session"]})
+                make_depth_header(made, "place", numbers["sequence"], depths.next() | {"session": numbers["session"]})
             ),
-            lambda numbers: server.publish(*to_message(made, "place", numbers)),
+            lambda numbers: server.publish(*encode_snapshot(made, "place", numbers)),
         ]
         deadline = time.monotonic() + 60
         shares = None
@@ -327,21 +327,21 @@ def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):
     _, network = node
     numbering = Numbering()
     with Publisher(RECON_STATUS, network) as publisher:
-        source = Live(network)
+        source = LiveSource(network)
         for tracked, seen in (
             (camera(0.5, frame_id=7), "7.png"),
             (camera(0.2), "0.png"),
             (None, None),
         ):
             deadline = time.monotonic() + 60
-            while (source.tracked.name if source.tracked else None) != seen and time.monotonic() < deadline:
+            while (source.live_camera.name if source.live_camera else None) != seen and time.monotonic() < deadline:
                 publisher.send(heartbeat(numbering, tracked))
                 time.sleep(0.02)
-            assert (source.tracked.name if source.tracked else None) == seen
-            there = source.tracked
+            assert (source.live_camera.name if source.live_camera else None) == seen
+            there = source.live_camera
             publisher.send(heartbeat(numbering, tracked))
             time.sleep(0.3)
-            assert source.tracked is there  # the same again is no news, for which a window would be drawn
+            assert source.live_camera is there  # the same again is no news, for which a window would be drawn
             assert source.age_s is not None and source.age_s < 60  # no scene yet, but the node lives
         source.close()
 
@@ -352,7 +352,7 @@ def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys
     monkeypatch.setattr(cli, "use_threads", given_up.append)
     monkeypatch.setattr(cli.cv2, "setNumThreads", given_up.append)
     server, network = node
-    server.publish(*to_message(snapshot(), "place", Numbering().next()))
+    server.publish(*encode_snapshot(snapshot(), "place", Numbering().next()))
     config = tmp_path / "node.yaml"
     config.write_text(f"network: {{directory: {network.directory}}}\n")
     out = tmp_path / "pictures"
@@ -365,7 +365,7 @@ def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys
 
 
 def test_a_viewer_that_waits_says_for_what(node, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "_give_way", lambda: None)
+    monkeypatch.setattr(cli, "_lower_priority", lambda: None)
     server, network = node
     config = tmp_path / "node.yaml"
     config.write_text(f"network: {{directory: {network.directory}}}\n")
@@ -374,7 +374,7 @@ def test_a_viewer_that_waits_says_for_what(node, tmp_path, monkeypatch, capsys):
     def say(line):
         said.append(line)
         if len(said) == 1:  # only now there is a scene
-            server.publish(*to_message(snapshot(), "place", Numbering().next()))
+            server.publish(*encode_snapshot(snapshot(), "place", Numbering().next()))
 
     monkeypatch.setattr(cli, "say", say)
     arguments = [

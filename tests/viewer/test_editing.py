@@ -7,13 +7,22 @@ import pytest
 
 from splatnode.recon.result.export.selection import Box, Selection
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import SHELL, filled
-from splatnode.viewer.editing import EditError, box, box_lines, edit_lines, edited, one_more, room, write_edited
+from splatnode.recon.result.sources import SHELL, encode_unconfirmed
+from splatnode.viewer.editing import (
+    EditError,
+    add_edit,
+    apply_edits,
+    box,
+    box_lines,
+    compute_crop_bounds,
+    edit_lines,
+    write_edited,
+)
 from splatnode.viewer.graph import Graph
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished, load_result
-from splatnode.viewer.state import State
+from splatnode.viewer.sources import FixedSource, load_result
+from splatnode.viewer.state import ViewerState
 from tests.viewer.test_scene import camera, moment, together, wall
 
 LEFT_HALF = Selection(box=Box((-1.0, -1.0, 0.0), (0.0, 1.0, 2.0)))
@@ -22,34 +31,34 @@ SEEN = Selection(only_seen=True)
 
 def two_walls() -> Moment:
     """One that two photographs confirm, and behind it a guess and a shell."""
-    parts = wall(9), wall(9, depth=1.5, source=filled(0)), wall(5, depth=9.0, half=3.0, source=SHELL)
+    parts = wall(9), wall(9, depth=1.5, source=encode_unconfirmed(0)), wall(5, depth=9.0, half=3.0, source=SHELL)
     return moment(together(*parts), camera(0.0), camera(0.1, frame_id=1))
 
 
 def test_edits_take_away_one_after_another():
     gaussians = two_walls().snapshot.gaussians
-    assert edited(gaussians, ()) is gaussians
-    assert (edited(gaussians, (SEEN,)).means[:, 2] == 1.0).all()
-    both = edited(gaussians, (SEEN, LEFT_HALF))
+    assert apply_edits(gaussians, ()) is gaussians
+    assert (apply_edits(gaussians, (SEEN,)).means[:, 2] == 1.0).all()
+    both = apply_edits(gaussians, (SEEN, LEFT_HALF))
     assert len(both) == 45 and (both.means[:, 0] <= 0).all()
-    assert len(edited(gaussians, (Selection(box=Box((8, 8, 8), (9, 9, 9))),))) == 0
+    assert len(apply_edits(gaussians, (Selection(box=Box((8, 8, 8), (9, 9, 9))),))) == 0
 
 
 def test_what_cannot_be_done_is_told_and_changes_nothing():
     there = two_walls()
-    assert one_more(there, (), SEEN) == (SEEN,)
+    assert add_edit(there, (), SEEN) == (SEEN,)
     with pytest.raises(EditError, match="nothing to take away"):
-        one_more(there, (SEEN,), SEEN)
+        add_edit(there, (SEEN,), SEEN)
     with pytest.raises(EditError, match="Nothing would be left"):
-        one_more(there, (), Selection(box=Box((8, 8, 8), (9, 9, 9))))
+        add_edit(there, (), Selection(box=Box((8, 8, 8), (9, 9, 9))))
     with pytest.raises(EditError, match="does not tell which"):
-        one_more(moment(wall(5, source=SHELL), camera(0.0)), (), SEEN)
+        add_edit(moment(wall(5, source=SHELL), camera(0.0)), (), SEEN)
     with pytest.raises(EditError, match="single scene"):
-        one_more(Moment(there.snapshot, 0.0, graph=Graph((), (), 0, 1, False)), (), LEFT_HALF)
+        add_edit(Moment(there.snapshot, 0.0, graph=Graph((), (), 0, 1, False)), (), LEFT_HALF)
 
 
 def test_the_room_holds_what_was_photographed_and_boxes_are_cut_from_it():
-    corners = room(two_walls())
+    corners = compute_crop_bounds(two_walls())
     assert (corners[0] < [-0.3, -0.3, 1.0]).all() and (corners[1] > [0.3, 0.3, 1.0]).all() and corners[1, 2] < 1.5
     whole = box(corners, ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0)))
     assert np.allclose([whole.least, whole.most], corners)
@@ -57,17 +66,17 @@ def test_the_room_holds_what_was_photographed_and_boxes_are_cut_from_it():
     assert half.least[0] == pytest.approx(corners[:, 0].mean()) and half.least[2] < half.most[2]
     edges = box_lines(whole).ends
     assert edges.shape == (12, 2, 3) and np.allclose((edges[:, 0] != edges[:, 1]).sum(1), 1)
-    assert room(moment(GaussianArrays.empty())).shape == (2, 3)
+    assert compute_crop_bounds(moment(GaussianArrays.empty())).shape == (2, 3)
 
 
 def test_a_session_crops_undoes_and_saves_as_a_new_result(tmp_path):
     there = two_walls()
-    session = Session(Finished(there), State(advice=False))
+    session = Session(FixedSource(there), ViewerState(advice=False))
     session.receive()
     with pytest.raises(EditError, match="nothing new"):
         session.save(tmp_path)
     session.keep_seen()
-    session.state = State(advice=False, edits=session.state.edits, box=((0.0, 0.5), (0.0, 1.0), (0.0, 1.0)))
+    session.state = ViewerState(advice=False, edits=session.state.edits, box=((0.0, 0.5), (0.0, 1.0), (0.0, 1.0)))
     session.crop()
     assert len(session.gaussians()) == 45 and edit_lines(there, session.state.edits) == [
         "45 of 187 Gaussians left (2 steps)."
@@ -86,8 +95,8 @@ def test_a_session_crops_undoes_and_saves_as_a_new_result(tmp_path):
 
 
 def test_another_place_begins_without_edits():
-    feed = Finished(two_walls())
-    session = Session(feed, State(advice=False, edits=(SEEN,), measured=(np.zeros(3),)))
+    feed = FixedSource(two_walls())
+    session = Session(feed, ViewerState(advice=False, edits=(SEEN,), measured=(np.zeros(3),)))
     session.receive()
     feed._moment = Moment(two_walls().snapshot, 1.0, "elsewhere")
     session.receive()

@@ -10,8 +10,8 @@ from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.canvas import project
 from splatnode.viewer.ground import ground, ground_lines, round_number
 from splatnode.viewer.legend import bar_length, legend
-from splatnode.viewer.lengths import in_words
-from splatnode.viewer.viewpoint import orbited
+from splatnode.viewer.lengths import format_length
+from splatnode.viewer.viewpoint import orbit
 from tests.viewer.test_scene import camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 
@@ -56,7 +56,7 @@ def test_cells_are_round_numbers(least, cell):
     ],
 )
 def test_a_length_has_its_unit_or_says_that_it_has_none(length, metric, said):
-    assert in_words(length, Scale(metric)) == said
+    assert format_length(length, Scale(metric)) == said
 
 
 @pytest.mark.parametrize("distance", [0.013, 0.4, 1.0, 77.0])
@@ -72,7 +72,7 @@ def test_the_scale_bar_is_as_long_as_it_says_at_the_depth_of_the_pivot(distance)
 
 
 def test_the_axes_point_where_the_world_s_do():
-    view, size = orbited(viewpoint(), 0.7, 0.3), (400, 320)
+    view, size = orbit(viewpoint(), 0.7, 0.3), (400, 320)
     shown = legend(view, *size, RELATIVE)
     assert [label.text for label in shown.labels] == ["0.2 relative", "x", "y", "z", "up"]
     ends = [project(lines.ends[0], view, *size)[:, :2] for lines in shown.lines[1:]]

@@ -13,14 +13,14 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
-from splatnode.recon.result.message import SceneHeader, from_message, to_message
+from splatnode.recon.result.message import SceneHeader, decode_snapshot, encode_snapshot
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished, Live, _safe
-from splatnode.viewer.state import BINDINGS, State
+from splatnode.viewer.sources import FixedSource, LiveSource, _sanitize_snapshot
+from splatnode.viewer.state import BINDINGS, ViewerState
 from tests.capture.messaging.test_sockets import wait_for
 
 COUNT = 6
@@ -74,11 +74,11 @@ SCENES = {
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_that_passes_the_wire_is_drawn(name):
-    header, arrays = to_message(SCENES[name], "place", Numbering().next())
-    live = from_message(decode([bytes(part) for part in encode(header, arrays)], SceneHeader))
-    moment = Moment(_safe(live.snapshot), 0.0, "place")
+    header, arrays = encode_snapshot(SCENES[name], "place", Numbering().next())
+    live = decode_snapshot(decode([bytes(part) for part in encode(header, arrays)], SceneHeader))
+    moment = Moment(_sanitize_snapshot(live.snapshot), 0.0, "place")
     analyse(moment)
-    session = Session(Finished(moment), State())
+    session = Session(FixedSource(moment), ViewerState())
     try:
         assert session.receive()
         for binding in BINDINGS:
@@ -86,7 +86,7 @@ def test_a_scene_that_passes_the_wire_is_drawn(name):
             assert session.paint(64, 48).shape == (48, 64, 3)
             session.press(binding.key)
         for each in live.snapshot.cameras[:2]:
-            session.state = replace(State(), camera=each.name, blend=0.5)
+            session.state = replace(ViewerState(), camera=each.name, blend=0.5)
             assert session.paint(64, 48).shape == (48, 64, 3)
             session.click(32.0, 24.0, 64, 48)
     finally:
@@ -96,20 +96,20 @@ def test_a_scene_that_passes_the_wire_is_drawn(name):
 def test_scenes_that_are_refused_end_no_viewer(tmp_path):
     network, numbering = Network(directory=tmp_path / "run"), Numbering()
     with StateServer(RECON_SCENE, network) as server:
-        live = Live(network)
+        live = LiveSource(network)
         try:
-            header, arrays = to_message(scene(), "place", numbering.next())
+            header, arrays = encode_snapshot(scene(), "place", numbering.next())
             for change in (
                 [np.zeros((COUNT, 2, 3), np.float32) if index == 4 else array for index, array in enumerate(arrays)],
                 arrays[:-1],
                 [*arrays[:-1], np.zeros(10, np.uint8)],
             ):
                 with pytest.raises(WireError):
-                    from_message(Message(header, tuple(change)))
+                    decode_snapshot(Message(header, tuple(change)))
                 header = msgspec.structs.replace(header, **numbering.next())
                 server.publish(header, change)
                 wait_for(lambda: server.serve(0.05) or live.age_s < 60)
-            good = to_message(scene(), "good", numbering.next())
+            good = encode_snapshot(scene(), "good", numbering.next())
             server.publish(*good)
 
             def shown():

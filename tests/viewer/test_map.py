@@ -11,17 +11,17 @@ import pytest
 
 from splatnode.command_line import main
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.pieces import pieces_of
-from splatnode.recon.result.whole import read_whole
+from splatnode.recon.result.pieces import find_pieces
+from splatnode.recon.result.whole import read_map_set
 from splatnode.viewer import words
 from splatnode.viewer.graph import FULL, NOTHING, Graph, GraphEdge, GraphNode, edge_lines, node_marks, place_lines
 from splatnode.viewer.map_loader import MapLoader
 from splatnode.viewer.map_source import Maps, MapSource, map_moment
-from splatnode.viewer.moment import remembered
-from splatnode.viewer.nearness import FOCAL_PX, Extent, chosen_levels
+from splatnode.viewer.moment import append_moment
+from splatnode.viewer.nearness import FOCAL_PX, Extent, choose_levels
 from splatnode.viewer.session import Session
 from splatnode.viewer.shapes import CHAIN_COLOUR, LOOP_COLOUR, RETRACTED_COLOUR, shapes
-from splatnode.viewer.state import State, press
+from splatnode.viewer.state import ViewerState, press
 from splatnode.viewer.viewpoint import overview
 from tests.support.walk import place, walk, write_walk
 
@@ -46,13 +46,13 @@ def out(tmp_path):
 
 def test_the_near_is_full_the_far_is_coarse_and_the_budget_is_kept():
     near, far = Extent(0.0, 0.1, (1000, 100), (0.01,)), Extent(5.0, 5.1, (1000, 100), (0.01,))
-    assert chosen_levels([far, near], 5000) == (FULL, FULL)  # voxels of 10 pixels are seen
-    assert chosen_levels([far, near], 1100) == (1, FULL)
-    assert chosen_levels([far, near], 1050) == (1, 1)
-    assert chosen_levels([far, near], 150) == (NOTHING, 1)
+    assert choose_levels([far, near], 5000) == (FULL, FULL)  # voxels of 10 pixels are seen
+    assert choose_levels([far, near], 1100) == (1, FULL)
+    assert choose_levels([far, near], 1050) == (1, 1)
+    assert choose_levels([far, near], 150) == (NOTHING, 1)
     beyond = replace(far, away=FOCAL_PX * 0.01)
-    assert chosen_levels([beyond, near], 5000) == (1, FULL)  # now they are below a pixel
-    assert chosen_levels([], 10) == ()
+    assert choose_levels([beyond, near], 5000) == (1, FULL)  # now they are below a pixel
+    assert choose_levels([], 10) == ()
 
 
 @pytest.mark.parametrize("budget", [0, 40, 500, 2600, 10_000])
@@ -64,13 +64,13 @@ def test_no_choice_exceeds_the_budget(budget):
         extents.append(
             Extent(float(rng.uniform(0, 9)), float(rng.uniform(0, 9)), (full, full // 4, full // 16), (0.01, 0.02))
         )
-    chosen = chosen_levels(extents, budget)
+    chosen = choose_levels(extents, budget)
     assert sum(extents[i].counts[level] for i, level in enumerate(chosen) if level != NOTHING) <= budget
 
 
 def test_pieces_are_loaded_where_the_eye_is_and_forgotten_where_it_was(tmp_path):
-    whole = read_whole(write_walk(tmp_path, step=0.02))
-    pieces = pieces_of(whole, whole.maps[0], tmp_path)
+    whole = read_map_set(write_walk(tmp_path, step=0.02))
+    pieces = find_pieces(whole, whole.maps[0], tmp_path)
     full = [len(scene.gaussians) - int((scene.gaussians.source_frame == -1).sum()) for scene in walk(0.02)]
     budget = max(full) + max(full) // 3
     loader = MapLoader(pieces, budget)
@@ -88,8 +88,8 @@ def test_pieces_are_loaded_where_the_eye_is_and_forgotten_where_it_was(tmp_path)
 
 
 def test_loading_begins_anew_when_the_eye_goes_elsewhere(tmp_path):
-    whole = read_whole(write_walk(tmp_path))
-    loader = MapLoader(pieces_of(whole, whole.maps[0], tmp_path), 1_000_000)
+    whole = read_map_set(write_walk(tmp_path))
+    loader = MapLoader(find_pieces(whole, whole.maps[0], tmp_path), 1_000_000)
     assert loader.look_from(NONE, lambda: True)
     assert list(loader.shown) == ["scene-0001"]  # the nearest first
 
@@ -117,9 +117,11 @@ def test_the_whole_map_is_in_one_frame_with_its_graph(out):
 
 def test_links_are_drawn_by_kind_and_places_are_listed(out):
     moment = map_moment(maps(out))
-    drawn = {lines.colour: len(lines.ends) for lines in shapes(moment, State(cameras=False, path=False), None).lines}
+    drawn = {
+        lines.colour: len(lines.ends) for lines in shapes(moment, ViewerState(cameras=False, path=False), None).lines
+    }
     assert drawn[CHAIN_COLOUR] == 1 and drawn[LOOP_COLOUR] == 1 and drawn[RETRACTED_COLOUR] > 4  # dashes
-    hidden = shapes(moment, press(State(cameras=False, path=False), (), "8"), None)
+    hidden = shapes(moment, press(ViewerState(cameras=False, path=False), (), "8"), None)
     assert not hidden.lines
     said = "\n".join(words.place_lines(moment))
     for phrase in (
@@ -155,7 +157,7 @@ def wait_for(session: Session, until) -> None:
 def test_a_person_walks_through_a_map_and_to_the_next_one(tmp_path, out):
     index = json.loads((out / "places.json").read_text())
     (out / "places.json").write_text(json.dumps(index))
-    session = Session(MapSource(maps(out, 1200)), State())
+    session = Session(MapSource(maps(out, 1200)), ViewerState())
     try:
         wait_for(session, lambda moment: any(node.level == FULL for node in moment.graph.nodes))
         assert session.analysis() is None and session.source.age_s is None
@@ -176,7 +178,7 @@ def test_a_person_walks_through_a_map_and_to_the_next_one(tmp_path, out):
 
 def test_a_map_has_no_history(out):
     moment = map_moment(maps(out))
-    assert remembered((moment, moment), moment) == (moment,)
+    assert append_moment((moment, moment), moment) == (moment,)
 
 
 def test_what_is_damaged_is_told_by_name(out, capsys):
@@ -185,7 +187,7 @@ def test_what_is_damaged_is_told_by_name(out, capsys):
     (out / "scene-0002" / "scene.ply").write_bytes(b"ply\n")
     with pytest.raises(SceneFileError, match="scene-0002"):
         map_moment(maps(out))
-    session = Session(MapSource(maps(out)), State())
+    session = Session(MapSource(maps(out)), ViewerState())
     with pytest.raises(SceneFileError, match="scene-0002"):
         wait_for(session, lambda moment: False)
     session.close()

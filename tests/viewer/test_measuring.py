@@ -7,11 +7,11 @@ import pytest
 
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.viewer.canvas import empty_canvas, project
-from splatnode.viewer.measuring import measured_lines, measured_shapes, surface_point, with_point
+from splatnode.viewer.measuring import add_point, measurement_lines, measurement_shapes, surface_point
 from splatnode.viewer.paint import paint_coarsely
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished
-from splatnode.viewer.state import State
+from splatnode.viewer.sources import FixedSource
+from splatnode.viewer.state import ViewerState
 from tests.viewer.test_scene import camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 
@@ -20,7 +20,7 @@ SIZE = 200, 160
 
 def test_a_click_means_the_surface_that_is_seen_there():
     view = viewpoint()
-    canvas = paint_coarsely(wall(), view, State(), SIZE, 1)
+    canvas = paint_coarsely(wall(), view, ViewerState(), SIZE, 1)
     for there in ([0.1, -0.05, 1.0], [-0.2, 0.2, 1.0]):
         x, y, _ = project(np.array([there]), view, *SIZE)[0]
         assert surface_point(canvas, view, x, y) == pytest.approx(there, abs=0.01)
@@ -29,27 +29,27 @@ def test_a_click_means_the_surface_that_is_seen_there():
 
 
 def test_two_points_are_measured_and_a_third_begins_anew():
-    points = with_point(with_point((), np.zeros(3)), np.array([0.0, 0.3, 0.4]))
-    assert len(points) == 2 and len(with_point(points, np.ones(3))) == 1
-    said = " ".join(measured_lines(points, True, RELATIVE))
+    points = add_point(add_point((), np.zeros(3)), np.array([0.0, 0.3, 0.4]))
+    assert len(points) == 2 and len(add_point(points, np.ones(3))) == 1
+    said = " ".join(measurement_lines(points, True, RELATIVE))
     assert said.startswith("0.5 relative") and "median depth" in said
     metric = Scale(True, "the distance between a.jpg and b.jpg")
-    assert measured_lines(points, True, metric) == [f"50 cm between the two points ({metric.source})."]
-    assert "two points" in measured_lines((), True, RELATIVE)[0] and measured_lines((), False, RELATIVE) == []
-    assert "second" in measured_lines(points[:1], True, RELATIVE)[0]
+    assert measurement_lines(points, True, metric) == [f"50 cm between the two points ({metric.source})."]
+    assert "two points" in measurement_lines((), True, RELATIVE)[0] and measurement_lines((), False, RELATIVE) == []
+    assert "second" in measurement_lines(points[:1], True, RELATIVE)[0]
 
 
 def test_what_is_measured_stands_in_the_scene():
     eye = np.array([0.0, 0.0, -1.0])
-    assert measured_shapes((), eye, RELATIVE).lines == ()
-    one = measured_shapes((np.zeros(3),), eye, RELATIVE)
+    assert measurement_shapes((), eye, RELATIVE).lines == ()
+    one = measurement_shapes((np.zeros(3),), eye, RELATIVE)
     assert len(one.lines[0].ends) == 3 and not one.labels
-    two = measured_shapes((np.zeros(3), np.array([0.2, 0.0, 0.0])), eye, Scale(True))
+    two = measurement_shapes((np.zeros(3), np.array([0.2, 0.0, 0.0])), eye, Scale(True))
     assert len(two.lines[0].ends) == 7 and [label.text for label in two.labels] == ["20 cm"]
 
 
 def test_in_a_session_clicks_measure_while_that_is_asked_for():
-    session = Session(Finished(moment(wall(), camera(0.0), camera(0.1, frame_id=1))), State(advice=False))
+    session = Session(FixedSource(moment(wall(), camera(0.0), camera(0.1, frame_id=1))), ViewerState(advice=False))
     session.receive()
     session.press("d")
     here, there = np.array([-0.1, 0.0, 1.0]), np.array([0.1, 0.0, 1.0])

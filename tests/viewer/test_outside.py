@@ -9,9 +9,9 @@ import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.result.sources import SHELL
-from splatnode.viewer.outside import seen_from
+from splatnode.viewer.outside import cull_far_shell
 from splatnode.viewer.paint import paint_gaussians
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import look_at
 from tests.viewer.test_scene import K
 
@@ -42,7 +42,7 @@ def surrounded() -> GaussianArrays:
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (0.6, 0.8, 0)])
 def test_the_shell_is_seen_from_inside_alone(share, all_of_it, direction):
     gaussians = surrounded()
-    seen = seen_from(gaussians, CENTRE + share * RADIUS * np.array(direction))
+    seen = cull_far_shell(gaussians, CENTRE + share * RADIUS * np.array(direction))
     assert len(seen) == (len(gaussians) if all_of_it else 50)
 
 
@@ -50,13 +50,13 @@ def test_a_scene_without_a_shell_is_seen_whole():
     gaussians = surrounded()
     for source in (0, SHELL):  # which is what files have that do not tell
         bare = replace(gaussians, source_frame=np.full(len(gaussians), source, np.int32))
-        assert seen_from(bare, CENTRE + 100.0) is bare
-    assert len(seen_from(GaussianArrays.empty(), CENTRE)) == 0
+        assert cull_far_shell(bare, CENTRE + 100.0) is bare
+    assert len(cull_far_shell(GaussianArrays.empty(), CENTRE)) == 0
 
 
 def test_the_picture_from_outside_shows_what_the_shell_surrounds():
     for away, colour in ((12.0, 0), (3.0, 0)):
         view = look_at(CENTRE - np.array([0, 0, away]), CENTRE, np.array([0.0, -1.0, 0.0]))
-        image = paint_gaussians(surrounded(), view, K, State(), 100, 80).image
+        image = paint_gaussians(surrounded(), view, K, ViewerState(), 100, 80).image
         assert image[40, 50].argmax() == colour and image[40, 50, colour] > 150
     assert image[2, 2].argmax() == 1  # from inside the shell is behind the ball

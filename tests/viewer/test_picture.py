@@ -7,27 +7,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.result.bounds import Bounds, ball
+from splatnode.recon.result.bounds import Bounds, make_ball
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.colours import source_colour
-from splatnode.viewer.paint import blended, caption, paint, paint_gaussians
+from splatnode.viewer.paint import add_caption, blend_image, paint, paint_gaussians
 from splatnode.viewer.shapes import (
+    ImageQuad,
     Lines,
-    Photograph,
     Shapes,
+    advice_lines,
     ellipsoid,
     frustum,
     frustum_depth,
-    hint,
     image_corners,
     path,
     shapes,
 )
-from splatnode.viewer.state import State
-from splatnode.viewer.viewpoint import at_camera
+from splatnode.viewer.state import ViewerState
+from splatnode.viewer.viewpoint import move_to_camera
 from tests.viewer.test_scene import K, camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 
@@ -36,11 +36,11 @@ RED, GREEN = np.array([255, 0, 0]), np.array([0, 255, 0])
 
 
 def test_gaussians_cover_the_background_and_can_be_hidden():
-    image = paint(wall(half=0.2), NOTHING, viewpoint(), State(), 100, 80)
+    image = paint(wall(half=0.2), NOTHING, viewpoint(), ViewerState(), 100, 80)
     assert image.shape == (80, 100, 3) and image.dtype == np.uint8
     assert (image[40, 50] > 150).all() and (image[2, 2] == BACKGROUND).all()
-    assert (paint(wall(), NOTHING, viewpoint(), State(gaussians=False), 100, 80) == BACKGROUND).all()
-    assert (paint(GaussianArrays.empty(), NOTHING, viewpoint(), State(), 100, 80) == BACKGROUND).all()
+    assert (paint(wall(), NOTHING, viewpoint(), ViewerState(gaussians=False), 100, 80) == BACKGROUND).all()
+    assert (paint(GaussianArrays.empty(), NOTHING, viewpoint(), ViewerState(), 100, 80) == BACKGROUND).all()
 
 
 def test_points_are_squares_and_the_nearest_is_on_top():
@@ -51,12 +51,12 @@ def test_points_are_squares_and_the_nearest_is_on_top():
         sh=np.array([[[-2.0] * 3], [[2.0] * 3]], np.float32),
         **{name: getattr(far, name)[:2] for name in ("quats", "scales", "opacities", "source_frame")},
     )
-    canvas = paint_gaussians(gaussians, np.eye(4), K, State(as_points=True, point_size=4), 100, 80)
+    canvas = paint_gaussians(gaussians, np.eye(4), K, ViewerState(as_points=True, point_size=4), 100, 80)
     white = (canvas.image == 255).all(2)
     assert np.array_equal(np.argwhere(white)[[0, -1]], [[38, 48], [41, 51]]) and white.sum() == 16
     assert (canvas.depth[white] == 1.0).all() and np.isinf(canvas.depth[~white]).all()
     at_corner = replace(gaussians, means=gaussians.means + np.array([-0.5, -0.4, 0], np.float32))
-    clipped = paint_gaussians(at_corner, np.eye(4), K, State(as_points=True, point_size=4), 100, 80)
+    clipped = paint_gaussians(at_corner, np.eye(4), K, ViewerState(as_points=True, point_size=4), 100, 80)
     assert (clipped.image[:2, :2] == 255).all() and np.isfinite(clipped.depth).sum() > 4
 
 
@@ -65,12 +65,12 @@ def test_lines_are_bright_before_a_wall_and_dim_behind_it():
         return Shapes((Lines(np.array([[[-0.2, 0.0, z], [0.2, 0.0, z]]]), (1.0, 0.0, 0.0), 3),), ())
 
     gaussians = wall(half=0.4)
-    before = paint(gaussians, line(0.5), viewpoint(), State(), 100, 80)
-    behind = paint(gaussians, line(1.5), viewpoint(), State(), 100, 80)
+    before = paint(gaussians, line(0.5), viewpoint(), ViewerState(), 100, 80)
+    behind = paint(gaussians, line(1.5), viewpoint(), ViewerState(), 100, 80)
     assert np.abs(before[40, 50].astype(int) - RED).max() < 30
     assert behind[40, 50, 0] < 150
     passing = Shapes((Lines(np.array([[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]]), (1.0, 0.0, 0.0), 3),), ())
-    paint(gaussians, passing, viewpoint(), State(), 100, 80)  # through the eye: no crash
+    paint(gaussians, passing, viewpoint(), ViewerState(), 100, 80)  # through the eye: no crash
 
 
 def test_a_photograph_lies_where_its_rectangle_is():
@@ -78,12 +78,17 @@ def test_a_photograph_lies_where_its_rectangle_is():
     picture[:, :10], picture[:, 10:] = RED, GREEN
     rectangle = np.array([[-0.2, -0.1, 1], [0.2, -0.1, 1], [0.2, 0.1, 1], [-0.2, 0.1, 1]])
     image = paint(
-        GaussianArrays.empty(), Shapes((), (Photograph("a", rectangle, (picture,)),)), viewpoint(), State(), 100, 80
+        GaussianArrays.empty(),
+        Shapes((), (ImageQuad("a", rectangle, (picture,)),)),
+        viewpoint(),
+        ViewerState(),
+        100,
+        80,
     )
     assert (image[32:48, 32:48] == RED).all() and (image[32:48, 53:68] == GREEN).all()
     assert (image[:28] == BACKGROUND).all() and (image[:, :28] == BACKGROUND).all()
-    hidden = Photograph("a", rectangle + [0, 0, 1.0], (picture,))
-    assert (paint(wall(half=0.5), Shapes((), (hidden,)), viewpoint(), State(), 100, 80)[40, 40] > 150).all()
+    hidden = ImageQuad("a", rectangle + [0, 0, 1.0], (picture,))
+    assert (paint(wall(half=0.5), Shapes((), (hidden,)), viewpoint(), ViewerState(), 100, 80)[40, 40] > 150).all()
 
 
 def test_a_photograph_that_is_drawn_small_does_not_flicker():
@@ -95,29 +100,29 @@ def test_a_photograph_that_is_drawn_small_does_not_flicker():
     assert (np.abs(levels[1].astype(int) - 128) <= 1).all() and there.num_bytes > moment(wall()).num_bytes
     rectangle = np.array([[-0.08, -0.08, 1], [0.08, -0.08, 1], [0.08, 0.08, 1], [-0.08, 0.08, 1]])
     image = paint(
-        GaussianArrays.empty(), Shapes((), (Photograph("a", rectangle, levels),)), viewpoint(), State(), 100, 80
+        GaussianArrays.empty(), Shapes((), (ImageQuad("a", rectangle, levels),)), viewpoint(), ViewerState(), 100, 80
     )
     assert (np.abs(image[36:44, 46:54].astype(int) - 128) <= 2).all()
 
 
 def test_a_photograph_covers_the_render_pixel_by_pixel():
     one = camera(0.0)
-    view = at_camera(viewpoint(), one)
+    view = move_to_camera(viewpoint(), one)
     picture = np.random.default_rng(0).integers(0, 255, (80, 100, 3), dtype=np.uint8)
     render = np.full((80, 100, 3), 100, np.uint8)
-    assert np.array_equal(blended(render, picture, one, view.K(100, 80), 1.0), picture)
-    half = blended(render, picture, one, view.K(100, 80), 0.5)
+    assert np.array_equal(blend_image(render, picture, one, view.K(100, 80), 1.0), picture)
+    half = blend_image(render, picture, one, view.K(100, 80), 0.5)
     assert np.abs(half - (picture / 2 + 50)).max() <= 0.5
-    wide = blended(np.full((80, 200, 3), 7, np.uint8), picture, one, view.K(200, 80), 1.0)
+    wide = blend_image(np.full((80, 200, 3), 7, np.uint8), picture, one, view.K(200, 80), 1.0)
     assert np.array_equal(wide[:, 50:150], picture) and (wide[:, :49] == 7).all()
     grey = np.full((8, 10, 3), 100, np.uint8)  # a small one has soft edges: they must not be dark
-    assert (np.abs(blended(render, grey, one, view.K(100, 80), 1.0).astype(int) - 100) <= 1).all()
+    assert (np.abs(blend_image(render, grey, one, view.K(100, 80), 1.0).astype(int) - 100) <= 1).all()
 
 
 def test_captions_stand_below():
-    image = caption(np.zeros((20, 300, 3), np.uint8), ["a line of 12°", "another"])
+    image = add_caption(np.zeros((20, 300, 3), np.uint8), ["a line of 12°", "another"])
     assert image.shape[0] > 50 and image.shape[1] == 300 and image[20:].max() > 200
-    wrapped = caption(np.zeros((20, 300, 3), np.uint8), ["words " * 30])
+    wrapped = add_caption(np.zeros((20, 300, 3), np.uint8), ["words " * 30])
     assert wrapped.shape[0] > image.shape[0] and (wrapped[20:, -4:] == BACKGROUND).all()
 
 
@@ -144,7 +149,7 @@ def test_frusta_are_as_large_in_the_picture_in_metres_as_without():
 def test_the_path_follows_the_frames_and_the_hint_is_a_camera_that_looks_where_it_should():
     route = path((camera(0.2, frame_id=2), camera(0.0, frame_id=0), camera(0.1, frame_id=1)))
     assert np.allclose(route[:, :, 0], [[0.0, 0.1], [0.1, 0.2]])
-    frame, way = hint((camera(0.0),), np.zeros(3), np.array([1.0, 0, 0]), np.array([1.0, 0, 5.0]), 0.1)
+    frame, way = advice_lines((camera(0.0),), np.zeros(3), np.array([1.0, 0, 0]), np.array([1.0, 0, 5.0]), 0.1)
     assert np.allclose(way.ends, [[[0, 0, 0], [1, 0, 0]]]) and np.allclose(frame.ends[:4, 0], [1, 0, 0])
     assert np.allclose(frame.ends[:4, 1, 2], 0.1) and np.allclose(frame.ends[:4, 1].mean(0), [1.0, 0.0, 0.1])
 
@@ -159,11 +164,13 @@ def test_an_ellipsoid_ends_at_its_semi_axes_and_nowhere_beyond():
 
 def test_an_ellipsoid_has_the_colour_of_its_camera_and_is_drawn_where_it_is_more_than_a_dot():
     sizes = {0: 0.05, 1: 0.001}
-    cameras = [replace(camera(0.5 * i, frame_id=i), bounds=Bounds(0.1, r, r, 1.0, ball(r))) for i, r in sizes.items()]
+    cameras = [
+        replace(camera(0.5 * i, frame_id=i), bounds=Bounds(0.1, r, r, 1.0, make_ball(r))) for i, r in sizes.items()
+    ]
     there = moment(wall(), *cameras, camera(1.0, frame_id=2))
 
     def drawn(**how: object) -> list:
-        state = State(cameras=False, path=False, advice=False, uncertainty=bool(how.pop("uncertainty", True)))
+        state = ViewerState(cameras=False, path=False, advice=False, uncertainty=bool(how.pop("uncertainty", True)))
         return [lines.colour for lines in shapes(there, state, None, **how).lines]
 
     assert drawn() == [source_colour(0), source_colour(1)]  # nothing is known of the third
@@ -179,9 +186,9 @@ def test_switches_decide_what_stands_in_the_scene():
     there, tracked = moment(wall(), *cameras, images=images), camera(0.25, frame_id=9)
     advice = analyse(there).advice
     assert advice.arrow is not None
-    every = shapes(there, State(), advice, tracked)
+    every = shapes(there, ViewerState(), advice, tracked)
     assert len(every.lines) == 1 + 2 + 1 + 2 and [one.name for one in every.photographs] == ["0.png"]
     for switch, left in (("path", 5), ("cameras", 4), ("tracked", 5), ("advice", 4)):
-        assert len(shapes(there, State(**{switch: False}), advice, tracked).lines) == left, switch
-    assert not shapes(there, State(photographs=False), advice).photographs
-    assert len(shapes(there, State(), advice, eye=np.zeros(3)).photographs) == 0  # it would fill the window
+        assert len(shapes(there, ViewerState(**{switch: False}), advice, tracked).lines) == left, switch
+    assert not shapes(there, ViewerState(photographs=False), advice).photographs
+    assert len(shapes(there, ViewerState(), advice, eye=np.zeros(3)).photographs) == 0  # it would fill the window

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.recon.result.bounds import Bounds, ball
-from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.bounds import Bounds, make_ball
+from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer import words
 from splatnode.viewer.advice import GOOD_ANGLE_DEG, Points, next_view, surface_points
-from splatnode.viewer.colours import UNKNOWN, coloured, source_colour
-from splatnode.viewer.moment import Moment, remembered
-from splatnode.viewer.state import Colouring, State
+from splatnode.viewer.colours import UNKNOWN, colour_gaussians, source_colour
+from splatnode.viewer.moment import Moment, append_moment
+from splatnode.viewer.state import Colouring, ViewerState
 from splatnode.viewer.support import support
 from splatnode.viewer.viewpoint import look_at
 
@@ -78,20 +78,22 @@ def test_colours_say_what_they_mean():
     cameras = camera(0.0), camera(0.05, frame_id=1)
     there = moment(together(near, far), *cameras)
     seen = support(there.snapshot.gaussians, cameras)
-    rgb = {colouring: base_rgb(coloured(there, colouring, seen)) / 255.0 for colouring in Colouring}
+    rgb = {colouring: compute_base_rgb(colour_gaussians(there, colouring, seen)) / 255.0 for colouring in Colouring}
     red, _, blue = rgb[Colouring.DEPTH][:25].mean(0)
     assert red > 2 * blue  # near is red
     assert np.allclose(rgb[Colouring.NORMAL][:25], [0.5, 0.5, 1.0], atol=0.01)  # it faces the cameras
     assert np.allclose(rgb[Colouring.SOURCE][:25], source_colour(0), atol=0.01)
     assert np.allclose(rgb[Colouring.SOURCE][25:], source_colour(1), atol=0.01)
     assert (rgb[Colouring.SUPPORT][seen.views == 0] == np.round(np.array(UNKNOWN) * 255) / 255).all()
-    assert coloured(there, Colouring.PHOTOGRAPH, seen) is there.snapshot.gaussians
+    assert colour_gaussians(there, Colouring.PHOTOGRAPH, seen) is there.snapshot.gaussians
 
 
 def test_a_file_without_sources_is_coloured_by_the_camera_that_sees_it_largest():
     cameras = camera(0.0), camera(0.0, z=0.5, frame_id=1)
     there = moment(replace(wall(9, half=0.1), source_frame=np.full(81, -1, np.int32)), *cameras)
-    rgb = base_rgb(coloured(there, Colouring.SOURCE, support(there.snapshot.gaussians, cameras))) / 255.0
+    rgb = (
+        compute_base_rgb(colour_gaussians(there, Colouring.SOURCE, support(there.snapshot.gaussians, cameras))) / 255.0
+    )
     assert np.allclose(rgb, source_colour(1), atol=0.01)
 
 
@@ -145,17 +147,17 @@ def test_the_time_axis_is_thinned_where_it_is_dense_and_never_grows():
     size = moment(wall(5)).num_bytes
     history = ()
     for second in (0, 10, 20, 20.1, 30):
-        history = remembered(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
+        history = append_moment(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
     assert [one.received_s for one in history] in ([0, 10, 20, 30], [0, 10, 20.1, 30])
     for second in range(31, 60):
-        history = remembered(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
+        history = append_moment(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
         assert len(history) == 4 and history[0].received_s == 0 and history[-1].received_s == second
-    assert len(remembered((), moment(wall(5)), memory_bytes=1)) == 1
+    assert len(append_moment((), moment(wall(5)), memory_bytes=1)) == 1
 
 
 def test_the_camera_that_is_looked_through_is_told_or_else_the_widest_of_all():
-    first = replace(camera(0.0), bounds=Bounds(0.3, 0.01, 1.0, 0.8, ball(0.01)))
-    second = replace(camera(0.5, frame_id=1), bounds=Bounds(0.2, 0.03, 3.0, 0.8, ball(0.03)))
+    first = replace(camera(0.0), bounds=Bounds(0.3, 0.01, 1.0, 0.8, make_ball(0.01)))
+    second = replace(camera(0.5, frame_id=1), bounds=Bounds(0.2, 0.03, 3.0, 0.8, make_ball(0.03)))
     there = moment(wall(3), first, second, camera(1.0, frame_id=2), scale=Scale(True, "a ruler"))
     positions = "of the distance to the scene"
     assert words.bounds_lines(there, first) == [
@@ -177,8 +179,8 @@ def test_words_are_plain():
         "About: 0.png",
     ]
     assert words.count_lines(there) == ["9 Gaussians, 1 camera", "3.0 s (poses 1.2)", "10 iterations"]
-    assert words.dropped_lines(there)[0] == "2 photographs were left out before:"
-    assert words.dropped_lines(there)[-1] == "left out 7.png: blurred"
+    assert words.rejection_lines(there)[0] == "2 photographs were left out before:"
+    assert words.rejection_lines(there)[-1] == "left out 7.png: blurred"
     assert words.feed_line(None, True) == "a finished result"
     assert "nothing has come" in words.waiting_line(float("inf")) and "is there" in words.waiting_line(1.0)
     assert "STALE" in words.waiting_line(12.0)
@@ -186,7 +188,7 @@ def test_words_are_plain():
     assert words.advice_line(None, moment(wall(3), verdict=refusal)) == "Take a step to the side."
     file = moment(wall(3))
     assert "file" in words.advice_line(None, replace(file, snapshot=replace(file.snapshot, cameras=(), final=True)))
-    assert words.time_line(State(), (there,)) == "snapshot 1 of 1, the newest"
+    assert words.time_line(ViewerState(), (there,)) == "snapshot 1 of 1, the newest"
 
 
 def test_the_panel_tells_how_much_depth_other_views_confirm_of_a_view_and_of_all():

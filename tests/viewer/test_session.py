@@ -15,20 +15,20 @@ from splatnode.viewer.analysis import Analyst
 from splatnode.viewer.canvas import project
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished
+from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import (
     BINDINGS,
     Colouring,
     Engine,
-    State,
+    ViewerState,
+    current_moment,
     go_to_moment,
     help_lines,
     moment_index,
     open3d_draws,
     press,
-    shown_moment,
 )
-from splatnode.viewer.viewpoint import orbited
+from splatnode.viewer.viewpoint import orbit
 from tests.viewer.test_scene import camera, moment, wall
 
 
@@ -39,7 +39,7 @@ def moments(count: int) -> tuple[Moment, ...]:
 
 def test_every_key_does_something_and_only_its_own():
     history = moments(3)
-    start = State(camera="1.png", blend=0.5, help=True, held=history[1], edits=(Selection(only_seen=True),))
+    start = ViewerState(camera="1.png", blend=0.5, help=True, held=history[1], edits=(Selection(only_seen=True),))
     for binding in BINDINGS:
         after = press(start, history, binding.key)
         assert after is not start and any(getattr(after, name) is not getattr(start, name) for name in vars(start))
@@ -49,7 +49,7 @@ def test_every_key_does_something_and_only_its_own():
 
 
 def test_keys_go_round():
-    state = State()
+    state = ViewerState()
     for _ in Colouring:
         state = press(state, (), "c")
     assert state.colouring is Colouring.PHOTOGRAPH
@@ -67,22 +67,22 @@ def test_keys_go_round():
 
 def test_time_goes_back_and_forth_and_a_pause_holds_it():
     history = moments(4)
-    state = press(State(), history, "left")
-    assert shown_moment(state, history) is history[2] and moment_index(state, history) == 2
-    assert shown_moment(press(state, history, "right"), history) is history[3]
+    state = press(ViewerState(), history, "left")
+    assert current_moment(state, history) is history[2] and moment_index(state, history) == 2
+    assert current_moment(press(state, history, "right"), history) is history[3]
     assert go_to_moment(state, history, -5).held is history[0] and go_to_moment(state, history, 99).held is None
-    paused = press(State(), history, "space")
+    paused = press(ViewerState(), history, "space")
     longer = (*history, moments(5)[4])
-    assert shown_moment(paused, longer) is history[3] and shown_moment(State(), longer) is longer[4]
-    assert shown_moment(press(paused, longer, "space"), longer) is longer[4]
-    assert moment_index(State(held=history[1]), (history[0], *history[2:])) == 1  # it was thinned out
+    assert current_moment(paused, longer) is history[3] and current_moment(ViewerState(), longer) is longer[4]
+    assert current_moment(press(paused, longer, "space"), longer) is longer[4]
+    assert moment_index(ViewerState(held=history[1]), (history[0], *history[2:])) == 1  # it was thinned out
 
 
 def test_open3d_draws_what_it_draws_whole():
-    asked = State(engine=Engine.OPEN3D)
+    asked = ViewerState(engine=Engine.OPEN3D)
     assert open3d_draws(asked, software=False) and not open3d_draws(asked, software=True)
     assert open3d_draws(replace(asked, as_points=True), software=True)
-    assert not open3d_draws(State(), software=False)
+    assert not open3d_draws(ViewerState(), software=False)
 
 
 class Feed:
@@ -103,7 +103,7 @@ class Feed:
 
 def test_a_session_from_the_first_moment_to_a_click():
     feed = Feed()
-    session = Session(feed, State())
+    session = Session(feed, ViewerState())
     assert not session.receive() and session.paint(100, 80) is None and not session.click(1, 1, 100, 80)
     session.press("n")
     first, second = moments(2)
@@ -118,7 +118,7 @@ def test_a_session_from_the_first_moment_to_a_click():
     centre = project(first.snapshot.cameras[1].T_world_camera[None, :3, 3], view, 100, 80)[0]
     assert session.click(centre[0], centre[1], 100, 80) and session.state.camera == "1.png"
     assert np.array_equal(session.viewpoint().T_world_camera, first.snapshot.cameras[1].T_world_camera)
-    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
+    session.move(orbit(session.viewpoint_to_move(), 0.1, 0.0))
     assert session.state.camera is None
     chosen = session.viewpoint()
     feed.waiting.append(second)
@@ -150,10 +150,10 @@ def test_what_was_said_in_another_world_is_taken_back(factor, along):
     feed = Feed()
     first, second = moments(2)
     feed.waiting += [first]
-    session = Session(feed, State())
+    session = Session(feed, ViewerState())
     session.receive()
     session.state = replace(session.state, measured=(np.zeros(3), np.ones(3)), edits=(Selection(only_seen=True),))
-    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
+    session.move(orbit(session.viewpoint_to_move(), 0.1, 0.0))
     chosen = session.viewpoint()
     feed.waiting += [second]
     session.receive()
@@ -169,10 +169,10 @@ def test_what_is_held_keeps_its_edits_and_its_viewpoint_until_it_is_let_go():
     feed = Feed()
     first, second = moments(2)
     feed.waiting += [first]
-    session = Session(feed, State())
+    session = Session(feed, ViewerState())
     session.receive()
     session.state = replace(session.state, held=first, edits=(Selection(only_seen=True),))
-    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
+    session.move(orbit(session.viewpoint_to_move(), 0.1, 0.0))
     chosen = session.viewpoint()
     feed.waiting += [replace(second, scene_id="another")]
     session.receive()
@@ -185,7 +185,7 @@ def test_what_is_held_keeps_its_edits_and_its_viewpoint_until_it_is_let_go():
 
 def test_the_live_camera_moves_between_moments():
     feed = Feed()
-    session = Session(feed, State())
+    session = Session(feed, ViewerState())
     feed.waiting.append(moments(1)[0])
     session.receive()
     lines = len(session.shapes().lines)
@@ -201,7 +201,7 @@ def test_the_live_camera_moves_between_moments():
 
 def test_the_look_at_the_whole_scene_makes_room_for_advice_only_where_it_is_shown():
     for advice in (True, False):
-        session = Session(Finished(moments(1)[0]), State(advice=advice))
+        session = Session(FixedSource(moments(1)[0]), ViewerState(advice=advice))
         session.receive()
         session.whole_scene()
         before = session.viewpoint()
@@ -214,7 +214,7 @@ def test_the_look_at_the_whole_scene_makes_room_for_advice_only_where_it_is_show
 
 def test_gaussians_are_painted_again_only_where_they_look_different():
     feed = Feed()
-    session = Session(feed, State(advice=False))
+    session = Session(feed, ViewerState(advice=False))
     feed.waiting.append(moments(1)[0])
     session.receive()
     without = session.paint(60, 40)
@@ -226,7 +226,7 @@ def test_gaussians_are_painted_again_only_where_they_look_different():
     assert np.array_equal(session.paint(60, 40), without) and session.paintings == 1  # nothing was left behind
     session.press("g")
     session.paint(60, 40)
-    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
+    session.move(orbit(session.viewpoint_to_move(), 0.1, 0.0))
     session.paint(60, 40)
     session.paint(30, 20)
     assert session.paintings == 4
@@ -237,7 +237,7 @@ def test_gaussians_are_painted_again_only_where_they_look_different():
 
 
 def test_a_camera_that_is_gone_from_the_next_moment_leaves_a_free_viewpoint():
-    session = Session(Finished(moment(wall(5), camera(0.0))), State(camera="gone.png"))
+    session = Session(FixedSource(moment(wall(5), camera(0.0))), ViewerState(camera="gone.png"))
     session.receive()
     assert session.camera() is None and session.paint(50, 40) is not None
     session.close()
@@ -246,9 +246,9 @@ def test_a_camera_that_is_gone_from_the_next_moment_leaves_a_free_viewpoint():
 def test_the_analyst_answers_for_the_moment_that_is_asked_for():
     analyst = Analyst()
     first, second = moments(2)
-    analyst.of(first)
+    analyst.request_analysis(first)
     deadline = time.monotonic() + 60
-    while (answer := analyst.of(second)) is None and time.monotonic() < deadline:
+    while (answer := analyst.request_analysis(second)) is None and time.monotonic() < deadline:
         time.sleep(0.005)
     assert answer is not None and answer.moment is second and answer.support.sizes.shape == (25, 3)
     analyst.close()

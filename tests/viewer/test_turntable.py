@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.ground import ground
-from splatnode.viewer.turntable import seen_arc, turntable_views
+from splatnode.viewer.turntable import compute_arc, turntable_views
 from splatnode.viewer.viewpoint import Viewpoint, overview
 from tests.viewer.test_scene import UP, camera, moment, wall
 
@@ -22,7 +22,7 @@ def angles(centre, view: Viewpoint) -> tuple[float, float]:
 
 def test_the_arc_is_where_the_cameras_were():
     cameras = camera(-0.5, -0.1), camera(0.0, frame_id=1), camera(0.5, 0.1, frame_id=2)
-    arc = seen_arc(cameras, np.array([0.0, 0.0, 1.0]), UP)
+    arc = compute_arc(cameras, np.array([0.0, 0.0, 1.0]), UP)
     assert arc.azimuths == pytest.approx((-np.arctan(0.5), np.arctan(0.5)))
     assert arc.elevations[0] < 0 < arc.elevations[1] and arc.distance == pytest.approx(np.sqrt(1.26))
 

@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.canvas import project
-from splatnode.viewer.viewpoint import Viewpoint, first_view, look_at, orbited, overview, panned, zoomed
+from splatnode.viewer.viewpoint import Viewpoint, first_view, look_at, orbit, overview, pan, zoom
 from tests.viewer.test_scene import K, camera, moment, wall
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -30,11 +30,11 @@ def test_looking_at_something_puts_it_in_the_middle_and_up_up():
 
 def test_an_orbit_keeps_the_pivot_and_its_distance():
     view = viewpoint(2.0)
-    right = orbited(view, np.radians(90), 0.0)
+    right = orbit(view, np.radians(90), 0.0)
     assert np.allclose(right.pivot, view.pivot) and np.allclose(right.T_world_camera[:3, 3], [2.0, 0.0, 2.0])
-    above = orbited(view, 0.0, np.radians(30))
+    above = orbit(view, 0.0, np.radians(30))
     assert np.allclose(above.T_world_camera[:3, 3], [0.0, -1.0, 2.0 - np.sqrt(3.0)])
-    highest = orbited(view, 0.0, np.radians(170))
+    highest = orbit(view, 0.0, np.radians(170))
     assert np.degrees(np.arcsin(-highest.T_world_camera[1, 3] / 2.0)) == pytest.approx(85.0)
 
 
@@ -42,14 +42,14 @@ def test_what_is_dragged_stays_under_the_pointer():
     view = viewpoint(1.0)
     focal = float(view.K(100, 80)[0, 0])
     before = project(view.pivot[None], view, 100, 80)[0]
-    after = project(view.pivot[None], panned(view, 10.0, -4.0, focal), 100, 80)[0]
+    after = project(view.pivot[None], pan(view, 10.0, -4.0, focal), 100, 80)[0]
     assert np.allclose(after[:2] - before[:2], [10.0, -4.0])
 
 
 def test_zooming_goes_to_the_pivot():
-    near = zoomed(viewpoint(2.0), 0.25)
+    near = zoom(viewpoint(2.0), 0.25)
     assert np.allclose(near.pivot, [0, 0, 2.0]) and np.allclose(near.T_world_camera[:3, 3], [0, 0, 1.5])
-    assert zoomed(near, 0.0).distance > 0
+    assert zoom(near, 0.0).distance > 0
 
 
 def test_the_lens_fits_into_every_window():

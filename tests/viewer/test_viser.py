@@ -17,9 +17,9 @@ import pytest
 
 from splatnode.viewer.paint import paint_gaussians
 from splatnode.viewer.shapes import frustum_depth
-from splatnode.viewer.state import State
-from splatnode.viewer.viewpoint import at_camera, overview
-from splatnode.viewer.viser_stage import Stage, _go, sent
+from splatnode.viewer.state import ViewerState
+from splatnode.viewer.viewpoint import move_to_camera, overview
+from splatnode.viewer.viser_stage import ViserStage, _go, make_splat_arguments
 from tests.support.chromium import NAMES, browser, chromium
 from tests.support.exported import make_gaussians, make_snapshot, write
 from tests.viewer.test_scene import camera, moment
@@ -49,11 +49,11 @@ def websocket_headers(port: int, origin: str) -> dict[str, str]:
 
 def test_small_gaussians_survive_the_16_bits_in_which_their_covariances_travel():
     gaussians = replace(make_gaussians(), scales=np.full((50, 3), 1e-4, np.float32))
-    given = sent(gaussians)
+    given = make_splat_arguments(gaussians)
     travelled = given["covariances"].astype(np.float16).astype(np.float64) * given["scale"] ** 2
     assert np.allclose(np.linalg.eigvalsh(travelled), 1e-8, rtol=0.01)
     assert np.allclose(given["centers"] * given["scale"], gaussians.means, rtol=1e-6)
-    large = sent(replace(gaussians, scales=np.full((50, 3), 400.0, np.float32)))
+    large = make_splat_arguments(replace(gaussians, scales=np.full((50, 3), 400.0, np.float32)))
     assert np.isfinite(large["covariances"].astype(np.float16)).all()
 
 
@@ -88,7 +88,7 @@ def test_where_it_cannot_listen_it_says_so_and_takes_no_other_port():
 def test_a_visitor_is_given_the_cameras_where_they_are_with_their_photographs():
     photographs = {"0.png": np.full((80, 100, 3), 200, np.uint8)}
     with viser.serving("127.0.0.1", 0) as server:
-        stage = Stage(server)
+        stage = ViserStage(server)
         stage.draw(place(images=photographs))
         nodes = stage._nodes
         for name, x in (("0.png", -0.1), ("1.png", 0.1)):
@@ -101,10 +101,10 @@ def test_a_visitor_is_given_the_cameras_where_they_are_with_their_photographs():
             assert (frustum.image is not None) == (name == "0.png")
         assert len(nodes["/gaussians"].buffer) == len(place().snapshot.gaussians)
         stage.photographs.value = False
-        stage.attend()
+        stage.apply_client_changes()
         assert nodes["/cameras/0.png"].image is None and nodes["/cameras/0.png"].visible
         stage.cameras.value = False
-        stage.attend()
+        stage.apply_client_changes()
         stage.draw(place(cameras=place().snapshot.cameras[:1], images=photographs))
         assert not stage._nodes["/cameras/0.png"].visible and "/cameras/1.png" not in stage._nodes
         stage.track(camera(0.0, frame_id=5))
@@ -116,7 +116,7 @@ def test_a_visitor_is_given_the_cameras_where_they_are_with_their_photographs():
 def test_a_frustum_is_as_deep_as_that_of_the_other_viewers():
     """viser's own rule (CameraFrustumVariants.tsx): the pyramid x, y, 1 over the cube root of a third of x y."""
     with viser.serving("127.0.0.1", 0) as server:
-        stage = Stage(server)
+        stage = ViserStage(server)
         stage.draw(place())
         frustum = stage._nodes["/cameras/0.png"]
         y = np.tan(frustum.fov / 2.0)
@@ -127,7 +127,7 @@ def test_a_frustum_is_as_deep_as_that_of_the_other_viewers():
 def test_a_browser_shows_what_the_projects_own_rasteriser_does():
     whole = place()
     with viser.serving("127.0.0.1", 0) as server, browser(900, 600) as page:
-        stage = Stage(server)
+        stage = ViserStage(server)
         page.open(f"http://127.0.0.1:{server.get_port()}/")
         deadline = time.monotonic() + PATIENCE_S
         while not server.get_clients() and time.monotonic() < deadline:
@@ -135,19 +135,19 @@ def test_a_browser_shows_what_the_projects_own_rasteriser_does():
         stage.draw(replace(whole, snapshot=replace(whole.snapshot, gaussians=make_gaussians())))
         stage.cameras.value = False
         stage.draw(whole)  # the visitor, who was there before, has been taken to the scene
-        stage.attend()
+        stage.apply_client_changes()
         texts = "[...document.querySelectorAll('textarea')].map(each => each.value)"
         assert page.wait(f"{texts}.some(each => each.includes('2 cameras, {len(whole.snapshot.gaussians)}'))")
         width, height = page.value("[document.querySelector('canvas').clientWidth, innerHeight]")
-        view = at_camera(overview(whole), whole.snapshot.cameras[0])
+        view = move_to_camera(overview(whole), whole.snapshot.cameras[0])
         (visitor,) = server.get_clients().values()
         _go(visitor, view)
         while visitor.camera.near == 0.01 and time.monotonic() < deadline:
-            stage.attend()
+            stage.apply_client_changes()
             time.sleep(0.1)
         assert np.isclose(visitor.camera.near, 2.0 * frustum_depth(whole))
         K = np.array([[height / 0.8, 0, width / 2], [0, height / 0.8, height / 2], [0, 0, 1]])  # of the camera's lens
-        ours = paint_gaussians(whole.snapshot.gaussians, view.T_world_camera, K, State(), width, height).image
+        ours = paint_gaussians(whole.snapshot.gaussians, view.T_world_camera, K, ViewerState(), width, height).image
         middle = np.s_[height // 4 : -height // 4, width // 4 : width // 2]
         difference = np.inf
         while difference > 8.0 and time.monotonic() < deadline:  # Gaussians are sorted some time after they came

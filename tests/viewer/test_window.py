@@ -27,7 +27,7 @@ from tests.viewer.test_cli import snapshot
 from tests.viewer.test_scene import wall
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
-from splatnode.viewer.state import BINDINGS, State
+from splatnode.viewer.state import BINDINGS, ViewerState
 from splatnode.viewer.window import show
 
 class Driver(Session):
@@ -45,7 +45,7 @@ class Driver(Session):
         return super().receive()
 
 try:
-    show(Driver(Feed(), State()), software=True, screenshots=Path(sys.argv[1]), size=(400, 300))
+    show(Driver(Feed(), ViewerState()), software=True, screenshots=Path(sys.argv[1]), size=(400, 300))
 except SystemExit as stopped:
     print("closed with", stopped.code, flush=True)
 """
@@ -85,7 +85,7 @@ from dataclasses import replace
 from pathlib import Path
 from splatnode.viewer.map_source import Maps, MapSource
 from splatnode.viewer.session import Session
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.window import show
 
 class Driver(Session):
@@ -100,7 +100,7 @@ class Driver(Session):
 
 source = MapSource(Maps(Path(sys.argv[1]), lambda cameras: {}))
 try:
-    show(Driver(source, State()), software=True, screenshots=Path(sys.argv[1]), size=(400, 300))
+    show(Driver(source, ViewerState()), software=True, screenshots=Path(sys.argv[1]), size=(400, 300))
 except SystemExit as stopped:
     print("closed with", stopped.code, flush=True)
 """

@@ -13,7 +13,7 @@ import msgspec
 from splatnode.capture.cameras.v4l2 import Config, find, stream
 from splatnode.capture.frame import Frame
 from splatnode.capture.reader import Config as ReaderConfig
-from splatnode.capture.reader import Reader, State
+from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.unavailable import CameraUnavailable
 from splatnode.capture.video4linux import layout, locks
 from splatnode.capture.video4linux.device import Device
@@ -97,10 +97,10 @@ def lost_and_back(config):
         ids.append(frame_id(reader.next(10)))
         unplug(config.device)
         deadline = time.monotonic() + 10
-        while reader.state is not State.DEGRADED and time.monotonic() < deadline:
+        while reader.state is not ReaderState.DEGRADED and time.monotonic() < deadline:
             reader.next(0.05)
         states.append([reader.state.value, reader.why])
-        while reader.state is not State.STREAMING and time.monotonic() < deadline + 20:
+        while reader.state is not ReaderState.STREAMING and time.monotonic() < deadline + 20:
             reader.next(0.05)
         ids.append(frame_id(reader.next(10)))
         states.append([reader.state.value, reader.why])

@@ -136,9 +136,9 @@ def test_a_link_that_is_cut_loses_and_doubles_nothing(tmp_path, link, end):
         for index in range(FRAMES // 2, FRAMES):
             server.offer(Frame(index, f"{index}.png", index, IMAGE, None))
         serve(server, lambda: connections() == connections(name) == [0, 0], 3 * DEAD_LINK_S)
-        assert server.queued > 0
+        assert server.num_queued > 0
         sh(*cut, "up")
-        serve(server, lambda: server.queued == 0, 30)
+        serve(server, lambda: server.num_queued == 0, 30)
         process.kill()
         assert [int(line) for line in process.communicate()[0].splitlines()] == list(range(FRAMES))
 
@@ -155,7 +155,7 @@ def test_a_frame_that_takes_longer_than_a_dead_link_arrives_at_once(tmp_path, li
     ):
         server.offer(Frame(0, "0.png", 0, IMAGE, None))
         began = time.monotonic()
-        serve(server, lambda: server.queued == 0, 20)
+        serve(server, lambda: server.num_queued == 0, 20)
         assert time.monotonic() - began > DEAD_LINK_S + 1
         process.kill()
         assert process.communicate()[0].split() == ["0"]
@@ -175,6 +175,6 @@ def test_a_slow_and_lossy_link_loses_and_doubles_nothing(tmp_path, link):
     ):
         for index in range(FRAMES):
             server.offer(Frame(index, f"{index}.png", index, IMAGE, None))
-        serve(server, lambda: server.queued == 0, 60)
+        serve(server, lambda: server.num_queued == 0, 60)
         process.kill()
         assert [int(line) for line in process.communicate()[0].splitlines()] == list(range(FRAMES))

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.viewer.session import Session
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 
 LINE = 46  # characters that fit into the panel's width
-Change = Callable[[State], None]
+Change = Callable[[ViewerState], None]
 
 
 class Words:
@@ -25,7 +25,7 @@ class Words:
         parent.add_child(self.label)
 
     def say(self, lines: Sequence[str]) -> None:
-        text = "\n".join(textwrap.fill(printable(line), LINE) for line in lines)
+        text = "\n".join(textwrap.fill(sanitize_text(line), LINE) for line in lines)
         if self.label.text != text:
             self.label.text = text
             self._window.set_needs_layout()
@@ -49,7 +49,9 @@ class Controls:
         parent.add_child(box)
         return box
 
-    def choice(self, parent: gui.Widget, items: list[str], changed: Callable[[State, int, str], State]) -> gui.Combobox:
+    def choice(
+        self, parent: gui.Widget, items: list[str], changed: Callable[[ViewerState, int, str], ViewerState]
+    ) -> gui.Combobox:
         """A drop-down list; `changed` gets the state, the index and the text of what was chosen."""
         box = gui.Combobox()
         for item in items:
@@ -58,18 +60,20 @@ class Controls:
         parent.add_child(box)
         return box
 
-    def slider(self, parent: gui.Widget, kind, changed: Callable[[State, Session, float], State]) -> gui.Slider:
+    def slider(
+        self, parent: gui.Widget, kind, changed: Callable[[ViewerState, Session, float], ViewerState]
+    ) -> gui.Slider:
         slider = gui.Slider(kind)
 
-        def moved(value) -> None:
+        def handle_change(value) -> None:
             if self._session is not None:
                 self._change(changed(self._session.state, self._session, value))
 
-        slider.set_on_value_changed(moved)
+        slider.set_on_value_changed(handle_change)
         parent.add_child(slider)
         return slider
 
-    def _apply(self, changed: Callable[[State], State]) -> None:
+    def _apply(self, changed: Callable[[ViewerState], ViewerState]) -> None:
         if self._session is not None:
             self._change(changed(self._session.state))
 
@@ -83,6 +87,6 @@ def button(parent: gui.Widget, text: str, pressed: Callable[[], None]) -> gui.Bu
 
 
 def column(window: gui.Window) -> gui.ScrollableVert:
-    """What a tab holds."""
+    """Creates the column of controls of a tab."""
     em = window.theme.font_size
     return gui.ScrollableVert(round(0.3 * em), gui.Margins(round(0.5 * em)))

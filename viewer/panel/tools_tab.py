@@ -8,10 +8,10 @@ from dataclasses import replace
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
 from splatnode.viewer.editing import edit_lines
-from splatnode.viewer.measuring import measured_lines
+from splatnode.viewer.measuring import measurement_lines
 from splatnode.viewer.panel.controls import Change, Controls, Words, button, column
 from splatnode.viewer.session import Session
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 
 _AXES = ("x", "y", "z")
 
@@ -42,7 +42,7 @@ class ToolsTab:
         self.root.add_child(last)
 
     def _side(self, controls: Controls, parent: gui.Widget, axis: int, end: int) -> gui.Slider:
-        slider = controls.slider(parent, gui.Slider.DOUBLE, lambda s, _, value: _with_side(s, axis, end, value))
+        slider = controls.slider(parent, gui.Slider.DOUBLE, lambda s, _, value: _set_box_side(s, axis, end, value))
         slider.set_limits(0.0, 1.0)
         return slider
 
@@ -56,12 +56,12 @@ class ToolsTab:
                 slider.double_value = value
         self._undo.enabled = self._save.enabled = bool(state.edits)
         if moment is not None:
-            self._measured.say(measured_lines(state.measured, state.measuring, moment.snapshot.scale))
+            self._measured.say(measurement_lines(state.measured, state.measuring, moment.snapshot.scale))
             self._left.say(edit_lines(moment, state.edits))
 
 
-def _with_side(state: State, axis: int, end: int, value: float) -> State:
-    """With one end of one side of the box moved; the box is shown, so that the person sees what moves."""
+def _set_box_side(state: ViewerState, axis: int, end: int, value: float) -> ViewerState:
+    """Sets one end of one side of the box and shows the box, so that the person sees what moves."""
     sides = [list(span) for span in state.box]
     sides[axis][end] = value
     x, y, z = ((low, high) for low, high in sides)

@@ -9,8 +9,8 @@ import secrets
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.capture.process.durable import write_whole
-from splatnode.capture.process.private import NotPrivate, read_own
+from splatnode.capture.process.durable import write_atomically
+from splatnode.capture.process.private import NotOwnerOnly, read_own
 
 LOOPBACK = "127.0.0.1"
 _KEY = re.compile(r"[A-Za-z0-9_-]{32,128}")
@@ -37,11 +37,11 @@ class Access:
         return f"splatnode_{self.port}"
 
     def url(self, machine: str | None = None, key: str | None = None) -> str:
-        """What to open in a browser: by its address or the `machine`'s name, with the key, or what stands for it."""
+        """Returns the URL for a browser: with the address or the `machine`'s name, and the key or its substitute."""
         host = machine or (f"[{self.address}]" if ":" in self.address else self.address)
         return f"http://{host}:{self.port}/" + (f"?key={key or self.key}" if self.key else "")
 
-    def host_is_fine(self, host: str | None) -> bool:
+    def is_allowed_host(self, host: str | None) -> bool:
         """Whether a request was meant for this server.
 
         Without a key only a name of the loopback address is, with any port, which ssh may have changed: a foreign page
@@ -53,7 +53,7 @@ class Access:
         """Compared in a time that tells nothing of where they differ."""
         return self.key is not None and hmac.compare_digest((text or "").encode(errors="replace"), self.key.encode())
 
-    def lets_in(self, authorization: str | None, cookies: str | None) -> bool:
+    def is_authorized(self, authorization: str | None, cookies: str | None) -> bool:
         """Whether a request has the key, in its cookie or as `Authorization: Bearer KEY`; any, where none is needed.
 
         The arguments are the headers of those names.
@@ -67,35 +67,35 @@ def new_key() -> str:
     return secrets.token_urlsafe(_KEY_BYTES)
 
 
-def kept_key(path: Path) -> str:
+def load_or_create_key(path: Path) -> str:
     """The key in the file; a new one, which the file gets, where there is none, or where it was cut to nothing.
 
     Raises NotPrivate where others may read the file, ValueError for one that holds something else, OSError.
     """
-    text = _text(path)
+    text = _read_key_file(path)
     if not text:
-        write_whole(path, [f"{new_key()}\n".encode()])
-        text = _text(path)
+        write_atomically(path, [f"{new_key()}\n".encode()])
+        text = _read_key_file(path)
     key = text.decode(errors="replace").strip()
     if not _KEY.fullmatch(key):
         raise ValueError(f"{path} must hold 32 to 128 letters, digits, - or _; remove it to get a new key")
     return key
 
 
-def _text(path: Path) -> bytes:
-    """What this user's file holds; nothing where it is not there."""
+def _read_key_file(path: Path) -> bytes:
+    """Returns the content of this user's file; nothing where it is not there."""
     try:
         text = read_own(path, _LARGEST, only_ours=True)
         mode = path.lstat().st_mode
     except FileNotFoundError:
         return b""
     if mode & _OTHERS:
-        raise NotPrivate(f"others may read {path}. Run: chmod 600 {path}")
+        raise NotOwnerOnly(f"others may read {path}. Run: chmod 600 {path}")
     return text
 
 
 def _cookie(header: str | None, name: str) -> str | None:
-    """By itself: browsers send the cookies of all programs on a machine, some of which no standard allows."""
+    """Finds one cookie: browsers send those of all programs on a machine, some of which no standard allows."""
     parts = (part.partition("=") for part in (header or "").split(";"))
     return next((value.strip() for found, _, value in parts if found.strip() == name), None)
 

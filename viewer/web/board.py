@@ -11,7 +11,7 @@ from splatnode.viewer.web.content import Content
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class BoardState:
     """One state of what is shown; `number` counts them. Versions tell what of it is new."""
 
     number: int
@@ -27,14 +27,14 @@ class Board:
 
     def __init__(self) -> None:
         self.run = secrets.token_hex(8)  # of this server: after another start, numbers begin anew
-        self._shown = Shown(0, {})
+        self._shown = BoardState(0, {})
         self._changed = threading.Condition()
 
     @property
-    def shown(self) -> Shown:
+    def current(self) -> BoardState:
         return self._shown
 
-    def put(self, said: dict[str, Any], content: Content | None, *, live: bool) -> None:
+    def publish(self, said: dict[str, Any], content: Content | None, *, live: bool) -> None:
         """Shows this from now on, if it is not what is shown already."""
         before = self._shown
         if said == before.said and content is before.content:
@@ -45,11 +45,11 @@ class Board:
             gaussians += content.moment.snapshot.gaussians is not known
             shapes += 1
         with self._changed:
-            self._shown = Shown(before.number + 1, said, live, content, gaussians, shapes)
+            self._shown = BoardState(before.number + 1, said, live, content, gaussians, shapes)
             self._changed.notify_all()
 
-    def wait(self, run: str, number: int, timeout_s: float) -> Shown:
-        """What is shown, as soon as it is another than `number` of `run`, or after `timeout_s`."""
+    def wait(self, run: str, number: int, timeout_s: float) -> BoardState:
+        """Returns the current state once it differs from `number` of `run`, or after `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: (run, number) != (self.run, self._shown.number), timeout_s)
             return self._shown

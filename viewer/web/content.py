@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.recon.result.export.formats.splat import encode_splat
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
@@ -18,12 +18,12 @@ from splatnode.viewer.colours import source_colour
 from splatnode.viewer.ground import ground, ground_lines
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.shapes import Lines, frustum_depth, image_corners, shapes
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import Viewpoint, overview, scene_pivot
 
 THUMBNAIL_SIDE = 256  # pixels, at least where the photograph has as many
 _QUALITY = 85  # of JPEG
-_NOTHING = State(
+_NOTHING = ViewerState(
     cameras=False, photographs=False, path=False, tracked=False, advice=False, uncertainty=False, graph=False
 )
 # Groups of lines that the page shows or hides; the names are fields of State. "ground" is one more.
@@ -48,7 +48,9 @@ class Content:
 
         The text has the cameras, the viewpoints to start from, and where in the numbers each group of lines is.
         """
-        named = [(name, _group(self, name)) for name in _GROUPS] + [("ground", ground_lines(ground(self.moment)))]
+        named = [(name, _lines_of_group(self, name)) for name in _GROUPS] + [
+            ("ground", ground_lines(ground(self.moment)))
+        ]
         parts, told, at = [], [], 0
         for name, group in named:
             for lines in group:
@@ -56,11 +58,11 @@ class Content:
                 parts.append(ends.tobytes())
                 told.append({"group": name, "at": at, "count": len(ends), "colour": lines.colour, "width": lines.width})
                 at += ends.size
-        text = json.dumps(_told(self) | {"lines": told}, allow_nan=False).encode()
+        text = json.dumps(_describe_scene(self) | {"lines": told}, allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         return b"".join([len(text).to_bytes(4, "little"), text, *parts])
 
-    def photograph(self, index: int, *, small: bool) -> bytes | None:
+    def encode_image(self, index: int, *, small: bool) -> bytes | None:
         """The JPEG of the camera at `index`, at its size or as a thumbnail; None where there is none."""
         cameras = self.moment.snapshot.cameras
         image = self.moment.snapshot.images.get(cameras[index].name) if 0 <= index < len(cameras) else None
@@ -75,19 +77,19 @@ class Content:
         return data.tobytes() if done else None
 
 
-def _group(content: Content, name: str) -> tuple[Lines, ...]:
+def _lines_of_group(content: Content, name: str) -> tuple[Lines, ...]:
     """The lines of one group; those of the cameras are one for each, in their order."""
     state = replace(_NOTHING, **{name: True})
     return shapes(content.moment, state, content.advice).lines
 
 
-def tracked_ends(moment: Moment, tracked: CameraEstimate | None) -> list[float]:
+def live_camera_ends(moment: Moment, tracked: CameraEstimate | None) -> list[float]:
     """The ends of the live camera's lines, six numbers each; none where it is not known."""
     lines = shapes(moment, replace(_NOTHING, tracked=True), None, tracked).lines
     return [round(number, 6) for each in lines for number in each.ends.ravel().tolist()]
 
 
-def _told(content: Content) -> dict[str, Any]:
+def _describe_scene(content: Content) -> dict[str, Any]:
     moment = content.moment
     snapshot = moment.snapshot
     start = overview(moment, (content.advice.arrow if content.advice else None) or ())
@@ -101,7 +103,7 @@ def _told(content: Content) -> dict[str, Any]:
         "frustum_depth": depth,
         "cameras": [
             {
-                "name": printable(camera.name),
+                "name": sanitize_text(camera.name),
                 "colour": source_colour(index),
                 "T_world_camera": camera.T_world_camera.ravel().tolist(),
                 "K": camera.K.ravel().tolist(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from splatnode.capture.process.printable import printable
+from splatnode.capture.process.printable import sanitize_text
 from splatnode.recon.result.verdict import Code
 from splatnode.viewer import words
 from splatnode.viewer.session import Session
@@ -14,7 +14,7 @@ _MOST_VIEWS = 100  # whose share of confirmed depth is listed
 _LONGEST = 2000  # characters of a line
 
 
-def said(session: Session) -> dict[str, Any]:
+def describe_session(session: Session) -> dict[str, Any]:
     """Headings and their lines, every one printable; `good`: whether the verdict is."""
     moment, age = session.moment, session.source.age_s
     if moment is None:
@@ -26,7 +26,7 @@ def said(session: Session) -> dict[str, Any]:
         ("Depth that other views confirm", words.view_depth_lines(moment, _MOST_VIEWS)),
         ("Places", words.place_lines(moment)),
         ("What there is", words.count_lines(moment)),
-        (f"Photographs left out: {len(snapshot.dropped)}", words.dropped_lines(moment, _MOST_DROPPED)),
+        (f"Photographs left out: {len(snapshot.dropped)}", words.rejection_lines(moment, _MOST_DROPPED)),
     ]
     kind = "final" if snapshot.final else "provisional: the scene is still being made"
     return {
@@ -38,4 +38,4 @@ def said(session: Session) -> dict[str, Any]:
 
 
 def _line(text: str) -> str:
-    return printable(text, _LONGEST)
+    return sanitize_text(text, _LONGEST)

@@ -27,7 +27,7 @@ from urllib.parse import parse_qs
 
 from splatnode.capture.process.crowd import network_of, next_to_go
 from splatnode.viewer.web.access import Access
-from splatnode.viewer.web.board import Board, Shown
+from splatnode.viewer.web.board import Board, BoardState
 
 log = logging.getLogger(__name__)
 
@@ -170,13 +170,13 @@ class _Request(BaseHTTPRequestHandler):
             asked = {name: values[0] for name, values in parse_qs(query, max_num_fields=4).items()}
         except ValueError:
             return self._refuse(HTTPStatus.BAD_REQUEST, "this question is not understood")
-        if not access.host_is_fine(self.headers.get("Host")):
+        if not access.is_allowed_host(self.headers.get("Host")):
             return self._refuse(
                 HTTPStatus.FORBIDDEN, "without a key the address must be 127.0.0.1 or localhost (over ssh -L)"
             )
         if path == "/" and access.is_key(asked.get("key")):
             return self._remember_key()
-        if not access.lets_in(self.headers.get("Authorization"), self.headers.get("Cookie")):
+        if not access.is_authorized(self.headers.get("Authorization"), self.headers.get("Cookie")):
             return self._refuse(
                 HTTPStatus.UNAUTHORIZED,
                 "the key is missing or wrong: open the address that splatnode view --web prints",
@@ -191,8 +191,8 @@ class _Request(BaseHTTPRequestHandler):
         if path == "/told":
             (number,) = _numbers([asked.get("number", "")]) or (-1,)
             shown = board.wait(asked.get("run", ""), number, _WAIT_S)
-            return self._send("application/json", _told(board, shown))
-        kind, data = self.server.pages.get(path) or _part(board.shown, path) or ("", None)
+            return self._send("application/json", _encode_state(board, shown))
+        kind, data = self.server.pages.get(path) or _find_part(board.current, path) or ("", None)
         if data is None:
             return self._refuse(HTTPStatus.NOT_FOUND, "there is no such thing, or no longer")
         self._send(kind, data)
@@ -226,7 +226,7 @@ class _Request(BaseHTTPRequestHandler):
         """Requests are not logged: the page asks all the time, and an address may hold a key."""
 
 
-def _told(board: Board, shown: Shown) -> bytes:
+def _encode_state(board: Board, shown: BoardState) -> bytes:
     content = shown.content
     return json.dumps(
         {
@@ -240,7 +240,7 @@ def _told(board: Board, shown: Shown) -> bytes:
     ).encode()
 
 
-def _part(shown: Shown, path: str) -> tuple[str, bytes | None] | None:
+def _find_part(shown: BoardState, path: str) -> tuple[str, bytes | None] | None:
     """Gaussians, shapes or a photograph of what is shown; None for anything else, and for an earlier version."""
     content, (kind, *numbers) = shown.content, path.removeprefix("/").split("/")
     versions = _numbers(numbers)
@@ -251,7 +251,7 @@ def _part(shown: Shown, path: str) -> tuple[str, bytes | None] | None:
     if kind == "shapes" and versions == [shown.shapes]:
         return "application/octet-stream", content.shapes
     if kind in ("thumbnail", "photograph") and len(versions) == 2 and versions[0] == shown.shapes:
-        return "image/jpeg", content.photograph(versions[1], small=kind == "thumbnail")
+        return "image/jpeg", content.encode_image(versions[1], small=kind == "thumbnail")
     return None
 
 
@@ -262,7 +262,7 @@ def _numbers(texts: list[str]) -> list[int]:
 
 
 def _pages() -> dict[str, tuple[str, bytes]]:
-    """By the path that is asked for: what never changes."""
+    """Returns the static files by their request path."""
     files = resources.files("splatnode.viewer.web").joinpath("page").iterdir()
     found = {f"/{file.name}": (_TYPES[file.name.rpartition(".")[2]], file.read_bytes()) for file in files}
     return found | {"/": found["/index.html"]}

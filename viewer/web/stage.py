@@ -12,11 +12,11 @@ from typing import Any, NoReturn
 
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import Source
-from splatnode.viewer.state import State
-from splatnode.viewer.web.access import LOOPBACK, Access, kept_key, new_key
+from splatnode.viewer.state import ViewerState
+from splatnode.viewer.web.access import LOOPBACK, Access, load_or_create_key, new_key
 from splatnode.viewer.web.board import Board
-from splatnode.viewer.web.content import Content, tracked_ends
-from splatnode.viewer.web.said import said
+from splatnode.viewer.web.content import Content, live_camera_ends
+from splatnode.viewer.web.said import describe_session
 from splatnode.viewer.web.server import Server
 
 PORT = 8347
@@ -25,8 +25,8 @@ _EVERYWHERE = ("0.0.0.0", "::")
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where the server listens."""
+class ListenAddress:
+    """The address and the key of the server."""
 
     address: str = LOOPBACK  # numeric
     port: int = PORT  # 0: any that is free
@@ -34,29 +34,29 @@ class Place:
     key_file: Path | None = None  # that has the key
 
 
-def place(listen: str | None, port: int, key_file: Path | None) -> Place:
+def resolve_address(listen: str | None, port: int, key_file: Path | None) -> ListenAddress:
     """On the loopback address, or with a key at the address to `listen` on. Raises what `kept_key` raises."""
-    key = kept_key(key_file) if key_file is not None else new_key() if listen is not None else None
-    return Place(listen or LOOPBACK, port, key, key_file)
+    key = load_or_create_key(key_file) if key_file is not None else new_key() if listen is not None else None
+    return ListenAddress(listen or LOOPBACK, port, key, key_file)
 
 
-def show(source: Source, where: Place, opened: Callable[[], None], say: Callable[[str], None]) -> NoReturn:
+def show(source: Source, where: ListenAddress, opened: Callable[[], None], say: Callable[[str], None]) -> NoReturn:
     """Serves until the process is told to end. Raises OSError where it cannot listen, and what the source raises."""
-    with serving(source, where) as (server, session):
+    with open_server(source, where) as (server, session):
         say(invitation(server.access, where.key_file))
         opened()
         content = None
         while True:
             session.receive()
-            content = newest(session, content)
-            server.board.put(_told(session), content, live=source.age_s is not None)
+            content = make_content(session, content)
+            server.board.publish(_describe_page(session), content, live=source.age_s is not None)
             time.sleep(_TICK_S)
 
 
 @contextlib.contextmanager
-def serving(source: Source, where: Place) -> Iterator[tuple[Server, Session]]:
+def open_server(source: Source, where: ListenAddress) -> Iterator[tuple[Server, Session]]:
     """A server that answers, and the session of the source; both are closed at the end."""
-    session = Session(source, State(), memory_bytes=0)
+    session = Session(source, ViewerState(), memory_bytes=0)
     try:
         server = Server(Board(), where.address, where.port, where.key)
         try:
@@ -69,8 +69,8 @@ def serving(source: Source, where: Place) -> Iterator[tuple[Server, Session]]:
         session.close()
 
 
-def newest(session: Session, before: Content | None) -> Content | None:
-    """What is to be drawn now: `before`, where nothing of it has changed."""
+def make_content(session: Session, before: Content | None) -> Content | None:
+    """Returns the content to draw now: `before`, where nothing of it has changed."""
     moment, analysis = session.moment, session.analysis()
     if moment is None:
         return None
@@ -79,9 +79,9 @@ def newest(session: Session, before: Content | None) -> Content | None:
     return before if same else Content(moment, advice)
 
 
-def _told(session: Session) -> dict[str, Any]:
+def _describe_page(session: Session) -> dict[str, Any]:
     moment = session.moment
-    return said(session) | {"tracked": tracked_ends(moment, session.tracked) if moment else []}
+    return describe_session(session) | {"tracked": live_camera_ends(moment, session.live_camera) if moment else []}
 
 
 def invitation(access: Access, key_file: Path | None) -> str:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from splatnode.capture.diorama import papers
 from splatnode.capture.diorama.builder import PALETTES, Builder
 from splatnode.capture.diorama.building import pieces
-from splatnode.capture.diorama.building.lighting import lit_together
+from splatnode.capture.diorama.building.lighting import bake_zone_light
 from splatnode.capture.diorama.building.plan import CORRIDOR, ZONES
 from splatnode.capture.diorama.building.rooms import (
     CHAIR_ROOM,
@@ -43,7 +43,7 @@ class Interior:
 
 @lru_cache(maxsize=16)
 def interior(seed: int, density: float, number: int) -> Interior:
-    """Of the zone `number`, with `density` texels a metre."""
+    """Builds the interior of the zone `number`, with `density` texels a metre."""
     zone = ZONES[number]
     paper_seed = 100 * seed + (LOOK_ALIKES[0] if number in LOOK_ALIKES else number)
     shell = Builder(paper_seed, density)  # look-alikes have the same paper, leaf by leaf
@@ -60,9 +60,9 @@ def interior(seed: int, density: float, number: int) -> Interior:
     cover_above(above, zone, papers.tiles([(186, 182, 172), (198, 194, 184)], 0.6))
     rng = np.random.default_rng([seed, 30, number])
     light = Light((0.5, 0.35, 1.5), texels_per_metre=min(6.0, density / 16), sun_samples=3, sky_samples=12)
-    chairs = tuple(lit_together(chair, [*solids, *chair], light, rng) for chair in _chairs(seed, density, number))
+    chairs = tuple(bake_zone_light(chair, [*solids, *chair], light, rng) for chair in _chairs(seed, density, number))
     index = None if mirror is None else len(shell.solids) + mirror
-    return Interior((*lit_together(solids, solids, light, rng), *above.solids), index, chairs)
+    return Interior((*bake_zone_light(solids, solids, light, rng), *above.solids), index, chairs)
 
 
 def _chairs(seed: int, density: float, number: int) -> list[list[Solid]]:

@@ -49,12 +49,12 @@ def line(seed: int, legs: int) -> Line:
     for room in rooms_of(seed, legs):
         times[room] = times.get(room, 0) + 1
         counterclockwise = times[room] % 3 != 2 or room == FIRST_ROOMS[0]
-        way = _resampled(_blank_end() if room == BLANK_END else _tour(room, counterclockwise, first=not parts))
+        way = _resample(_blank_end() if room == BLANK_END else _tour(room, counterclockwise, first=not parts))
         if parts:
-            between = _resampled(np.stack([parts[-1][0][-1], way[0]]))
+            between = _resample(np.stack([parts[-1][0][-1], way[0]]))
             parts.append((between, np.zeros(len(between))))
             total += len(between)
-        turn = np.zeros(len(way)) if room == BLANK_END else _turned(room, way, counterclockwise)
+        turn = np.zeros(len(way)) if room == BLANK_END else _compute_gaze_degrees(room, way, counterclockwise)
         parts.append((way, turn))
         if room != BLANK_END:
             visits.append((room, total, total + len(way) - 1))
@@ -77,7 +77,7 @@ def _tour(room: int, counterclockwise: bool, first: bool) -> Array:
     return np.concatenate([*([] if first else [corridor[None], inside[None]]), around, inside[None], corridor[None]])
 
 
-def _turned(room: int, way: Array, counterclockwise: bool) -> Array:
+def _compute_gaze_degrees(room: int, way: Array, counterclockwise: bool) -> Array:
     """(P,) degrees: to the middle of the room while the way goes around it."""
     deep = np.abs(way[:, 1]) > abs(DOORS[room].outer) + 0.7
     return np.where(deep, INWARDS if counterclockwise else -INWARDS, 0.0)
@@ -91,7 +91,7 @@ def _blank_end() -> Array:
     return np.concatenate([[[x - 1.5, -0.42]], turn, [[x - 1.5, 0.42]]])
 
 
-def _resampled(corners: Array) -> Array:
+def _resample(corners: Array) -> Array:
     """Points `STEP` apart on the line through `corners`, from the first one on."""
     lengths = np.concatenate([[0.0], np.linalg.norm(np.diff(corners, axis=0), axis=1).cumsum()])
     along = np.arange(0.0, max(lengths[-1], STEP), STEP)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.building.view import State, depth
+from splatnode.capture.diorama.building.view import BuildingState, depth
 from splatnode.capture.diorama.cast import Camera, Matrix
 
 COLUMNS = 40  # of the grid of rays on which it is measured
@@ -16,28 +16,28 @@ GRAZING = 0.06  # metres added to it, for surfaces seen at a slant
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What a camera sees, coarsely: `z` (h, w) at pixel centres of the small image with `K`."""
+class CoarseView:
+    """A coarse view of a camera: `z` (h, w) at pixel centres of the small image with `K`."""
 
     T_world_camera: Matrix
     K: Matrix
     z: npt.NDArray[np.float32]
 
 
-def seen(state: State, camera: Camera, width: int, height: int) -> Seen:
-    """Of a camera with images of `width` x `height` pixels."""
+def render_coarse_view(state: BuildingState, camera: Camera, width: int, height: int) -> CoarseView:
+    """Renders the coarse view of a camera with images of `width` x `height` pixels."""
     T_world_camera, K = camera
     small = COLUMNS, max(1, round(COLUMNS * height / width))
     scaled = np.diag([small[0] / width, small[1] / height, 1.0]) @ K
-    return Seen(T_world_camera, scaled, depth(state, (T_world_camera, scaled), *small))
+    return CoarseView(T_world_camera, scaled, depth(state, (T_world_camera, scaled), *small))
 
 
-def shared(first: Seen, second: Seen) -> float:
+def compute_overlap(first: CoarseView, second: CoarseView) -> float:
     """0 to 1: the share of what one sees that the other sees, too; of both ways the lesser."""
     return min(_share(first, second), _share(second, first))
 
 
-def _share(first: Seen, second: Seen) -> float:
+def _share(first: CoarseView, second: CoarseView) -> float:
     rows, columns = first.z.shape
     u, v = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
     known = np.isfinite(first.z)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from splatnode.capture.diorama import papers, prints
 from splatnode.capture.diorama import textures as paint
-from splatnode.capture.diorama.builder import CREAM, INK, PALETTES, PAPER, Builder, Palette, scaled
+from splatnode.capture.diorama.builder import CREAM, INK, PALETTES, PAPER, Builder, Palette, scale_colour
 from splatnode.capture.diorama.building import pieces
 from splatnode.capture.diorama.building.plan import HEIGHT, Zone
 from splatnode.capture.diorama.building.shell import Cover, openings, stretches
@@ -30,7 +30,7 @@ class Style:
 
 
 def _lying_bed(builder: Builder, palette: Palette, spot: Spot) -> None:
-    pieces.bed(builder, palette, spot.beside(-0.95, 0.68, -90.0))
+    pieces.single_bed(builder, palette, spot.offset_spot(-0.95, 0.68, -90.0))
 
 
 def _arm_chair(builder: Builder, palette: Palette, spot: Spot) -> None:
@@ -46,12 +46,12 @@ def _stack(builder: Builder, palette: Palette, spot: Spot) -> None:
 
 
 def _seat(builder: Builder, palette: Palette, spot: Spot) -> None:
-    _arm_chair(builder, palette, spot.beside(-0.2, -0.5))
-    pieces.lamp(builder, palette, spot.beside(0.55, -0.2))
+    _arm_chair(builder, palette, spot.offset_spot(-0.2, -0.5))
+    pieces.lamp(builder, palette, spot.offset_spot(0.55, -0.2))
 
 
 def style(number: int) -> Style:
-    """Of a room; the seed does not change it."""
+    """Returns the style of a room; the seed does not change it."""
     first, second, third, fourth = PALETTES
     case, side, sofa, desk, rack = pieces.bookcase, pieces.sideboard, pieces.sofa, pieces.desk, pieces.rack
     if number in LOOK_ALIKES:
@@ -76,7 +76,7 @@ def corridor_cover() -> Cover:
 
 
 def _stone(palette: Palette) -> paint.Painter:
-    return papers.tiles([scaled(palette.floor, factor) for factor in (0.9, 1.05, 1.2)] + [(196, 190, 180)])
+    return papers.tiles([scale_colour(palette.floor, factor) for factor in (0.9, 1.05, 1.2)] + [(196, 190, 180)])
 
 
 def furnish(builder: Builder, zone: Zone, room: Style) -> int | None:
@@ -85,7 +85,7 @@ def furnish(builder: Builder, zone: Zone, room: Style) -> int | None:
     slots = _slots(zone)
     dealt = [room.pieces[i] for i in rng.permutation(len(room.pieces))]
     for number, (piece, (side, x)) in enumerate(zip(dealt, slots, strict=True)):
-        spot = walls(zone)[side][0].beside(x + rng.uniform(-0.08, 0.08))
+        spot = walls(zone)[side][0].offset_spot(x + rng.uniform(-0.08, 0.08))
         if zone.number == MIRROR_ROOM and number == 0:
             mirror = _mirror(builder, spot)
             continue
@@ -94,11 +94,11 @@ def furnish(builder: Builder, zone: Zone, room: Style) -> int | None:
             width, height = rng.uniform((0.55, 0.5), (0.8, 0.66))
             pieces.picture(builder, palette, spot, 1.72, width, height)
     for side, x in _gaps(zone):
-        spot = walls(zone)[side][0].beside(x)
+        spot = walls(zone)[side][0].offset_spot(x)
         pieces.picture(builder, palette, spot, rng.uniform(1.4, 1.6), rng.uniform(0.4, 0.5), rng.uniform(0.6, 0.8))
     spot = Spot(*zone.centre, rng.uniform(-25, 25))
     weave = paint.rug([CREAM, *(palette.accents[i] for i in rng.permutation(4))])
-    builder.box(spot.at(0, 0, 0.006), (2.3, 1.8, 0.012), weave, spot.yaw_deg)
+    builder.box(spot.transform_point(0, 0, 0.006), (2.3, 1.8, 0.012), weave, spot.yaw_deg)
     room.centre(builder, palette, spot)
     corners = [(zone.x0 + 0.35, zone.y1 - 0.35), (zone.x1 - 0.35, zone.y1 - 0.35)]
     corners = corners if zone.y0 > 0 else [(x, zone.y0 + 0.35) for x, _ in corners]
@@ -126,8 +126,8 @@ def _mirror(builder: Builder, spot: Spot) -> int:
     """Hangs the mirror, whose face is that along the spot's y; its index among the solids."""
     width, height = MIRROR_SIZE
     frame = paint.wood((190, 150, 70))
-    builder.box(spot.at(0, 0.012, 1.2), (width + 0.1, 0.024, height + 0.1), frame, spot.yaw_deg)
-    builder.box(spot.at(0, 0.018, 1.2), (width, 0.03, height), paint.plain((200, 204, 206)), spot.yaw_deg)
+    builder.box(spot.transform_point(0, 0.012, 1.2), (width + 0.1, 0.024, height + 0.1), frame, spot.yaw_deg)
+    builder.box(spot.transform_point(0, 0.018, 1.2), (width, 0.03, height), paint.plain((200, 204, 206)), spot.yaw_deg)
     return len(builder.solids) - 1
 
 
@@ -143,7 +143,7 @@ def furnish_corridor(builder: Builder, zone: Zone) -> None:
     pieces.picture(builder, palette, west, 1.6, 1.1, 0.8)
     east, length = walls(zone)["east"]
     blank = paint.plain((216, 212, 204), 0.004)
-    builder.box(east.at(0, 0.03, HEIGHT / 2), (length, 0.06, HEIGHT), blank, east.yaw_deg)
+    builder.box(east.transform_point(0, 0.03, HEIGHT / 2), (length, 0.06, HEIGHT), blank, east.yaw_deg)
 
 
 def _line(builder: Builder, palette: Palette, spot: Spot, ends: tuple[float, float]) -> None:
@@ -151,11 +151,11 @@ def _line(builder: Builder, palette: Palette, spot: Spot, ends: tuple[float, flo
     rng, x = builder.rng, ends[0] + 0.25
     furniture: Sequence[Piece] = (pieces.sideboard, pieces.lamp, _narrow_stack)
     while x < ends[1]:
-        place = spot.beside(x)
+        place = spot.offset_spot(x)
         pieces.picture(builder, palette, place, rng.uniform(1.5, 1.66), rng.uniform(0.45, 0.7), rng.uniform(0.5, 0.85))
         if rng.random() < 0.4 and ends[0] + 0.6 < x < ends[1] - 0.5:
             chosen = furniture[int(rng.integers(len(furniture)))]
-            chosen(builder, palette, place if chosen is pieces.sideboard else place.beside(0.42, 0.24))
+            chosen(builder, palette, place if chosen is pieces.sideboard else place.offset_spot(0.42, 0.24))
         x += rng.uniform(0.85, 1.15)
 
 
@@ -164,4 +164,6 @@ def _narrow_stack(builder: Builder, palette: Palette, spot: Spot) -> None:
     for z, size in ((0.18, 0.36), (0.5, 0.28)):
         colour = palette.accents[int(rng.integers(4))] if z > 0.3 else (196, 154, 106)
         turned = spot.yaw_deg + rng.uniform(-20, 20)
-        builder.box(spot.at(0, 0, z), (size, size, size), prints.carton(colour, PAPER if z > 0.3 else INK), turned)
+        builder.box(
+            spot.transform_point(0, 0, z), (size, size, size), prints.carton(colour, PAPER if z > 0.3 else INK), turned
+        )

@@ -16,7 +16,7 @@ CASING = 0.09  # metres, the width of the wood around a door
 
 @dataclass(frozen=True)
 class Cover:
-    """What walls and floor are covered with; `dado` is the lower metre of the walls, None for none."""
+    """The covering of walls and floor; `dado` is the lower metre of the walls, None for none."""
 
     wall: paint.Painter
     floor: paint.Painter
@@ -35,7 +35,7 @@ def enclose(builder: Builder, zone: Zone, cover: Cover) -> None:
 
 def cover_above(builder: Builder, zone: Zone, painter: paint.Painter) -> None:
     """The ceiling."""
-    faces = [painter if face == MINUS_Z else paint.unseen for face in range(6)]
+    faces = [painter if face == MINUS_Z else paint.blank for face in range(6)]
     builder.box((*zone.centre, HEIGHT + 0.05), (zone.x1 - zone.x0, zone.y1 - zone.y0, 0.1), faces)
 
 
@@ -51,7 +51,7 @@ def openings(zone: Zone, side: str) -> list[tuple[float, float]]:
 
 
 def stretches(length: float, gaps: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """What gaps leave of a wall."""
+    """Returns the parts of a wall between its gaps."""
     edges = [-length / 2, *(end for gap in gaps for end in gap), length / 2]
     return [(left, right) for left, right in zip(edges[::2], edges[1::2], strict=True) if right - left > 0.01]
 
@@ -62,9 +62,11 @@ def _wall(builder: Builder, spot: Spot, length: float, gaps: Sequence[tuple[floa
         _panel(builder, spot, (left, right), (0.0, HEIGHT), cover.wall)
         middle, width = (left + right) / 2, right - left
         if cover.dado is not None:
-            builder.box(spot.at(middle, 0.008, 0.5), (width, 0.016, 1.0), only(PLUS_Y, cover.dado), spot.yaw_deg)
-            builder.box(spot.at(middle, 0.02, 1.0), (width, 0.04, 0.06), skirting, spot.yaw_deg)
-        builder.box(spot.at(middle, 0.012, 0.05), (width, 0.024, 0.10), skirting, spot.yaw_deg)
+            builder.box(
+                spot.transform_point(middle, 0.008, 0.5), (width, 0.016, 1.0), only(PLUS_Y, cover.dado), spot.yaw_deg
+            )
+            builder.box(spot.transform_point(middle, 0.02, 1.0), (width, 0.04, 0.06), skirting, spot.yaw_deg)
+        builder.box(spot.transform_point(middle, 0.012, 0.05), (width, 0.024, 0.10), skirting, spot.yaw_deg)
     for gap in gaps:
         _panel(builder, spot, gap, (DOOR_HEIGHT, HEIGHT), cover.wall)
         _casing(builder, spot, gap)
@@ -73,16 +75,18 @@ def _wall(builder: Builder, spot: Spot, length: float, gaps: Sequence[tuple[floa
 def _panel(
     builder: Builder, spot: Spot, along: tuple[float, float], up: tuple[float, float], painter: paint.Painter
 ) -> None:
-    centre = spot.at(sum(along) / 2, -WALL / 4, sum(up) / 2)
+    centre = spot.transform_point(sum(along) / 2, -WALL / 4, sum(up) / 2)
     builder.box(centre, (along[1] - along[0], WALL / 2, up[1] - up[0]), only(PLUS_Y, painter), spot.yaw_deg)
 
 
 def _casing(builder: Builder, spot: Spot, gap: tuple[float, float]) -> None:
     wood = paint.wood((150, 108, 74))
     for x in (gap[0] - CASING / 2, gap[1] + CASING / 2):
-        builder.box(spot.at(x, 0.012, DOOR_HEIGHT / 2), (CASING, 0.036, DOOR_HEIGHT), wood, spot.yaw_deg)
+        builder.box(spot.transform_point(x, 0.012, DOOR_HEIGHT / 2), (CASING, 0.036, DOOR_HEIGHT), wood, spot.yaw_deg)
     width = gap[1] - gap[0] + 2 * CASING
-    builder.box(spot.at(sum(gap) / 2, 0.014, DOOR_HEIGHT + CASING / 2), (width, 0.04, CASING), wood, spot.yaw_deg)
+    builder.box(
+        spot.transform_point(sum(gap) / 2, 0.014, DOOR_HEIGHT + CASING / 2), (width, 0.04, CASING), wood, spot.yaw_deg
+    )
 
 
 def _lining(builder: Builder, zone: Zone) -> None:

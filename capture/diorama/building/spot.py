@@ -18,19 +18,19 @@ class Spot:
     y: float
     yaw_deg: float
 
-    def at(self, dx: float, dy: float, z: float) -> Vector:
+    def transform_point(self, dx: float, dy: float, z: float) -> Vector:
         """World coordinates of a point of this frame."""
         px, py, _ = turn(self.yaw_deg) @ np.array([dx, dy, 0.0])
         return self.x + float(px), self.y + float(py), z
 
-    def beside(self, dx: float, dy: float = 0.0, yaw_deg: float = 0.0) -> Spot:
+    def offset_spot(self, dx: float, dy: float = 0.0, yaw_deg: float = 0.0) -> Spot:
         """Another place, by its coordinates in this frame."""
-        x, y, _ = self.at(dx, dy, 0.0)
+        x, y, _ = self.transform_point(dx, dy, 0.0)
         return Spot(x, y, self.yaw_deg + yaw_deg)
 
 
 def walls(zone: Zone) -> dict[str, tuple[Spot, float]]:
-    """By side: the foot of the wall's middle, and its length in metres."""
+    """Returns the foot of each wall's middle and the wall's length in metres, by side."""
     (x, y), width, depth = zone.centre, zone.x1 - zone.x0, zone.y1 - zone.y0
     return {
         "north": (Spot(x, zone.y1, 180.0), width),

@@ -25,7 +25,7 @@ def visible_zones(camera: Camera, width: int, behind: int | None = None) -> dict
     x, y = T_world_camera[:2, 3]
     seen: dict[int, Slopes] = {}
     for zone in zones_at(float(x), float(y)) if behind is None else (behind,):
-        _look(T_world_camera, zone, (-half, half), seen, None)
+        _collect_zones(T_world_camera, zone, (-half, half), seen, None)
     return {zone: _columns(seen[zone], K, width) for zone in sorted(seen)}
 
 
@@ -37,7 +37,7 @@ def _columns(slopes: Slopes, K: Matrix, width: int) -> slice:
     return slice(left, min(right + 1, width))
 
 
-def may_be_seen(spheres: Matrix, camera: Camera, columns: slice, height: int) -> npt.NDArray[np.bool_]:
+def find_visible_spheres(spheres: Matrix, camera: Camera, columns: slice, height: int) -> npt.NDArray[np.bool_]:
     """(S,) whether spheres (S, 4), centre and radius in the world, reach into so many rows and these columns."""
     T_world_camera, K = camera
     x, y, z = T_world_camera[:3, :3].T @ (spheres[:, :3] - T_world_camera[:3, 3]).T
@@ -51,18 +51,20 @@ def may_be_seen(spheres: Matrix, camera: Camera, columns: slice, height: int) ->
     return inside
 
 
-def _look(T_world_camera: Matrix, zone: int, slopes: Slopes, seen: dict[int, Slopes], through: Door | None) -> None:
+def _collect_zones(
+    T_world_camera: Matrix, zone: int, slopes: Slopes, seen: dict[int, Slopes], through: Door | None
+) -> None:
     known = seen.get(zone, slopes)
     seen[zone] = min(known[0], slopes[0]), max(known[1], slopes[1])
     for door in doors_of(zone):
         if door is through:
             continue
-        narrowed = _narrowed(T_world_camera, door, zone, slopes)
+        narrowed = _clip_to_door(T_world_camera, door, zone, slopes)
         if narrowed is not None:
-            _look(T_world_camera, door.room if zone == CORRIDOR else CORRIDOR, narrowed, seen, door)
+            _collect_zones(T_world_camera, door.room if zone == CORRIDOR else CORRIDOR, narrowed, seen, door)
 
 
-def _narrowed(T_world_camera: Matrix, door: Door, zone: int, slopes: Slopes) -> Slopes | None:
+def _clip_to_door(T_world_camera: Matrix, door: Door, zone: int, slopes: Slopes) -> Slopes | None:
     """The rays of `slopes` that pass a door from `zone`; None where there is none."""
     y = door.inner if zone == CORRIDOR else door.outer
     ends = np.array([[x, y] for x in door.span]) - T_world_camera[:2, 3]

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.frames.keyframe import Keyframe, longer_side
 from splatnode.recon.matching import pair_matching
-from splatnode.recon.matching.match import Matcher, completed
+from splatnode.recon.matching.match import Matcher, match_pending
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
 
@@ -34,7 +34,7 @@ MIN_VIEWS = 3  # of each scene that must have a camera then
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class LoopSide:
     """One of the two scenes."""
 
     scene_id: str
@@ -44,7 +44,7 @@ class Side:
 
 
 @dataclass(frozen=True, eq=False)
-class Bridge:
+class VerifiedLoop:
     """Cameras T_world_camera (4, 4) of photographs of both scenes, in one world, by the photographs' names."""
 
     one: Mapping[str, Array]
@@ -58,24 +58,28 @@ class Bridge:
 
 
 @dataclass(frozen=True)
-class _Apart:
+class _LoopRejection:
     """There is no bridge by some photographs of both scenes."""
 
     why: str
     joined: bool  # whether photographs of both had cameras in one world: more photographs may make a bridge of that
 
 
-def bridge(
-    one: Side, other: Side, config: Config, matcher: Matcher | None, pause: Callable[[], None] = lambda: None
-) -> Bridge | str:
+def verify_loop(
+    one: LoopSide,
+    other: LoopSide,
+    config: ReconstructionConfig,
+    matcher: Matcher | None,
+    pause: Callable[[], None] = lambda: None,
+) -> VerifiedLoop | str:
     """The bridge between the scenes, or why there is none. `pause` is called about once a second and may raise."""
-    pairs = verified_pairs(one, other, config, pause)
-    if len(_distinct(pairs)) < MIN_VERIFIED:
+    pairs = verify_pairs(one, other, config, pause)
+    if len(_select_distinct_pairs(pairs)) < MIN_VERIFIED:
         return f"{len(pairs)} pairs of photographs show the same"
     why = ""
     for most in VIEWS:
-        found = _bridge_of(one, other, pairs, most, config, matcher, pause)
-        if isinstance(found, Bridge):
+        found = _verify_with_views(one, other, pairs, most, config, matcher, pause)
+        if isinstance(found, VerifiedLoop):
             return found
         why = found.why
         if not found.joined:
@@ -83,34 +87,34 @@ def bridge(
     return why
 
 
-def _bridge_of(
-    one: Side, other: Side, pairs: Sequence[Pair], most: int, config: Config, matcher: Matcher | None,
+def _verify_with_views(
+    one: LoopSide, other: LoopSide, pairs: Sequence[Pair], most: int, config: ReconstructionConfig, matcher: Matcher | None,
     pause: Callable[[], None],
-) -> Bridge | _Apart:  # fmt: skip
-    """By `most` photographs of each scene."""
-    chosen = [views_to_bridge(side, [pair[end] for pair in pairs], most) for end, side in enumerate((one, other))]
+) -> VerifiedLoop | _LoopRejection:  # fmt: skip
+    """Verifies the loop with `most` images of each scene."""
+    chosen = [select_views(side, [pair[end] for pair in pairs], most) for end, side in enumerate((one, other))]
     graph = ViewGraph(config.matching)
     for side, views in zip((one, other), chosen, strict=True):
-        graph = graph.joined(_renamed(side, views))
-    for whole in completed(graph, matcher):
+        graph = graph.merge(_prefix_names(side, views))
+    for whole in match_pending(graph, matcher):
         graph = whole
         pause()
-    twins = _twins(graph, one.scene_id)
-    estimate = estimate_cameras(graph.without(twins.keys()), (), config, pause)
+    twins = _find_twins(graph, one.scene_id)
+    estimate = estimate_cameras(graph.remove_keyframes(twins.keys()), (), config, pause)
     names, cameras = estimate.graph.names, estimate.registration.cameras if estimate.registration else ()
     found = {names[camera.index]: camera.T_world_camera for camera in cameras}
     found |= {name: found[twin] for name, twin in twins.items() if twin in found}
-    mine, theirs = (_of(side.scene_id, found) for side in (one, other))
+    mine, theirs = (_select_cameras(side.scene_id, found) for side in (one, other))
     fewest = min(len(mine), len(theirs))
     joined = fewest >= MIN_VIEWS or (fewest > 0 and estimate.verdict.code is not Code.SPLIT)
     if not estimate.publishable:
-        return _Apart(f"together they are {estimate.verdict.code.value}: {estimate.verdict.message}", joined)
+        return _LoopRejection(f"together they are {estimate.verdict.code.value}: {estimate.verdict.message}", joined)
     if fewest < MIN_VIEWS:
-        return _Apart(f"together only {len(mine)} and {len(theirs)} of their photographs have cameras", joined)
-    return Bridge(mine, theirs, len(pairs))
+        return _LoopRejection(f"together only {len(mine)} and {len(theirs)} of their photographs have cameras", joined)
+    return VerifiedLoop(mine, theirs, len(pairs))
 
 
-def verified_pairs(one: Side, other: Side, config: Config, pause: Callable[[], None]) -> list[Pair]:
+def verify_pairs(one: LoopSide, other: LoopSide, config: ReconstructionConfig, pause: Callable[[], None]) -> list[Pair]:
     """The pairs, a keyframe of each scene by its position, that show the same; those with most matches first."""
     alike = one.codes @ other.codes.T
     order = np.argsort(-alike, axis=None, kind="stable")[: GLANCED * VERIFIED]
@@ -133,7 +137,7 @@ def verified_pairs(one: Side, other: Side, config: Config, pause: Callable[[], N
     return sorted(found, key=lambda pair: -found[pair])
 
 
-def _distinct(pairs: Sequence[Pair]) -> list[Pair]:
+def _select_distinct_pairs(pairs: Sequence[Pair]) -> list[Pair]:
     """Pairs that have no keyframe in common, the first ones first."""
     taken: tuple[set[int], set[int]] = set(), set()
     distinct = []
@@ -145,7 +149,7 @@ def _distinct(pairs: Sequence[Pair]) -> list[Pair]:
     return distinct
 
 
-def _twins(graph: ViewGraph, scene_id: str) -> dict[str, str]:
+def _find_twins(graph: ViewGraph, scene_id: str) -> dict[str, str]:
     """Photographs that were taken from where one of scene `scene_id` was, with the name of that one.
 
     They have no parallax to each other, so one camera is estimated for both.
@@ -154,13 +158,13 @@ def _twins(graph: ViewGraph, scene_id: str) -> dict[str, str]:
     for (i, j), pair in sorted(graph.pairs.items()):
         one, other = graph.keyframes[i], graph.keyframes[j]
         moved_px = pair_matching.median_motion_px(pair, longer_side(one.frame), longer_side(other.frame))
-        first, second = sorted((one.name, other.name), key=lambda name: not _is_of(scene_id, name))
-        if _is_of(scene_id, first) and not _is_of(scene_id, second) and moved_px < TWIN_PX:
+        first, second = sorted((one.name, other.name), key=lambda name: not _belongs_to(scene_id, name))
+        if _belongs_to(scene_id, first) and not _belongs_to(scene_id, second) and moved_px < TWIN_PX:
             twins.setdefault(second, first)
     return twins
 
 
-def views_to_bridge(side: Side, matched: Sequence[int], most: int) -> list[int]:
+def select_views(side: LoopSide, matched: Sequence[int], most: int) -> list[int]:
     """At most so many keyframes with a camera: two of those `matched`, then such as have enough in common with these.
 
     Each is as far as can be from those before it: cameras close together say little about scale and position.
@@ -189,19 +193,19 @@ def _distance(centre: Array, others: Sequence[Array]) -> float:
     return min(float(np.linalg.norm(centre - each)) for each in others)
 
 
-def _renamed(side: Side, views: Collection[int]) -> ViewGraph:
+def _prefix_names(side: LoopSide, views: Collection[int]) -> ViewGraph:
     """The view graph of these keyframes alone, by names that no keyframe of another scene has."""
     gone = {name for index, name in enumerate(side.graph.names) if index not in views}
-    graph = side.graph.without(gone)
+    graph = side.graph.remove_keyframes(gone)
     keyframes = (
         replace(each, frame=replace(each.frame, name=f"{side.scene_id}/{each.name}")) for each in graph.keyframes
     )
     return replace(graph, keyframes=tuple(keyframes), codes={}, glanced={})
 
 
-def _is_of(scene_id: str, name: str) -> bool:
+def _belongs_to(scene_id: str, name: str) -> bool:
     return name.startswith(f"{scene_id}/")
 
 
-def _of(scene_id: str, cameras: Mapping[str, Array]) -> dict[str, Array]:
-    return {name.removeprefix(f"{scene_id}/"): T for name, T in cameras.items() if _is_of(scene_id, name)}
+def _select_cameras(scene_id: str, cameras: Mapping[str, Array]) -> dict[str, Array]:
+    return {name.removeprefix(f"{scene_id}/"): T for name, T in cameras.items() if _belongs_to(scene_id, name)}

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, spread
+from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius
 
 MIN_SHARED = 3  # cameras that two scenes must share, so that one that is wrong shows
 # What no link is surer of, however well its few cameras agree: what the scenes themselves are wrong by.
@@ -21,15 +21,15 @@ Array = npt.NDArray[np.float64]
 Cameras = Mapping[str, Array]  # T_world_camera (4, 4) by the names of the photographs
 
 
-class Kind(enum.Enum):
+class EdgeKind(enum.Enum):
     CHAIN = "chain"  # the one scene goes on where the other was full: they have photographs in common
     LOOP = "loop"  # the camera came back: photographs of the one show what those of the other show
 
 
-class Link(msgspec.Struct, frozen=True, kw_only=True):
+class PoseGraphEdge(msgspec.Struct, frozen=True, kw_only=True):
     """A point x of scene `other` lies at scale * rotation @ x + translation in `scene`."""
 
-    kind: Kind = Kind.CHAIN
+    kind: EdgeKind = EdgeKind.CHAIN
     scene: str  # scene_id
     other: str
     scale: float
@@ -52,7 +52,7 @@ class Link(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _Alignment:
     """One set of cameras laid on another."""
 
     similarity: Similarity
@@ -63,26 +63,26 @@ class _Fit:
     sigma_relative: float  # of the logarithm of the scale; of the mean position over `extent`
 
     @property
-    def agrees(self) -> bool:
+    def is_consistent(self) -> bool:
         """Whether both sets lie alike."""
         return self.rotation_deg <= MOST_DEG and self.centre_rms <= MOST_RELATIVE * self.extent
 
 
-def link(scene: str, other: str, mine: Cameras, theirs: Cameras) -> Link | None:
-    """By the cameras of two scenes that both have, by their names. None where they share fewer than MIN_SHARED."""
+def make_chain_edge(scene: str, other: str, mine: Cameras, theirs: Cameras) -> PoseGraphEdge | None:
+    """Makes the edge between two scenes by shared cameras. None if they share fewer than MIN_SHARED."""
     shared = [name for name in mine if name in theirs]
     if len(shared) < MIN_SHARED:
         return None
     target = np.stack([mine[name] for name in shared])
-    fit = _fit(np.stack([theirs[name] for name in shared]), target)
+    fit = _align(np.stack([theirs[name] for name in shared]), target)
     why = f"{len(shared)} photographs are in both"
-    return _link(Kind.CHAIN, scene, other, fit.similarity, [fit], target, shared, why)
+    return _make_edge(EdgeKind.CHAIN, scene, other, fit.similarity, [fit], target, shared, why)
 
 
-def bridged(
+def make_loop_edge(
     scene: str, other: str, mine: Cameras, theirs: Cameras, bridge: tuple[Cameras, Cameras], why: str
-) -> Link | None:
-    """By cameras of some photographs of both scenes in a world of their own: `bridge`, those of `scene` first.
+) -> PoseGraphEdge | None:
+    """Makes the edge of a loop: `bridge` has cameras of both scenes in one world, first those of `scene`.
 
     None where fewer than MIN_SHARED of either have a camera in their scene, too, or have it elsewhere there.
     """
@@ -90,23 +90,25 @@ def bridged(
     if min(map(len, names)) < MIN_SHARED:
         return None
     target = np.stack([mine[name] for name in names[0]])
-    to_mine = _fit(np.stack([bridge[0][name] for name in names[0]]), target)
-    to_theirs = _fit(np.stack([bridge[1][name] for name in names[1]]), np.stack([theirs[name] for name in names[1]]))
-    if not (to_mine.agrees and to_theirs.agrees):
+    to_mine = _align(np.stack([bridge[0][name] for name in names[0]]), target)
+    to_theirs = _align(np.stack([bridge[1][name] for name in names[1]]), np.stack([theirs[name] for name in names[1]]))
+    if not (to_mine.is_consistent and to_theirs.is_consistent):
         return None
     similarity = to_mine.similarity.after(to_theirs.similarity.inverse())
-    return _link(Kind.LOOP, scene, other, similarity, [to_mine, to_theirs], target, [*names[0], *names[1]], why)
+    return _make_edge(
+        EdgeKind.LOOP, scene, other, similarity, [to_mine, to_theirs], target, [*names[0], *names[1]], why
+    )
 
 
-def carried(link: Link, scene: str, before: Cameras, now: Cameras) -> Link | None:
+def transfer_edge(link: PoseGraphEdge, scene: str, before: Cameras, now: Cameras) -> PoseGraphEdge | None:
     """The link, after one of its scenes was made again: from the world in which its cameras lay `before` to that of
     `now`. None where they lie to each other otherwise now, or have too few in common.
     """
     names = [name for name in before if name in now]
     if len(names) < MIN_SHARED:
         return None
-    fit = _fit(np.stack([before[name] for name in names]), np.stack([now[name] for name in names]))
-    if not fit.agrees:
+    fit = _align(np.stack([before[name] for name in names]), np.stack([now[name] for name in names]))
+    if not fit.is_consistent:
         return None
     to_now, there, centre, position = fit.similarity, link.similarity, link.centre, link.sigma_position
     if link.scene == scene:
@@ -127,26 +129,26 @@ def carried(link: Link, scene: str, before: Cameras, now: Cameras) -> Link | Non
     )
 
 
-def _fit(source: Array, target: Array) -> _Fit:
+def _align(source: Array, target: Array) -> _Alignment:
     """Cameras `source` (C, 4, 4) laid on `target`."""
     found = align_cameras(source, target)
     turned = angles_deg(found.rotation @ source[:, :3, :3], target[:, :3, :3])
     rms = float(np.sqrt(((found(source[:, :3, 3]) - target[:, :3, 3]) ** 2).sum(1).mean()))
-    extent = max(spread(target[:, :3, 3]), 1e-12)
+    extent = max(compute_rms_radius(target[:, :3, 3]), 1e-12)
     root = np.sqrt(len(source))
     relative = rms / extent / root
     sigma_deg = max(float(np.sqrt((turned**2).mean())) / root, LEAST_DEG)
-    return _Fit(found, float(turned.max()), rms, extent, sigma_deg, max(relative, LEAST_RELATIVE))
+    return _Alignment(found, float(turned.max()), rms, extent, sigma_deg, max(relative, LEAST_RELATIVE))
 
 
-def _link(
-    kind: Kind, scene: str, other: str, similarity: Similarity, fits: list[_Fit], target: Array, names: list[str],
+def _make_edge(
+    kind: EdgeKind, scene: str, other: str, similarity: Similarity, fits: list[_Alignment], target: Array, names: list[str],
     why: str,
-) -> Link:  # fmt: skip
+) -> PoseGraphEdge:  # fmt: skip
     relative = float(np.sqrt(sum(fit.sigma_relative**2 for fit in fits)))
     moving = all(fit.extent > 1e-9 for fit in fits)
     differ = max(fit.centre_rms / fit.extent for fit in fits)
-    return Link(
+    return PoseGraphEdge(
         kind=kind,
         scene=scene,
         other=other,

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from splatnode.recon.daemon.atlas.links import Kind, Link
-from splatnode.recon.daemon.atlas.relaxation import contradictions, relaxed
+from splatnode.recon.daemon.atlas.links import EdgeKind, PoseGraphEdge
+from splatnode.recon.daemon.atlas.relaxation import compute_deviations, solve_pose_graph
 from splatnode.recon.geometry import Similarity
 
 CONTRADICTED = 5.0  # standard deviations by which a link differs from where the others put it
 
 
-class Pose(msgspec.Struct, frozen=True):
+class SubmapPose(msgspec.Struct, frozen=True):
     """A point x of `scene` lies at scale * rotation @ x + translation in the world of `map`, the map's first scene."""
 
     scene: str
@@ -37,13 +37,13 @@ class Pose(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Graph:
-    poses: tuple[Pose, ...]  # of all scenes, each once
-    links: tuple[Link, ...]  # as they were given; those of them that do not count say why
+class PoseGraph:
+    poses: tuple[SubmapPose, ...]  # of all scenes, each once
+    links: tuple[PoseGraphEdge, ...]  # as they were given; those of them that do not count say why
 
 
-def optimised(scenes: Sequence[str], links: Sequence[Link]) -> Graph:
-    """Where the scenes lie. The first scene of each map, in the order of `scenes`, is its world.
+def optimize_pose_graph(scenes: Sequence[str], links: Sequence[PoseGraphEdge]) -> PoseGraph:
+    """Optimizes the scenes' poses. The first scene of each map, in the order of `scenes`, is its world.
 
     A loop that contradicts the others is retracted, the most contradicted first, until none does.
     """
@@ -51,46 +51,48 @@ def optimised(scenes: Sequence[str], links: Sequence[Link]) -> Graph:
     while True:
         counting = [index for index in range(len(links)) if index not in retracted]
         those = [links[index] for index in counting]
-        placed = _placed(scenes, those, math.inf)
-        if contradictions(_worlds(placed), those).max(initial=0.0) <= CONTRADICTED:
+        placed = _place_scenes(scenes, those, math.inf)
+        if compute_deviations(_select_similarities(placed), those).max(initial=0.0) <= CONTRADICTED:
             break
         # Where loops pull no harder than this, those that agree hold the scenes, and the wrong one stands out.
-        apart = contradictions(_worlds(_placed(scenes, those, 1.0)), those)
-        loops = [place for place, each in enumerate(those) if each.kind is Kind.LOOP]
+        apart = compute_deviations(_select_similarities(_place_scenes(scenes, those, 1.0)), those)
+        loops = [place for place, each in enumerate(those) if each.kind is EdgeKind.LOOP]
         if not loops:
             break
         worst = max(loops, key=lambda place: apart[place])
         index, sigmas = counting[worst], apart[worst]
         retracted[index] = f"it differs from where the other links put the scenes by {sigmas:.0f} standard deviations"
     poses = (
-        Pose(scene, root, found.scale, tuple(map(tuple, found.rotation.tolist())), tuple(found.translation.tolist()))
+        SubmapPose(
+            scene, root, found.scale, tuple(map(tuple, found.rotation.tolist())), tuple(found.translation.tolist())
+        )
         for scene, (root, found) in placed.items()
     )
     told = (msgspec.structs.replace(each, retracted=retracted.get(index)) for index, each in enumerate(links))
-    return Graph(tuple(poses), tuple(told))
+    return PoseGraph(tuple(poses), tuple(told))
 
 
 _Placed = Mapping[str, tuple[str, Similarity]]  # by scene: the first scene of its map, and from its world to that
 
 
-def _placed(scenes: Sequence[str], links: Sequence[Link], hardest: float) -> _Placed:
+def _place_scenes(scenes: Sequence[str], links: Sequence[PoseGraphEdge], hardest: float) -> _Placed:
     """The scenes by the links, all of which count; `hardest` as for `relaxed`."""
     placed: dict[str, tuple[str, Similarity]] = {}
     for root in scenes:
         if root in placed:
             continue
-        found = _spanned(root, links)
+        found = _span_tree(root, links)
         mine = [each for each in links if each.scene in found and each.other in found]
         if len(mine) >= len(found):  # there is a cycle
-            found = relaxed(found, mine, hardest)
+            found = solve_pose_graph(found, mine, hardest)
         placed |= {scene: (root, found[scene]) for scene in scenes if scene in found}
     return placed
 
 
-def _spanned(root: str, links: Sequence[Link]) -> dict[str, Similarity]:
+def _span_tree(root: str, links: Sequence[PoseGraphEdge]) -> dict[str, Similarity]:
     """All scenes that links lead to, along the fewest links; chains before loops."""
     found = {root: Similarity(1.0, np.eye(3), np.zeros(3))}
-    ordered = sorted(links, key=lambda each: each.kind is Kind.LOOP)
+    ordered = sorted(links, key=lambda each: each.kind is EdgeKind.LOOP)
     while True:
         reached: dict[str, Similarity] = {}
         for each in ordered:
@@ -103,5 +105,5 @@ def _spanned(root: str, links: Sequence[Link]) -> dict[str, Similarity]:
         found |= reached
 
 
-def _worlds(placed: _Placed) -> dict[str, Similarity]:
+def _select_similarities(placed: _Placed) -> dict[str, Similarity]:
     return {scene: found for scene, (_, found) in placed.items()}

@@ -9,22 +9,22 @@ from dataclasses import dataclass, replace
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.memory_shortage import is_shortage
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint import saved, saved_estimate
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.frames.screening import Screened
-from splatnode.recon.incremental import IncrementalReconstruction, Known
+from splatnode.recon.frames.screening import ScreeningState
+from splatnode.recon.incremental import IncrementalReconstruction, StreamState
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.memory import Memory
-from splatnode.recon.modelling import shown
+from splatnode.recon.memory import ReconstructionCache
+from splatnode.recon.modelling import prepare_scene_for_display
 from splatnode.recon.preparation import prepare
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Restored:
+class RestoredReconstruction:
     work: IncrementalReconstruction
     keyframes: int
     new: list[Keyframe]  # that the reconstruction does not know yet
@@ -33,52 +33,54 @@ class Restored:
 
 def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     """Keeps what `work` knows; whether its scene is `final`. Raises OSError."""
-    store.save("graph", *saved.graph_message(work.graph))
+    store.save("graph", *saved.make_graph_message(work.graph))
     save_fallbacks(store, work)
-    estimate = work.remembered()
+    estimate = work.find_reconstruction()
     # Cameras that given poses hold have no evidence, and are estimated anew after a restart.
     if estimate is not None and estimate.publishable and estimate.evidence is not None:
-        store.save("judgement", *saved_estimate.estimate_message(estimate, work.proven))
+        store.save("judgement", *saved_estimate.make_reconstruction_message(estimate, work.publishable_names))
     if work.scene is not None:
-        store.save("pointmaps", *saved_estimate.pointmaps_message(work.known.pointmaps))
-        store.save("scene", *saved.scene_message(work.scene, final))
+        store.save("pointmaps", *saved_estimate.make_pointmaps_message(work.state.pointmaps))
+        store.save("scene", *saved.make_scene_message(work.scene, final))
 
 
 def save_fallbacks(store: Store, work: IncrementalReconstruction) -> None:
     """Keeps which fallbacks gained nothing. Raises OSError."""
-    fruitless = work.known.memory.fruitless
+    fruitless = work.state.memory.fruitless
     if fruitless:
         store.save("fallbacks", saved_estimate.FallbacksRecord(list(fruitless)), [])
 
 
-def restore(store: Store, config: Config) -> Restored:
+def restore(store: Store, config: ReconstructionConfig) -> RestoredReconstruction:
     """The reconstruction that the checkpoint holds. A frame that cannot be used is left out of it for good.
 
     Raises MemoryError and the like: what there is no memory for now is no fault of the files.
     """
     frames = [stored.frame for stored in store.frames()]
     try:
-        return _restored(store, frames, config)
+        return _restore_reconstruction(store, frames, config)
     except Exception as error:  # whatever the files of another version, or of a faulty disk, make fail
         if is_shortage(error):
             raise
         log.warning("the checkpoint's scene is made anew: %s: %s", type(error).__name__, error)
-        keyframes = _prepared(store, frames, config, {})
-        return Restored(IncrementalReconstruction(config), len(keyframes), list(keyframes.values()), final=False)
+        keyframes = _prepare_keyframes(store, frames, config, {})
+        return RestoredReconstruction(
+            IncrementalReconstruction(config), len(keyframes), list(keyframes.values()), final=False
+        )
 
 
-def graph_of(store: Store, config: Config) -> ViewGraph:
+def load_graph(store: Store, config: ReconstructionConfig) -> ViewGraph:
     """The view graph that the checkpoint holds; an empty one where it holds none. Raises OSError."""
     record = store.load("graph", saved.GraphRecord)
     if record is None:
         return ViewGraph(config.matching)
-    before = saved.graph_from(record)
-    keyframes = _prepared(store, [stored.frame for stored in store.frames()], config, before.features)
-    return _graph(config, [keyframe for name, keyframe in keyframes.items() if name in before.features], before)
+    before = saved.parse_graph(record)
+    keyframes = _prepare_keyframes(store, [stored.frame for stored in store.frames()], config, before.features)
+    return _make_graph(config, [keyframe for name, keyframe in keyframes.items() if name in before.features], before)
 
 
-def _prepared(
-    store: Store, frames: Sequence[Frame], config: Config, known: Mapping[str, Features]
+def _prepare_keyframes(
+    store: Store, frames: Sequence[Frame], config: ReconstructionConfig, known: Mapping[str, Features]
 ) -> dict[str, Keyframe]:
     """The keyframes by their names, with the features that are known."""
     keyframes = {}
@@ -94,28 +96,30 @@ def _prepared(
     return keyframes
 
 
-def _restored(store: Store, frames: Sequence[Frame], config: Config) -> Restored:
+def _restore_reconstruction(
+    store: Store, frames: Sequence[Frame], config: ReconstructionConfig
+) -> RestoredReconstruction:
     record = store.load("graph", saved.GraphRecord)
-    before = saved.graph_from(record) if record is not None else saved.SavedGraph({}, {}, [])
-    keyframes = _prepared(store, frames, config, before.features)
+    before = saved.parse_graph(record) if record is not None else saved.SavedGraph({}, {}, [])
+    keyframes = _prepare_keyframes(store, frames, config, before.features)
     record = store.load("scene", saved.SceneRecord)
-    scene = saved.scene_from(record, keyframes) if record is not None else None
+    scene = saved.parse_scene(record, keyframes) if record is not None else None
     final = record is not None and record.header.final and scene is not None
     record = store.load("pointmaps", saved_estimate.PointmapsRecord)
-    graph = _graph(config, [keyframes[name] for name in keyframes if name in before.features], before)
-    known = Known(
+    graph = _make_graph(config, [keyframes[name] for name in keyframes if name in before.features], before)
+    known = StreamState(
         graph,
         beside=ViewGraph(config.matching),
-        screened=_screened(graph),
-        memory=_memory(store, graph),
-        pointmaps=saved_estimate.pointmaps_from(record, keyframes) if record is not None else {},
-        show=shown(scene, config),
+        screened=_screen_keyframes(graph),
+        memory=_load_memory(store, graph),
+        pointmaps=saved_estimate.parse_pointmaps(record, keyframes) if record is not None else {},
+        show=prepare_scene_for_display(scene, config),
     )
     new = [keyframe for name, keyframe in keyframes.items() if name not in before.features]
-    return Restored(IncrementalReconstruction(config, known), len(keyframes), new, final)
+    return RestoredReconstruction(IncrementalReconstruction(config, known), len(keyframes), new, final)
 
 
-def _graph(config: Config, keyframes: Sequence[Keyframe], before: saved.SavedGraph) -> ViewGraph:
+def _make_graph(config: ReconstructionConfig, keyframes: Sequence[Keyframe], before: saved.SavedGraph) -> ViewGraph:
     """The view graph of the keyframes, with what an earlier process knew of their pairs."""
     position = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
     pairs = {(position[i], position[j]): pair for (i, j), pair in before.pairs.items() if {i, j} <= position.keys()}
@@ -123,19 +127,19 @@ def _graph(config: Config, keyframes: Sequence[Keyframe], before: saved.SavedGra
     return ViewGraph(config.matching, tuple(keyframes), pairs, frozenset(pending))
 
 
-def _screened(graph: ViewGraph) -> Screened:
-    screened = Screened()
+def _screen_keyframes(graph: ViewGraph) -> ScreeningState:
+    screened = ScreeningState()
     for keyframe in graph.keyframes:
-        screened = screened.with_known(keyframe.frame)
+        screened = screened.add_known_frame(keyframe.frame)
     return screened
 
 
-def _memory(store: Store, graph: ViewGraph) -> Memory:
-    """With the estimate of just these keyframes, if the checkpoint has one, and what gained nothing before."""
+def _load_memory(store: Store, graph: ViewGraph) -> ReconstructionCache:
+    """Loads the estimate of exactly these keyframes, if there is one, and the fruitless fallbacks."""
     record = store.load("fallbacks", saved_estimate.FallbacksRecord)
-    memory = Memory(fruitless=() if record is None else tuple(record.header.fruitless))
-    record = store.load("judgement", saved_estimate.EstimateRecord)
+    memory = ReconstructionCache(fruitless=() if record is None else tuple(record.header.fruitless))
+    record = store.load("judgement", saved_estimate.ReconstructionRecord)
     if record is None or record.header.names != graph.names:
         return memory
-    estimate, proven = saved_estimate.estimate_from(record, graph), frozenset(record.header.proven)
+    estimate, proven = saved_estimate.parse_reconstruction(record, graph), frozenset(record.header.proven)
     return replace(memory, recent=(((tuple(graph.names), 0), estimate),), proven=proven)

@@ -42,7 +42,7 @@ class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def scene_id(self) -> str:
-        """Of the present place's scene."""
+        """The id of the active submap's scene."""
         return f"scene-{self.place:04d}" + (f"-{self.part}" if self.part else "")
 
 
@@ -76,7 +76,7 @@ def write_ledger(directory: Path, ledger: Ledger) -> None:
     write_message(directory / FILE, encode(ledger))
 
 
-def identified(directory: Path) -> Ledger:
+def ensure_identity(directory: Path) -> Ledger:
     """The ledger with the checkpoint's identity, which it is given where it has none. Raises CheckpointError.
 
     It is of this version from now on, so that an earlier splatnode leaves alone what it could not read.

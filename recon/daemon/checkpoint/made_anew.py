@@ -25,7 +25,7 @@ def save(directory: Path, name: str, header: msgspec.Struct, arrays: list[Any]) 
 
 
 def load(directory: Path, name: str, schema: Any) -> Message[Any] | None:
-    """What `save` wrote under this name; None where it is missing or damaged."""
+    """Loads what `save` wrote under this name; None where it is missing or damaged."""
     try:
         return decode(read_message(directory / name), schema, LIMITS)
     except FileNotFoundError:

@@ -16,7 +16,7 @@ from splatnode.capture.messaging.wire import Message
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.straightened import straight
+from splatnode.recon.registration.straightened import undistort_keyframe
 from splatnode.recon.scene import light
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
@@ -47,10 +47,10 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     consistent_depth: list[float | None] = []  # share of each view's pixels; empty: not known of any
 
 
-def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
+def make_graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
     """Header and arrays of the message that holds `graph`."""
-    features = [taken_apart(keyframe.features) for keyframe in graph.keyframes]
-    pairs = {key: taken_apart(pair) for key, pair in graph.pairs.items()}
+    features = [flatten_dataclass(keyframe.features) for keyframe in graph.keyframes]
+    pairs = {key: flatten_dataclass(pair) for key, pair in graph.pairs.items()}
     header = GraphRecord(
         names=[keyframe.name for keyframe in graph.keyframes],
         features=[numbers for numbers, _ in features],
@@ -69,16 +69,18 @@ class SavedGraph:
     pending: list[tuple[str, str]]
 
 
-def graph_from(message: Message[GraphRecord]) -> SavedGraph:
-    """What `graph_message` was given. Raises ValueError where another version wrote the message."""
+def parse_graph(message: Message[GraphRecord]) -> SavedGraph:
+    """Parses the message of `make_graph_message`. Raises ValueError where another version wrote it."""
     names, arrays = message.header.names, iter(message.arrays)
-    features = [put_together(Features, numbers, arrays) for numbers in message.header.features]
-    pairs = {(names[i], names[j]): put_together(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs}
+    features = [unflatten_dataclass(Features, numbers, arrays) for numbers in message.header.features]
+    pairs = {
+        (names[i], names[j]): unflatten_dataclass(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs
+    }
     pending = [(names[i], names[j]) for i, j in message.header.pending]
     return SavedGraph(dict(zip(names, features, strict=True)), pairs, pending)
 
 
-def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:
+def make_scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:
     """Header and arrays of the message that holds `scene`; `final`: it is finished."""
     views = [view.name for view in scene.views]
     cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
@@ -91,7 +93,7 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
     return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
-def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
+def parse_scene(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
     """The scene that was saved; None where a frame of it is gone. Raises ValueError as `graph_from`."""
     header = message.header
     if any(name not in keyframes for name in header.views):
@@ -103,7 +105,9 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
     gains = header.gains or [None] * len(header.views)
     falloffs = header.falloffs or [0.0] * len(header.views)
     views = tuple(
-        _view(keyframes[name] if lens is None else straight(keyframes[name], lens), own, T_world_camera, K)
+        _make_view(
+            keyframes[name] if lens is None else undistort_keyframe(keyframes[name], lens), own, T_world_camera, K
+        )
         for name, lens, own, T_world_camera, K in zip(
             header.views, lenses, zip(gains, falloffs, strict=True), Ts_world_camera, Ks, strict=True
         )
@@ -113,30 +117,30 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
     return Scene(views, Gaussians(*gaussians), header.iterations, headroom=header.headroom)
 
 
-def _view(
+def _make_view(
     keyframe: Keyframe,
     told: tuple[tuple[float, float, float] | None, float],
     T_world_camera: torch.Tensor,
     K: torch.Tensor,
 ) -> TrainingView:
     """`told`: the photograph's gains, and its lens's falloff."""
-    image, exposure = light.relit(keyframe.image, *told)
+    image, exposure = light.compensate_image(keyframe.image, *told)
     shown = keyframe.name, keyframe.frame.frame_id, image
     return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, exposure=exposure, lens=keyframe.lens)
 
 
-def taken_apart(value: Any) -> tuple[Numbers, list[npt.NDArray]]:
+def flatten_dataclass(value: Any) -> tuple[Numbers, list[npt.NDArray]]:
     """A flat dataclass as its numbers and its arrays."""
     content = {field.name: getattr(value, field.name) for field in fields(value)}
     arrays = [part for part in content.values() if isinstance(part, np.ndarray)]
-    return {name: _plain(part) for name, part in content.items() if not isinstance(part, np.ndarray)}, arrays
+    return {name: _convert_number(part) for name, part in content.items() if not isinstance(part, np.ndarray)}, arrays
 
 
-def _plain(number: Any) -> bool | int | float | None:
+def _convert_number(number: Any) -> bool | int | float | None:
     return number.item() if isinstance(number, np.generic) else number
 
 
-def put_together(kind: type[T], numbers: Numbers, arrays: Any) -> T:
+def unflatten_dataclass(kind: type[T], numbers: Numbers, arrays: Any) -> T:
     """Inverse of `taken_apart`; takes from `arrays` as many as it needs. Raises ValueError where they do not fit."""
     names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
     if not set(numbers) <= set(names):

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.records import record_of
-from splatnode.recon.daemon.checkpoint.saved import Numbers, put_together, taken_apart
-from splatnode.recon.estimation import Estimate
+from splatnode.recon.daemon.checkpoint.saved import Numbers, flatten_dataclass, unflatten_dataclass
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
@@ -25,7 +25,7 @@ OF_REGISTRATION = ("points", "observed_by", "observed_point", "observed_pixels")
 OF_POINTMAP = ("depth", "confidence", "normal", "T_world_camera", "K", "unchecked")
 
 
-class EstimateRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ReconstructionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Arrays: those of each camera in the order of their fields, then OF_REGISTRATION."""
 
     names: list[str]  # of the keyframes, as the cameras number them
@@ -52,14 +52,16 @@ class PointmapsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: list[str]
 
 
-def estimate_message(estimate: Estimate, proven: Collection[str]) -> tuple[EstimateRecord, list[npt.NDArray]]:
-    """Of an estimate that has cameras and evidence; its depth is kept by itself. Raises ValueError for another."""
+def make_reconstruction_message(
+    estimate: Reconstruction, proven: Collection[str]
+) -> tuple[ReconstructionRecord, list[npt.NDArray]]:
+    """Makes the message, without depth. Raises ValueError where cameras or evidence are missing."""
     registration, evidence = estimate.registration, estimate.evidence
     if registration is None or evidence is None:
         raise ValueError("only an estimate with cameras and evidence is kept")
-    cameras = [taken_apart(camera) for camera in registration.cameras]
+    cameras = [flatten_dataclass(camera) for camera in registration.cameras]
     kept = {field.name: getattr(registration, field.name) for field in fields(registration)}
-    record = EstimateRecord(
+    record = ReconstructionRecord(
         names=estimate.graph.names,
         proven=sorted(proven),
         verdict=estimate.verdict,
@@ -72,28 +74,28 @@ def estimate_message(estimate: Estimate, proven: Collection[str]) -> tuple[Estim
     return record, [*arrays, *(kept[name] for name in OF_REGISTRATION)]
 
 
-def estimate_from(message: Message[EstimateRecord], graph: ViewGraph) -> Estimate:
-    """What `estimate_message` was given, of the same keyframes. Raises ValueError where another version wrote it."""
+def parse_reconstruction(message: Message[ReconstructionRecord], graph: ViewGraph) -> Reconstruction:
+    """Parses a message of `make_reconstruction_message`. Raises ValueError where another version wrote it."""
     header, arrays = message.header, iter(message.arrays)
-    cameras = tuple(_camera(numbers, arrays) for numbers in header.cameras)
+    cameras = tuple(_parse_camera(numbers, arrays) for numbers in header.cameras)
     inlier_ratios = {(i, j): ratio for i, j, ratio in header.inlier_ratios}
     content: dict[str, Any] = {"cameras": cameras, "inlier_ratios": inlier_ratios, **header.numbers}
     try:
         registration = Registration(**content, **dict(zip(OF_REGISTRATION, arrays, strict=True)))
     except TypeError as error:
         raise ValueError("an estimate of another version") from error
-    return Estimate(graph, registration, header.evidence, header.verdict)
+    return Reconstruction(graph, registration, header.evidence, header.verdict)
 
 
-def _camera(numbers: Numbers, arrays: Iterator[npt.NDArray]) -> RegisteredCamera:
-    """Of version 6 and before, too, whose lenses had one radial coefficient, a number."""
-    camera = put_together(RegisteredCamera, numbers, arrays)
+def _parse_camera(numbers: Numbers, arrays: Iterator[npt.NDArray]) -> RegisteredCamera:
+    """Parses a camera; up to version 6 a lens had one radial coefficient, a number."""
+    camera = unflatten_dataclass(RegisteredCamera, numbers, arrays)
     if "radial" not in numbers:
         return camera
     return replace(camera, radial=np.array([numbers["radial"], 0.0], np.float64))
 
 
-def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecord, list[npt.NDArray]]:
+def make_pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecord, list[npt.NDArray]]:
     arrays = []
     for pointmap in pointmaps.values():
         depth = pointmap.depth.astype(np.float16).view(np.uint16)
@@ -104,7 +106,7 @@ def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecor
     return PointmapsRecord(list(pointmaps)), arrays
 
 
-def pointmaps_from(message: Message[PointmapsRecord], keyframes: Mapping[str, Keyframe]) -> dict[str, Pointmap]:
+def parse_pointmaps(message: Message[PointmapsRecord], keyframes: Mapping[str, Keyframe]) -> dict[str, Pointmap]:
     """The point maps of those keyframes that there are. Raises ValueError as `estimate_from`."""
     names, arrays = message.header.names, message.arrays
     if len(arrays) != len(OF_POINTMAP) * len(names):

@@ -33,17 +33,12 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.durable import remove_leftovers
-from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.lock import LockHeld, exclusive
 from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.printable import LONGEST_NAME, printable
-from splatnode.capture.process.private import own_files, private_folder
+from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
+from splatnode.capture.process.private import list_own_files, make_owner_only_folder
 from splatnode.recon.daemon.checkpoint import left, made_anew
-from splatnode.recon.daemon.checkpoint.ledger import (
-    CheckpointError,
-    Ledger,
-    identified,
-    write_ledger,
-)
+from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger, ensure_identity, write_ledger
 from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
 from splatnode.recon.daemon.checkpoint.stored_frame import FILE, StoredFrame, file_name, read_frame, write_frame
 
@@ -64,19 +59,19 @@ class Store:
         """
         self.directory = directory
         self._frames = directory / "frames"
-        private_folder(directory, _INSTEAD, ours=(directory / "ledger").is_file() or self._frames.is_dir())
-        private_folder(self._frames, _INSTEAD, ours=True)
+        make_owner_only_folder(directory, _INSTEAD, ours=(directory / "ledger").is_file() or self._frames.is_dir())
+        make_owner_only_folder(self._frames, _INSTEAD, ours=True)
         self._resources = contextlib.ExitStack()
         try:
             self._resources.enter_context(exclusive(directory / "lock"))
-        except Held as error:
+        except LockHeld as error:
             raise CheckpointError(
                 f"another process uses the checkpoint in {directory}; stop it, or give another --checkpoint"
             ) from error
         remove_leftovers(directory)
         remove_leftovers(self._frames)
-        self.ledger = identified(directory)
-        left.remove_half_left(directory, self.ledger.place)
+        self.ledger = ensure_identity(directory)
+        left.remove_incomplete(directory, self.ledger.place)
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
         self._next = self.ledger.next
@@ -92,16 +87,16 @@ class Store:
 
     @property
     def identity(self) -> str:
-        """Of this checkpoint: 32 hexadecimal digits that stay."""
+        """The identity of this checkpoint: 32 hexadecimal digits that never change."""
         return self.ledger.identity or ""
 
     @property
     def names(self) -> set[str]:
-        """Of the frames that are stored."""
+        """The names of the stored frames."""
         return set(self._names)
 
     def names_before(self, number: int) -> set[str]:
-        """Of the stored frames that came before frame `number`."""
+        """Returns the names of the stored frames that came before frame `number`."""
         names = self._names.copy()  # at once: another thread may store a frame meanwhile
         return {name for name, each in names.items() if each < number}
 
@@ -110,11 +105,11 @@ class Store:
         return self._names.get(frame.name) == frame.frame_id
 
     @property
-    def dropped(self) -> list[DroppedFrame]:
+    def frames_dropped(self) -> list[DroppedFrame]:
         return [DroppedFrame(*entry) for entry in self.ledger.dropped]
 
     @property
-    def seen(self) -> list[tuple[str, int]]:
+    def frame_keys(self) -> list[tuple[str, int]]:
         """Session and sequence of the frames that were taken, which need not be sent again."""
         return [*self.ledger.gone, *self._keys.values()]
 
@@ -125,7 +120,7 @@ class Store:
 
     def _read_frames(self) -> Iterator[StoredFrame]:
         """The stored frames; a damaged one is renamed and logged, one that is there already left alone."""
-        for path in own_files(self._frames, FILE, ".frame"):
+        for path in list_own_files(self._frames, FILE, ".frame"):
             number = int(path.stem)
             try:
                 self._next = max(self._next, number + 1)
@@ -144,7 +139,7 @@ class Store:
             self._remember(stored)
             yield stored
 
-    def put(self, received: ReceivedFrame) -> StoredFrame | None:
+    def add_frame(self, received: ReceivedFrame) -> StoredFrame | None:
         """Returns when the frame is on the disk, under a name that no other has; None for one that was dropped.
 
         Raises OSError where the disk does not take it.
@@ -152,10 +147,10 @@ class Store:
         key, frame = (received.session, received.sequence), received.frame
         with self._writing:
             if isinstance(frame, DroppedFrame):
-                self._leave_out({}, key, (frame.name, frame.reason))
+                self._drop_frame({}, key, (frame.name, frame.reason))
                 return None
             number = self._next
-            name = self._unused(frame.name, number)
+            name = self._make_unique_name(frame.name, number)
             write_frame(self._frames / file_name(number), key, replace(frame, name=name))
             stored = StoredFrame(number, key, replace(frame, frame_id=number, name=name, encoded=None))
             self._next = number + 1
@@ -167,21 +162,21 @@ class Store:
         with self._writing:
             if name in self._names:
                 number = self._names[name]
-                self._leave_out({number: name}, self._keys[number], (name, reason))
+                self._drop_frame({number: name}, self._keys[number], (name, reason))
 
-    def retract_elsewhere(self, name: str, scenes: Iterable[str]) -> None:
+    def request_removal(self, name: str, scenes: Iterable[str]) -> None:
         """Records that these scenes, whose places were left, are to lose a frame. Raises OSError."""
         with self._writing:
             retracted = dict.fromkeys((*self.ledger.retracted, *((scene, name) for scene in scenes)))
             self._write(msgspec.structs.replace(self.ledger, retracted=tuple(retracted)))
 
-    def was_retracted(self, scene: str, name: str) -> None:
+    def confirm_removal(self, scene: str, name: str) -> None:
         """Records that the scene has lost the frame. Raises OSError."""
         with self._writing:
             retracted = tuple(each for each in self.ledger.retracted if each != (scene, name))
             self._write(msgspec.structs.replace(self.ledger, retracted=retracted))
 
-    def leave_place(self, first: int, shared: Collection[str] = ()) -> None:
+    def leave_submap(self, first: int, shared: Collection[str] = ()) -> None:
         """Begins another place as `begin_place` does, and keeps what there is of the present one. Raises OSError.
 
         `shared` are frames from `first` on that belong to both. A death in between leaves the place as it was.
@@ -191,10 +186,10 @@ class Store:
             frames = [f"frames/{file_name(number)}" for number in own]
             made = [name for name in MADE_ANEW if (self.directory / name).exists()]
             ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None, retracted=())
-            left.keep(self.directory, ledger, [*frames, *made], _INSTEAD)
-            self.begin_place(first, shared)
+            left.link_left_checkpoint(self.directory, ledger, [*frames, *made], _INSTEAD)
+            self.begin_submap(first, shared)
 
-    def part(self, names: Collection[str], present: bool = False) -> str:
+    def split_off(self, names: Collection[str], present: bool = False) -> str:
         """Makes a place of its own of frames of this place, forgets them, and returns its id. Raises OSError.
 
         It waits among the places that were left. `present`: this place is where the camera is, else it was left, too.
@@ -211,12 +206,12 @@ class Store:
             }
             ledger = msgspec.structs.replace(self.ledger, next=self._next, identity=None, retracted=(), **began)
             frames = [f"frames/{file_name(number)}" for number in numbers]
-            left.part(self.directory, ledger, frames, _INSTEAD, present)
+            left.link_split_checkpoint(self.directory, ledger, frames, _INSTEAD, present)
             for name in names:
                 self.forget(name, f"it shows another place: {ledger.scene_id}")
             return ledger.scene_id
 
-    def begin_place(self, first: int, shared: Collection[str] = ()) -> None:
+    def begin_submap(self, first: int, shared: Collection[str] = ()) -> None:
         """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError.
 
         It goes on from the present one where they have `shared` frames.
@@ -237,23 +232,23 @@ class Store:
         made_anew.save(self.directory, name, header, arrays)
 
     def load(self, name: str, schema: Any) -> Message[Any] | None:
-        """What `save` wrote under this name; None where it is missing or damaged."""
+        """Loads what `save` wrote under this name; None where it is missing or damaged."""
         return made_anew.load(self.directory, name, schema)
 
-    def remove_shown(self) -> None:
+    def remove_scene_files(self) -> None:
         """Removes what only a scene that grows has need of. Raises OSError."""
         made_anew.remove(self.directory, *made_anew.SHOWN)
 
-    def finish(self) -> None:
+    def finalize(self) -> None:
         """Takes a place that was left among the finished ones. Nothing is read or written here afterwards.
 
         Raises OSError.
         """
-        left.finish(self.directory, _INSTEAD)
+        left.move_to_finished(self.directory, _INSTEAD)
 
-    def _leave_out(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
+    def _drop_frame(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
         ledger = self.ledger
-        shown = printable(dropped[0], LONGEST_NAME), printable(dropped[1])
+        shown = sanitize_text(dropped[0], LONGEST_NAME), sanitize_text(dropped[1])
         self._write(
             msgspec.structs.replace(
                 ledger,
@@ -280,7 +275,7 @@ class Store:
         self._names[stored.frame.name] = stored.number
         self._keys[stored.number] = stored.key
 
-    def _unused(self, name: str, number: int) -> str:
+    def _make_unique_name(self, name: str, number: int) -> str:
         """The name, or one made of it that no other frame has."""
         further = (f"{number:06d}-{copy}-{name}" for copy in itertools.count(2))
         names = (each[:LONGEST_NAME] for each in itertools.chain((name, f"{number:06d}-{name}"), further))

@@ -13,7 +13,7 @@ from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
-from splatnode.capture.left_out import or_left_out
+from splatnode.capture.left_out import make_optional_field
 from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import WireError, decode, encode
@@ -55,10 +55,10 @@ def file_name(number: int) -> str:
 
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
-    moved = or_left_out(frame.given_pose), or_left_out(frame.motion), or_left_out(frame.gravity)
-    baseline = or_left_out(frame.right and frame.right.baseline)
+    moved = make_optional_field(frame.given_pose), make_optional_field(frame.motion), make_optional_field(frame.gravity)
+    baseline = make_optional_field(frame.right and frame.right.baseline)
     known = frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at
-    header = FrameRecord(VERSION, *key, *known, *moved, or_left_out(frame.exposure), baseline)
+    header = FrameRecord(VERSION, *key, *known, *moved, make_optional_field(frame.exposure), baseline)
     write_message(path, encode(header, arrays_of(frame)))
 
 

@@ -23,14 +23,14 @@ from torch import Tensor
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
-from splatnode.recon.evaluate.appearance import Splats
+from splatnode.recon.evaluate.appearance import GaussianAppearance
 from splatnode.recon.evaluate.rivals import colmap_3dgs, known_depth, outcome
 from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.priors.pointmap import world_points
+from splatnode.recon.priors.pointmap import compute_world_points
 from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.gaussians import Gaussians
@@ -60,34 +60,34 @@ _TOGETHER = msgspec.structs.replace(
 def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None) -> Iterator[Snapshot]:
     """Snapshots of the scene while all frames refine it; one refusal where fewer than three have a depth."""
     settings = config or Config()
-    return known_depth.optimised(
-        frames, seed, lambda known, clock: _frame_by_frame(frames, known, seed, settings, clock)
+    return known_depth.optimize_with_depth(
+        frames, seed, lambda known, clock: _reconstruct_frame_by_frame(frames, known, seed, settings, clock)
     )
 
 
-def _frame_by_frame(
+def _reconstruct_frame_by_frame(
     frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: Config, clock: Clock
 ) -> Iterator[Snapshot]:
-    scene = Scene((_view(known[0], np.eye(4)),), _from_depth(known[0], np.eye(4), config))
+    scene = Scene((_make_training_view(known[0], np.eye(4)),), _initialize_from_depth(known[0], np.eye(4), config))
     for frame, following in pairwise(known):
-        T_world_camera = _next_pose(frame, scene.views[-1], following, seed, config)
-        scene = replace(scene, views=(*scene.views, _view(following, T_world_camera)))
-        scene = _refined(scene, _TOGETHER, config.growing, seed)
+        T_world_camera = _estimate_next_pose(frame, scene.views[-1], following, seed, config)
+        scene = replace(scene, views=(*scene.views, _make_training_view(following, T_world_camera)))
+        scene = _refine_scene(scene, _TOGETHER, config.growing, seed)
     clock.lap("poses")
     together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
-    refined = refinement.refine(scene, colmap_3dgs.in_parts_of_extent(together, scene), seed=seed)
-    yield from (outcome.snapshot_of(frames, each) for each in refined)
+    refined = refinement.refine(scene, colmap_3dgs.scale_rates_to_extent(together, scene), seed=seed)
+    yield from (outcome.make_snapshot(frames, each) for each in refined)
 
 
-def _next_pose(
+def _estimate_next_pose(
     frame: FrameWithDepth, view: TrainingView, following: FrameWithDepth, seed: int, config: Config
 ) -> np.ndarray:
     """(4, 4) T_world_camera from which the Gaussians of `frame` alone look like the following frame."""
     T_world_camera = view.T_world_camera.double().numpy()
-    alone = Scene((view,), _from_depth(frame, T_world_camera, config))
-    fitted = _refined(alone, _ALONE, config.alone, seed)
+    alone = Scene((view,), _initialize_from_depth(frame, T_world_camera, config))
+    fitted = _refine_scene(alone, _ALONE, config.alone, seed)
     image = torch.from_numpy(following.image).float() / 255.0
-    look = _Alone(fitted.arrays(), rasterize)
+    look = _SingleFrameAppearance(fitted.arrays(), rasterize)
     aligned = find_test_pose(
         look,
         image,
@@ -102,7 +102,7 @@ def _next_pose(
     return aligned.T_world_camera
 
 
-class _Alone(Splats):
+class _SingleFrameAppearance(GaussianAppearance):
     """Gaussians of a single frame: another one is compared with them where they are, and not beside its border."""
 
     def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor, used: Tensor | None = None) -> Tensor:
@@ -114,24 +114,24 @@ class _Alone(Splats):
         return ((render.rgb - image).abs() * covered).sum() / (3 * covered.sum().clamp_min(1))
 
 
-def _refined(scene: Scene, config: refinement.Config, iterations: int, seed: int) -> Scene:
+def _refine_scene(scene: Scene, config: refinement.RefinementConfig, iterations: int, seed: int) -> Scene:
     """One view has no extent: lengths are then in parts of its depth, which is about 1."""
     config = msgspec.structs.replace(config, iterations=iterations)
     if len(scene.views) > 1:
-        config = colmap_3dgs.in_parts_of_extent(config, scene)
+        config = colmap_3dgs.scale_rates_to_extent(config, scene)
     (last,) = deque(refinement.refine(scene, config, seed=seed), maxlen=1)
     return last
 
 
-def _view(frame: FrameWithDepth, T_world_camera: np.ndarray) -> TrainingView:
+def _make_training_view(frame: FrameWithDepth, T_world_camera: np.ndarray) -> TrainingView:
     T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(frame.K).float()
     return TrainingView(frame.name, frame.frame_id, frame.image, T, K, mask=frame.mask)
 
 
-def _from_depth(frame: FrameWithDepth, T_world_camera: np.ndarray, config: Config) -> Gaussians:
+def _initialize_from_depth(frame: FrameWithDepth, T_world_camera: np.ndarray, config: Config) -> Gaussians:
     """A Gaussian for every `stride`-th pixel of every such row that is used."""
     chosen = slice(config.stride // 2, None, config.stride), slice(config.stride // 2, None, config.stride)
-    points = world_points(frame.depth, T_world_camera, frame.K)[chosen].reshape(-1, 3)
+    points = compute_world_points(frame.depth, T_world_camera, frame.K)[chosen].reshape(-1, 3)
     rgb = (frame.image[chosen].reshape(-1, 3) / 255.0).astype(np.float32)
     if frame.mask is not None:
         used = frame.mask[chosen].reshape(-1)

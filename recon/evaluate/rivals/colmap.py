@@ -26,7 +26,7 @@ Pair = tuple[str, str]  # of images, by their names
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
+class ImageFeatures:
     """The features of an image."""
 
     keypoints: npt.NDArray[np.float32]
@@ -34,14 +34,14 @@ class Described:
 
 
 @dataclass(frozen=True, eq=False)
-class Matched:
+class PairMatches:
     """The matches of two images, and what they agree on."""
 
     matches: npt.NDArray[np.uint32]
     geometry: pycolmap.TwoViewGeometry
 
 
-NOTHING_KNOWN: Mapping[str, Described] = MappingProxyType({})
+NOTHING_KNOWN: Mapping[str, ImageFeatures] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class RegisteredFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class SparseModel:
     """The largest model. The world is the first registered camera's frame; the points' median depth there is 1."""
 
     registered: tuple[RegisteredFrame, ...]  # in the order of the frames
@@ -63,14 +63,14 @@ class Model:
     observed: tuple[npt.NDArray[np.int64], ...]  # for each registered frame, the points that it observes
 
 
-def incremental(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
+def map_incrementally(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
     """COLMAP's incremental mapper (Schönberger and Frahm 2016)."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     return pycolmap.incremental_mapping(folder / "database.db", folder / "images", folder / "models", options)
 
 
-def global_(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
+def map_globally(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
     """Global mapping after a calibration of the view graph, as GLOMAP does it (Pan et al. 2024)."""
     options = pycolmap.GlobalPipelineOptions()
     options.random_seed = seed
@@ -78,25 +78,27 @@ def global_(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
     return pycolmap.global_mapping(folder / "database.db", folder / "images", folder / "models", options)
 
 
-def sparse_model(frames: Sequence[Frame], seed: int, mapping: Mapper = incremental) -> Model | None:
+def reconstruct_sparse_model(
+    frames: Sequence[Frame], seed: int, mapping: Mapper = map_incrementally
+) -> SparseModel | None:
     """The largest model that `mapping` makes of the frames; None where it makes none."""
     if len(frames) < 2:
         return None
-    named = image_names(frames)
+    named = name_images(frames)
     with TemporaryDirectory(prefix="splatnode-rival-") as name:
         folder = Path(name)
         extract_features(folder, named, seed)
         pycolmap.match_exhaustive(folder / "database.db", device=pycolmap.Device.cpu)
-        return largest_model(folder, named, seed, mapping)
+        return map_largest_model(folder, named, seed, mapping)
 
 
-def image_names(frames: Sequence[Frame]) -> dict[str, Frame]:
+def name_images(frames: Sequence[Frame]) -> dict[str, Frame]:
     """The frames by the names of their image files: a folder for each size."""
     return {f"{frame.width}x{frame.height}/{number:04d}.png": frame for number, frame in enumerate(frames)}
 
 
 def extract_features(
-    folder: Path, named: Mapping[str, Frame], seed: int, known: Mapping[str, Described] = NOTHING_KNOWN
+    folder: Path, named: Mapping[str, Frame], seed: int, known: Mapping[str, ImageFeatures] = NOTHING_KNOWN
 ) -> None:
     """Writes the images of the frames to `folder`/images, and their features to `folder`/database.db.
 
@@ -125,12 +127,12 @@ def extract_features(
         pycolmap.extract_features(**images, camera_mode=one_camera, reader_options=options, device=pycolmap.Device.cpu)
 
 
-def match_pairs(folder: Path, pairs: Sequence[Pair], seed: int, known: Mapping[Pair, Matched]) -> None:
+def match_pairs(folder: Path, pairs: Sequence[Pair], seed: int, known: Mapping[Pair, PairMatches]) -> None:
     """Matches these pairs of the images whose features `folder`/database.db holds, but for those that are `known`.
 
     What comes of a pair depends on no other one.
     """
-    with _opened(folder) as (database, ids):
+    with _open_database(folder) as (database, ids):
         for (first, second), found in known.items():
             database.write_matches(ids[first], ids[second], found.matches)
             database.write_two_view_geometry(ids[first], ids[second], found.geometry)
@@ -145,34 +147,35 @@ def match_pairs(folder: Path, pairs: Sequence[Pair], seed: int, known: Mapping[P
     )
 
 
-def features(folder: Path, names: Collection[str]) -> dict[str, Described]:
-    """What `folder`/database.db holds of these images."""
-    with _opened(folder) as (database, ids):
+def read_features(folder: Path, names: Collection[str]) -> dict[str, ImageFeatures]:
+    """Reads the features of these images from `folder`/database.db."""
+    with _open_database(folder) as (database, ids):
         return {
-            name: Described(database.read_keypoints(ids[name]), database.read_descriptors(ids[name])) for name in names
+            name: ImageFeatures(database.read_keypoints(ids[name]), database.read_descriptors(ids[name]))
+            for name in names
         }
 
 
-def matches(folder: Path, pairs: Collection[Pair]) -> dict[Pair, Matched]:
-    """What `folder`/database.db holds of these pairs of images."""
-    with _opened(folder) as (database, ids):
+def read_matches(folder: Path, pairs: Collection[Pair]) -> dict[Pair, PairMatches]:
+    """Reads the matches of these pairs of images from `folder`/database.db."""
+    with _open_database(folder) as (database, ids):
         return {
-            (first, second): Matched(
+            (first, second): PairMatches(
                 database.read_matches(ids[first], ids[second]), database.read_two_view_geometry(ids[first], ids[second])
             )
             for first, second in pairs
         }
 
 
-def _write_features(folder: Path, known: Mapping[str, Described]) -> None:
-    with _opened(folder) as (database, ids):
+def _write_features(folder: Path, known: Mapping[str, ImageFeatures]) -> None:
+    with _open_database(folder) as (database, ids):
         for name, found in known.items():
             database.write_keypoints(ids[name], found.keypoints)
             database.write_descriptors(ids[name], found.descriptors)
 
 
 @contextlib.contextmanager
-def _opened(folder: Path) -> Iterator[tuple[pycolmap.Database, dict[str, int]]]:
+def _open_database(folder: Path) -> Iterator[tuple[pycolmap.Database, dict[str, int]]]:
     """The database of a folder, and the numbers of its images by their names."""
     database = pycolmap.Database.open(folder / "database.db")
     try:
@@ -181,7 +184,7 @@ def _opened(folder: Path) -> Iterator[tuple[pycolmap.Database, dict[str, int]]]:
         database.close()
 
 
-def largest_model(folder: Path, named: Mapping[str, Frame], seed: int, mapping: Mapper) -> Model | None:
+def map_largest_model(folder: Path, named: Mapping[str, Frame], seed: int, mapping: Mapper) -> SparseModel | None:
     """The largest model that `mapping` makes of the images in `folder`/database.db, which are those of `named`.
 
     A model without points is none: it has no size.
@@ -192,13 +195,13 @@ def largest_model(folder: Path, named: Mapping[str, Frame], seed: int, mapping: 
     models = mapping(folder, seed)
     solid = [model for model in models.values() if model.num_points3D() > 0]
     largest = max(solid, key=lambda model: model.num_reg_images(), default=None)
-    return None if largest is None else _model(largest, named)
+    return None if largest is None else _convert_model(largest, named)
 
 
-def _model(found: pycolmap.Reconstruction, named: Mapping[str, Frame]) -> Model:
+def _convert_model(found: pycolmap.Reconstruction, named: Mapping[str, Frame]) -> SparseModel:
     by_name = {image.name: image for image in found.images.values() if image.has_pose}
     images = [(frame, by_name[name]) for name, frame in named.items() if name in by_name]
-    Ts = np.stack([_inverse(image.cam_from_world().matrix()) for _, image in images])
+    Ts = np.stack([_invert_pose(image.cam_from_world().matrix()) for _, image in images])
     place = {point_id: row for row, point_id in enumerate(found.points3D)}
     points = np.array([point.xyz for point in found.points3D.values()], np.float64).reshape(-1, 3)
     observed = tuple(
@@ -209,9 +212,9 @@ def _model(found: pycolmap.Reconstruction, named: Mapping[str, Frame]) -> Model:
     depths = [(points[seen] - T[:3, 3]) @ T[:3, 2] for seen, T in zip(observed, Ts, strict=True)]
     scale = 1.0 / float(np.median(np.concatenate(depths)))
     Ts[:, :3, 3] *= scale
-    return Model(
+    return SparseModel(
         tuple(
-            RegisteredFrame(frame, T, _intrinsics(found.cameras[image.camera_id]))
+            RegisteredFrame(frame, T, _convert_intrinsics(found.cameras[image.camera_id]))
             for (frame, image), T in zip(images, Ts, strict=True)
         ),
         scale * points,
@@ -220,7 +223,7 @@ def _model(found: pycolmap.Reconstruction, named: Mapping[str, Frame]) -> Model:
     )
 
 
-def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
+def _convert_intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     """OpenCV's first two radial coefficients are those of COLMAP's SIMPLE_RADIAL and RADIAL."""
     K = camera.calibration_matrix()
     radial = [float(camera.params[index]) for index in camera.extra_params_idxs()]
@@ -228,5 +231,5 @@ def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     return Intrinsics(camera.width, camera.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "estimated", distortion)
 
 
-def _inverse(T_camera_world: Array) -> Array:
+def _invert_pose(T_camera_world: Array) -> Array:
     return np.linalg.inv(np.vstack([T_camera_world, [0.0, 0.0, 0.0, 1.0]]))

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
-from splatnode.recon.evaluate.rivals.colmap import Model, RegisteredFrame, sparse_model
-from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
+from splatnode.recon.evaluate.rivals.colmap import RegisteredFrame, SparseModel, reconstruct_sparse_model
+from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.optimize import dropout, refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
@@ -31,7 +31,7 @@ from splatnode.recon.scene.scene import Scene, TrainingView
 SIZE = 512  # longer side of the photographs, pixels
 _OPACITY = 0.1  # of a Gaussian that starts from a point
 
-RATES = refinement.Rates(
+RATES = refinement.LearningRates(
     means=1.6e-4,  # times the extent of the scene
     means_unit="depth",
     quats=1e-3,
@@ -41,11 +41,11 @@ RATES = refinement.Rates(
     final_means=0.01,
     final=1.0,
 )
-OPTIMIZE = refinement.Config(
+OPTIMIZE = refinement.RefinementConfig(
     iterations=1500,
     checkpoints=(250, 900),
     dssim=0.2,
-    dropout=dropout.Config(share=0.0),
+    dropout=dropout.DropoutConfig(share=0.0),
     refine_poses=False,
     rates=RATES,
     control=ControlChoice("adaptive", adaptive.Config()),
@@ -64,45 +64,50 @@ PUBLISHED = msgspec.structs.replace(
 )
 
 
-def reconstruct(frames: Sequence[Frame], seed: int, config: refinement.Config = OPTIMIZE) -> Iterator[Snapshot]:
+def reconstruct(
+    frames: Sequence[Frame], seed: int, config: refinement.RefinementConfig = OPTIMIZE
+) -> Iterator[Snapshot]:
     """Snapshots of the scene while it is optimised; one refusal where COLMAP places fewer than three frames."""
-    yield from optimised(frames, seed, config, begin)
+    yield from optimize_sparse_model(frames, seed, config, initialize_scene)
 
 
-def optimised(
-    frames: Sequence[Frame], seed: int, config: refinement.Config, beginning: Callable[[Model, int], Scene]
+def optimize_sparse_model(
+    frames: Sequence[Frame],
+    seed: int,
+    config: refinement.RefinementConfig,
+    beginning: Callable[[SparseModel, int], Scene],
 ) -> Iterator[Snapshot]:
     """The same from what `beginning` makes of COLMAP's model and the seed."""
     clock = Clock()
-    model = sparse_model(frames, seed)
+    model = reconstruct_sparse_model(frames, seed)
     clock.lap("poses")
     if model is None or len(model.registered) < outcome.MIN_CAMERAS:
-        yield outcome.refused(frames, clock)
+        yield outcome.make_refusal(frames, clock)
         return
     scene = beginning(model, seed)
     clock.lap("points")
-    refined = refinement.refine(scene, in_parts_of_extent(config, scene), seed=seed)
-    yield from outcome.numbered((outcome.snapshot_of(frames, each) for each in refined), clock)
+    refined = refinement.refine(scene, scale_rates_to_extent(config, scene), seed=seed)
+    yield from outcome.number_snapshots((outcome.make_snapshot(frames, each) for each in refined), clock)
 
 
-def begin(model: Model, _seed: int) -> Scene:
+def initialize_scene(model: SparseModel, _seed: int) -> Scene:
     """The model's cameras, and a Gaussian for each of its points."""
     rgb = (model.colours / 255.0).astype(np.float32)
     first_seen = np.zeros(len(model.points), np.int32)
     for registered, seen in reversed(list(zip(model.registered, model.observed, strict=True))):
         first_seen[seen] = registered.frame.frame_id
     gaussians = gaussians_at(model.points.astype(np.float32), rgb, first_seen, _OPACITY)
-    return Scene(tuple(map(view, model.registered)), gaussians)
+    return Scene(tuple(map(make_training_view, model.registered)), gaussians)
 
 
-def view(registered: RegisteredFrame) -> TrainingView:
+def make_training_view(registered: RegisteredFrame) -> TrainingView:
     """A registered frame without its lens' distortion, at modelled size; what its mask hides is not fitted."""
-    frame = undistorted(replace(registered.frame, intrinsics=registered.intrinsics))
+    frame = undistort_frame(replace(registered.frame, intrinsics=registered.intrinsics))
     assert frame.intrinsics is not None  # COLMAP's
-    image = modelled_image(frame.image, SIZE)
+    image = resize_image(frame.image, SIZE)
     K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
     T_world_camera = torch.from_numpy(registered.T_world_camera).float()
-    mask = None if registered.frame.mask is None or frame.mask is None else modelled_mask(frame.mask, *image.shape[:2])
+    mask = None if registered.frame.mask is None or frame.mask is None else resize_mask(frame.mask, *image.shape[:2])
     return TrainingView(
         frame.name,
         frame.frame_id,
@@ -114,7 +119,7 @@ def view(registered: RegisteredFrame) -> TrainingView:
     )
 
 
-def in_parts_of_extent(config: refinement.Config, scene: Scene) -> refinement.Config:
+def scale_rates_to_extent(config: refinement.RefinementConfig, scene: Scene) -> refinement.RefinementConfig:
     """The configuration with the means' step size in parts of the extent of the scene."""
     means = config.rates.means * adaptive.extent([view.T_world_camera for view in scene.views])
     return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, means=means))

@@ -16,7 +16,7 @@ import msgspec
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.rivals import colmap_3dgs
-from splatnode.recon.evaluate.rivals.colmap import Model
+from splatnode.recon.evaluate.rivals.colmap import SparseModel
 from splatnode.recon.optimize import refinement, regularise
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import ControlChoice
@@ -28,7 +28,7 @@ from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene
 
 _WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correlates it
-_DEPTH = regularise.Config(
+_DEPTH = regularise.RegularizerConfig(
     {"depth": LossChoice("depth", depth.Config(0.05, 0.2, 0.95, patch=_WHOLE, share=1.0))}, min_confidence=0.1
 )
 _ADAPTIVE = adaptive.Config(min_gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER)
@@ -41,24 +41,26 @@ PUBLISHED = msgspec.structs.replace(  # as long as in the publication
 )
 
 
-def reconstruct(frames: Sequence[Frame], seed: int, config: refinement.Config = OPTIMIZE) -> Iterator[Snapshot]:
+def reconstruct(
+    frames: Sequence[Frame], seed: int, config: refinement.RefinementConfig = OPTIMIZE
+) -> Iterator[Snapshot]:
     """Snapshots of the scene while it is optimised; one refusal where COLMAP places fewer than three frames."""
-    yield from colmap_3dgs.optimised(frames, seed, config, with_depth)
+    yield from colmap_3dgs.optimize_sparse_model(frames, seed, config, initialize_scene_with_depth)
 
 
-def with_depth(model: Model, seed: int) -> Scene:
+def initialize_scene_with_depth(model: SparseModel, seed: int) -> Scene:
     """The scene that 3DGS starts from, with a depth for every view."""
-    scene = colmap_3dgs.begin(model, seed)
+    scene = colmap_3dgs.initialize_scene(model, seed)
     Ts, Ks = ([getattr(view, name).double().numpy() for view in scene.views] for name in ("T_world_camera", "K"))
     views, sparse = [], []
     for view, T, K, seen in zip(scene.views, Ts, Ks, model.observed, strict=True):
         points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]
         points = points[points[:, 2] > 0]
         pixels = points @ K.T
-        near, far = stereo.depth_range(points[:, 2])
+        near, far = stereo.estimate_depth_range(points[:, 2])
         views.append(stereo.StereoView(view.image, K, T, (near, classical.Config().far_margin * far)))
         sparse.append(stereo.SparsePoints(pixels[:, :2] / pixels[:, 2:], points[:, 2]))
-    maps = stereo.depth_maps(views, stereo.Config(), seed=seed, sparse=sparse)
+    maps = stereo.estimate_depth_maps(views, stereo.StereoConfig(), seed=seed, sparse=sparse)
     known = [
         replace(view, pointmap=Pointmap(view.name, view.frame_id, found.depth, found.confidence, found.normal, T, K))
         for view, found, T, K in zip(scene.views, maps, Ts, Ks, strict=True)

@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate.rivals import outcome
-from splatnode.recon.modelling import begin_scene
+from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.pipeline import estimate_frames
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
@@ -37,7 +37,7 @@ class FrameWithDepth:
     mask: npt.NDArray[np.bool_] | None = None  # (h, w) False: not used; None: all is
 
 
-def optimised(
+def optimize_with_depth(
     frames: Sequence[Frame], seed: int, learnt: Callable[[tuple[FrameWithDepth, ...], Clock], Iterable[Snapshot]]
 ) -> Iterator[Snapshot]:
     """The snapshots that `learnt` makes of the frames with their depth; one refusal where fewer than three have one.
@@ -45,19 +45,19 @@ def optimised(
     The clock is for what `learnt` does before its first snapshot.
     """
     clock = Clock()
-    known = frames_with_depth(frames, seed)
+    known = estimate_frame_depths(frames, seed)
     clock.lap("points")
     if len(known) < outcome.MIN_CAMERAS:
-        yield outcome.refused(frames, clock)
+        yield outcome.make_refusal(frames, clock)
     else:
-        yield from outcome.numbered(learnt(known, clock), clock, _SERVED_BY)
+        yield from outcome.number_snapshots(learnt(known, clock), clock, _SERVED_BY)
 
 
-def frames_with_depth(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDepth, ...]:
+def estimate_frame_depths(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDepth, ...]:
     """The frames whose depth is known, in their order; none where splatnode itself refuses the frames."""
-    config = Config(seed=seed)
+    config = ReconstructionConfig(seed=seed)
     estimate, _ = estimate_frames(frames, config, Clock())
-    begun = begin_scene(estimate, config)
+    begun = create_initial_scene(estimate, config)
     if begun is None:
         return ()
     views = sorted(begun.views, key=lambda view: view.frame_id)
@@ -67,7 +67,7 @@ def frames_with_depth(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDept
             view.name,
             view.frame_id,
             view.image,
-            _everywhere(view.pointmap, view.image),
+            _fill_depth(view.pointmap, view.image),
             view.K.double().numpy(),
             view.mask if view.name in masked else None,
         )
@@ -76,7 +76,7 @@ def frames_with_depth(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDept
     )
 
 
-def _everywhere(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-    settings = completion.Config()
-    known = pointmap.masked(pointmap.confidence >= settings.min_confidence)
+def _fill_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    settings = completion.DepthCompletionConfig()
+    known = pointmap.apply_mask(pointmap.confidence >= settings.min_confidence)
     return np.where(known.depth > 0, known.depth, completion.smooth_depth(known, image, settings)).astype(np.float32)

@@ -17,25 +17,25 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.nerf import fit
-from splatnode.recon.evaluate.rivals.nerf.appearance import snapshot_of_field
+from splatnode.recon.evaluate.rivals.nerf.appearance import make_field_snapshot
 from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
-from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
+from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 SIZE = 256  # longer side of the photographs, pixels
-OPTIMIZE = fit.Config()
+OPTIMIZE = fit.FitConfig()
 
 
-def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZE) -> Iterator[Snapshot]:
+def reconstruct(frames: Sequence[Frame], seed: int, config: fit.FitConfig = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the field while it is learnt."""
     clock = Clock()
     if len(frames) < outcome.MIN_CAMERAS:
-        yield outcome.refused(frames, clock)
+        yield outcome.make_refusal(frames, clock)
         return
-    images = [torch.from_numpy(modelled_image(frame.image, SIZE)).float() / 255.0 for frame in frames]
+    images = [torch.from_numpy(resize_image(frame.image, SIZE)).float() / 255.0 for frame in frames]
     used = [
-        None if frame.mask is None else torch.from_numpy(modelled_mask(frame.mask, *image.shape[:2]))
+        None if frame.mask is None else torch.from_numpy(resize_mask(frame.mask, *image.shape[:2]))
         for frame, image in zip(frames, images, strict=True)
     ]
-    learnt = fit.learn(images, used, Focal(1.0), config, seed=seed)
-    yield from outcome.numbered((snapshot_of_field(frames, frames, each) for each in learnt), clock)
+    learnt = fit.fit_field(images, used, Focal(1.0), config, seed=seed)
+    yield from outcome.number_snapshots((make_field_snapshot(frames, frames, each) for each in learnt), clock)

@@ -20,10 +20,10 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.rivals import known_depth
 from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
 from splatnode.recon.evaluate.rivals.nerf import fit
-from splatnode.recon.evaluate.rivals.nerf.appearance import snapshot_of_field, spread_pixels
+from splatnode.recon.evaluate.rivals.nerf.appearance import make_field_snapshot, sample_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
 from splatnode.recon.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
-from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
+from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 _DEPTH, _CLOUD, _SURFACE = 0.04, 1.0, 1.0  # weights
@@ -31,20 +31,22 @@ _PAIRS_UNTIL = 0.6  # of the run
 _POINTS = 384  # of each view's cloud
 
 
-def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZE) -> Iterator[Snapshot]:
+def reconstruct(frames: Sequence[Frame], seed: int, config: fit.FitConfig = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the field while it is learnt; one refusal where fewer than three frames have a depth."""
-    return known_depth.optimised(frames, seed, lambda known, _clock: _learnt(frames, known, seed, config))
+    return known_depth.optimize_with_depth(
+        frames, seed, lambda known, _clock: _fit_with_depth(frames, known, seed, config)
+    )
 
 
-def _learnt(
-    frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: fit.Config
+def _fit_with_depth(
+    frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: fit.FitConfig
 ) -> Iterator[Snapshot]:
     by_name = {frame.name: frame for frame in frames}
     registered = [by_name[frame.name] for frame in known]
-    views = [_view_with_depth(frame) for frame in known]
+    views = [_make_view_with_depth(frame) for frame in known]
     focal = Focal(float(np.mean([frame.K[0, 0] / max(frame.image.shape) for frame in known]))).requires_grad_(False)
     terms = ExtraLosses(views, focal)
-    learnt = fit.learn(
+    learnt = fit.fit_field(
         [view.image for view in views],
         [view.used for view in views],
         focal,
@@ -53,7 +55,7 @@ def _learnt(
         further=terms,
         beside=(terms.scales, terms.offsets),
     )
-    yield from (snapshot_of_field(frames, registered, each) for each in learnt)
+    yield from (make_field_snapshot(frames, registered, each) for each in learnt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +65,10 @@ class ViewWithDepth:
     used: Tensor | None = None  # (h, w) where its colours count; None: everywhere
 
 
-def _view_with_depth(frame: FrameWithDepth) -> ViewWithDepth:
-    image = modelled_image(frame.image, SIZE)
+def _make_view_with_depth(frame: FrameWithDepth) -> ViewWithDepth:
+    image = resize_image(frame.image, SIZE)
     depth = cv2.resize(frame.depth, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
-    used = None if frame.mask is None else torch.from_numpy(modelled_mask(frame.mask, *image.shape[:2]))
+    used = None if frame.mask is None else torch.from_numpy(resize_mask(frame.mask, *image.shape[:2]))
     depth = torch.from_numpy(depth / np.float32(np.median(depth))).float()
     return ViewWithDepth(torch.from_numpy(image).float() / 255.0, depth, used)
 
@@ -79,7 +81,7 @@ class ExtraLosses:
         self.scales = nn.Parameter(torch.ones(len(views) - 1))
         self.offsets = nn.Parameter(torch.zeros(len(views) - 1))
 
-    def __call__(self, step: fit.Step) -> Tensor:
+    def __call__(self, step: fit.FitStep) -> Tensor:
         columns, rows = step.pixels.long().unbind(1)
         loss = _DEPTH * (step.rays.depth - self._depth(step.view)[rows, columns]).abs().mean()
         if step.progress >= _PAIRS_UNTIL:
@@ -87,10 +89,14 @@ class ExtraLosses:
         first = min(step.view, len(self._views) - 2)
         Ts = [step.cameras.T_world_camera(index) for index in (first, first + 1)]
         T_second_first = torch.linalg.inv(Ts[1]) @ Ts[0]
-        cloud = self.cloud(first) @ T_second_first[:3, :3].T + T_second_first[:3, 3]
-        return loss + _CLOUD * chamfer(cloud, self.cloud(first + 1)) + _SURFACE * self.surface(first, cloud)
+        cloud = self.compute_cloud(first) @ T_second_first[:3, :3].T + T_second_first[:3, 3]
+        return (
+            loss
+            + _CLOUD * compute_chamfer_distance(cloud, self.compute_cloud(first + 1))
+            + _SURFACE * self.compute_surface_loss(first, cloud)
+        )
 
-    def surface(self, first: int, cloud: Tensor) -> Tensor:
+    def compute_surface_loss(self, first: int, cloud: Tensor) -> Tensor:
         """Mean difference between a view's colours and the next one's where that sees them, `cloud` (M, 3)."""
         view, other = self._views[first], self._views[first + 1]
         pixels = (cloud @ self._K(other).T)[:, :2] / cloud[:, 2:].clamp_min(1e-3)
@@ -99,14 +105,14 @@ class ExtraLosses:
         grid = (2 * pixels / size - 1)[None, None]
         colours = other.image.permute(2, 0, 1)[None]
         shown = functional.grid_sample(colours, grid, padding_mode="border", align_corners=False)[0, :, 0].T
-        columns, rows = _pixels(view).long().unbind(1)
+        columns, rows = _sample_pixels(view).long().unbind(1)
         difference = (shown - view.image[rows, columns]).abs().mean(1)
         return (difference * inside).sum() / inside.sum().clamp_min(1)
 
-    def cloud(self, index: int) -> Tensor:
+    def compute_cloud(self, index: int) -> Tensor:
         """(M, 3) points of a view in its camera's frame."""
         view = self._views[index]
-        pixels, K = _pixels(view), self._K(view)
+        pixels, K = _sample_pixels(view), self._K(view)
         columns, rows = pixels.long().unbind(1)
         rays = torch.cat([(pixels - K[:2, 2]) / torch.diagonal(K)[:2], torch.ones_like(pixels[:, :1])], 1)
         return rays * self._depth(index)[rows, columns][:, None]
@@ -119,11 +125,11 @@ class ExtraLosses:
         return self._focal.K(view.image.shape[1], view.image.shape[0])
 
 
-def chamfer(a: Tensor, b: Tensor) -> Tensor:
+def compute_chamfer_distance(a: Tensor, b: Tensor) -> Tensor:
     """Mean distance of points (M, 3) to the nearest of the others (N, 3), and the other way round."""
     distances = torch.cdist(a, b)
     return distances.amin(1).mean() + distances.amin(0).mean()
 
 
-def _pixels(view: ViewWithDepth) -> Tensor:
-    return spread_pixels(view.image.shape[1], view.image.shape[0], _POINTS)
+def _sample_pixels(view: ViewWithDepth) -> Tensor:
+    return sample_pixels(view.image.shape[1], view.image.shape[0], _POINTS)

@@ -15,8 +15,8 @@ from splatnode.recon.scene.scene import Scene
 MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
 
 
-def verdict(frames: Sequence[Frame], registered: Collection[str]) -> Verdict:
-    """What to say when cameras of the frames named `registered` were found."""
+def make_verdict(frames: Sequence[Frame], registered: Collection[str]) -> Verdict:
+    """Returns the verdict where cameras of the frames named `registered` were found."""
     missing = tuple(frame.name for frame in frames if frame.name not in registered)
     sentence = f"{len(registered)} of {len(frames)} photographs were placed."
     if len(registered) < MIN_CAMERAS:
@@ -24,26 +24,26 @@ def verdict(frames: Sequence[Frame], registered: Collection[str]) -> Verdict:
     return Verdict(Code.OK_PARTIAL if missing else Code.OK, sentence, "", missing, publishable=True)
 
 
-def refused(frames: Sequence[Frame], clock: Clock) -> Snapshot:
+def make_refusal(frames: Sequence[Frame], clock: Clock) -> Snapshot:
     """No scene, because too few cameras were found."""
     return Snapshot(
         sequence=1,
-        verdict=verdict(frames, ()),
+        verdict=make_verdict(frames, ()),
         cameras=(),
         gaussians=GaussianArrays.empty(),
         images={},
         dropped=(),
         iterations=0,
-        seconds=clock.booked,
+        seconds=clock.stage_seconds,
         final=True,
     )
 
 
-def snapshot_of(frames: Sequence[Frame], scene: Scene) -> Snapshot:
-    """What is published of Gaussians and the cameras that they were fitted with."""
+def make_snapshot(frames: Sequence[Frame], scene: Scene) -> Snapshot:
+    """Makes the snapshot of Gaussians and the cameras that they were fitted with."""
     return Snapshot(
         sequence=0,
-        verdict=verdict(frames, {view.name for view in scene.views}),
+        verdict=make_verdict(frames, {view.name for view in scene.views}),
         cameras=scene.cameras(),
         gaussians=scene.arrays(),
         images={},
@@ -53,7 +53,7 @@ def snapshot_of(frames: Sequence[Frame], scene: Scene) -> Snapshot:
     )
 
 
-def numbered(
+def number_snapshots(
     snapshots: Iterable[Snapshot], clock: Clock, served_by: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[Snapshot]:
     """The snapshots that an optimisation gives, numbered and timed as "optimise", and the last one again as final.
@@ -63,7 +63,9 @@ def numbered(
     last = None
     for sequence, snapshot in enumerate(snapshots, 1):
         clock.lap("optimise")
-        last = replace(snapshot, sequence=sequence, seconds=clock.booked, served_by={**snapshot.served_by, **served_by})
+        last = replace(
+            snapshot, sequence=sequence, seconds=clock.stage_seconds, served_by={**snapshot.served_by, **served_by}
+        )
         yield last
         clock.lap("wait")
     assert last is not None  # an optimisation gives its end

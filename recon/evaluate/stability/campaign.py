@@ -12,18 +12,18 @@ from pathlib import Path
 import msgspec
 
 from splatnode.recon.evaluate.json_file import read_json
-from splatnode.recon.evaluate.kept import Kept
-from splatnode.recon.evaluate.records import this_machine
-from splatnode.recon.evaluate.stability.case import Case, Row
-from splatnode.recon.evaluate.stability.places import Places, Sampler
-from splatnode.recon.evaluate.stability.summary import report
-from splatnode.recon.evaluate.stability.trial import FAILED, Trial, judged, reconstructed
+from splatnode.recon.evaluate.kept import Journal
+from splatnode.recon.evaluate.records import describe_machine
+from splatnode.recon.evaluate.stability.case import MatrixRow, TrialCase
+from splatnode.recon.evaluate.stability.places import Sampler, ScenesByMotion
+from splatnode.recon.evaluate.stability.summary import make_report
+from splatnode.recon.evaluate.stability.trial import FAILED, Trial, judge_trial, run_trial
 from splatnode.recon.evaluate.timing import check_same_cores
-from splatnode.recon.jobs.call import packed
+from splatnode.recon.jobs.call import pack_call
 from splatnode.recon.jobs.calls import Engine, Task, work_folder
 from splatnode.recon.jobs.child import Limits
 from splatnode.recon.result.export.staged import json_bytes, write_files
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.folder import hold_result_folder
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ Key = tuple[int, str, int, str]
 
 @dataclass(frozen=True)
 class Plan:
-    rows: tuple[Row, ...]
+    rows: tuple[MatrixRow, ...]
     seeds: tuple[int, ...]
     methods: tuple[str, ...]
     timeout_s: float = 120.0  # of one trial, from the start of its process on
@@ -40,17 +40,17 @@ class Plan:
 
 
 @dataclass(frozen=True, eq=False)
-class _About:
+class _TrialContext:
     """A trial that is under way; its case is without photographs."""
 
     row: int
     name: str
     seed: int
     method: str
-    case: Case
+    case: TrialCase
 
 
-def run_campaign(plan: Plan, places: Places, out: Path, command: str, engine: Engine) -> list[dict]:
+def run_campaign(plan: Plan, places: ScenesByMotion, out: Path, command: str, engine: Engine) -> list[dict]:
     """Runs what is missing in `out`/stability.json and returns all its trials.
 
     What came to an end is on the disk at once, in a journal beside the file, which is rewritten every few seconds.
@@ -59,29 +59,29 @@ def run_campaign(plan: Plan, places: Places, out: Path, command: str, engine: En
     """
     path = out / "stability.json"
     scenes = [place.name for kind in (places.walked, places.forward, places.turned) for place in kind]
-    trials = _resumed(path, scenes, engine.cores_each)
-    whole = partial(_write, path, plan, trials, {"scenes": scenes, "machine": this_machine(), "command": command})
-    with result_folder(out), work_folder(out) as folder:
+    trials = _resume_trials(path, scenes, engine.cores_each)
+    whole = partial(_write, path, plan, trials, {"scenes": scenes, "machine": describe_machine(), "command": command})
+    with hold_result_folder(out), work_folder(out) as folder:
         if not path.exists():
             whole()  # which scenes the journal is of
-        with Kept(out / "stability.jsonl", whole) as kept:
-            known = set(map(_key, trials))
-            trials += [trial for trial in kept.left() if _key(trial) not in known]
-            present = set(map(_key, trials))
-            todo = [job for job in _jobs(plan) if (job[0].number, job[0].name, *job[1:]) not in present]
-            for trial in _results(plan, places, todo, engine, folder):
+        with Journal(out / "stability.jsonl", whole) as kept:
+            known = set(map(_make_key, trials))
+            trials += [trial for trial in kept.recover_records() if _make_key(trial) not in known]
+            present = set(map(_make_key, trials))
+            todo = [job for job in _list_jobs(plan) if (job[0].number, job[0].name, *job[1:]) not in present]
+            for trial in _run_jobs(plan, places, todo, engine, folder):
                 trials.append(asdict(trial))
                 kept.add(trials[-1])
-                logger.info(f"stability {len(trials)}/{len(present) + len(todo)}: {_line(trial)}")
+                logger.info(f"stability {len(trials)}/{len(present) + len(todo)}: {_format_trial(trial)}")
     return trials
 
 
 def _write(path: Path, plan: Plan, trials: Sequence[Mapping], circumstances: Mapping) -> None:
-    ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_key(t)))
-    write_files(path.parent, {path.name: json_bytes({"trials": ordered, **report(ordered), **circumstances})})
+    ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_make_key(t)))
+    write_files(path.parent, {path.name: json_bytes({"trials": ordered, **make_report(ordered), **circumstances})})
 
 
-def _line(trial: Trial) -> str:
+def _format_trial(trial: Trial) -> str:
     took = "not timed" if trial.seconds is None else f"{trial.seconds:.1f} s"
     answered = f"{trial.verdict}, {trial.outcome}, {'no answer' if trial.verdict == FAILED else took}"
     return f"row {trial.row} {trial.name}, seed {trial.seed}, {trial.method}: {answered}"
@@ -92,26 +92,28 @@ def plan_order(plan: Plan, method: str) -> int:
     return plan.methods.index(method) if method in plan.methods else len(plan.methods)
 
 
-def _jobs(plan: Plan) -> list[tuple[Row, int, str]]:
+def _list_jobs(plan: Plan) -> list[tuple[MatrixRow, int, str]]:
     """Seed after seed, so that a campaign that is stopped has tried every row."""
     return [(row, seed, method) for seed in plan.seeds for row in plan.rows for method in plan.methods]
 
 
-def _results(
-    plan: Plan, places: Places, todo: Sequence[tuple[Row, int, str]], engine: Engine, folder: Path
+def _run_jobs(
+    plan: Plan, places: ScenesByMotion, todo: Sequence[tuple[MatrixRow, int, str]], engine: Engine, folder: Path
 ) -> Iterator[Trial]:
     """Trials as they are done."""
-    tasks = (_task(places, *job) for job in todo)
+    tasks = (_make_task(places, *job) for job in todo)
     limits = Limits(plan.max_memory_mb, plan.timeout_s)
     for about, answer in engine.answers(partial(next, tasks, None), limits, folder):
-        yield judged(about.case, about.row, about.name, about.seed, about.method, answer)
+        yield judge_trial(about.case, about.row, about.name, about.seed, about.method, answer)
 
 
-def _task(places: Places, row: Row, seed: int, method: str) -> Task:
+def _make_task(places: ScenesByMotion, row: MatrixRow, seed: int, method: str) -> Task:
     """The photographs go to the process, and the truth stays here."""
     case = row.make(Sampler(places, row.name, seed))
-    call = packed(partial(reconstructed, dataclasses.replace(case, worlds=()), method))
-    return Task(_About(row.number, row.name, seed, method, dataclasses.replace(case, source=list, probe=None)), call)
+    call = pack_call(partial(run_trial, dataclasses.replace(case, worlds=()), method))
+    return Task(
+        _TrialContext(row.number, row.name, seed, method, dataclasses.replace(case, source=list, probe=None)), call
+    )
 
 
 class _Trials(msgspec.Struct, frozen=True):
@@ -120,7 +122,7 @@ class _Trials(msgspec.Struct, frozen=True):
     machine: dict
 
 
-def _resumed(path: Path, scenes: Sequence[str], cores_each: int) -> list[dict]:
+def _resume_trials(path: Path, scenes: Sequence[str], cores_each: int) -> list[dict]:
     if not path.exists():
         return []
     content = read_json(path, _Trials, "the stability.json of a campaign")
@@ -135,5 +137,5 @@ def _resumed(path: Path, scenes: Sequence[str], cores_each: int) -> list[dict]:
     return content.trials
 
 
-def _key(trial: Mapping) -> Key:
+def _make_key(trial: Mapping) -> Key:
     return trial["row"], trial["name"], trial["seed"], trial["method"]

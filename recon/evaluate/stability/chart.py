@@ -47,12 +47,12 @@ def draw(stability_json: Path, out: Path) -> Path:
     if not content.get("trials"):
         raise ValueError(f"{stability_json} must have a trial to draw, it has none")
     buffer = io.BytesIO()
-    figure_of(content).savefig(buffer, format="png", facecolor="white")
+    make_figure(content).savefig(buffer, format="png", facecolor="white")
     write_files(out, {"stability.png": buffer.getvalue()})
     return out / "stability.png"
 
 
-def figure_of(content: Mapping) -> Figure:
+def make_figure(content: Mapping) -> Figure:
     """Above, for each method what it did against what was asked, and its rates; below, every trial's verdict."""
     trials, summaries = content["trials"], content["methods"]
     rows = list(dict.fromkeys((trial["row"], trial["name"]) for trial in trials))
@@ -65,9 +65,9 @@ def figure_of(content: Mapping) -> Figure:
         left = _NAMES / width + number * share
         mine = [trial for trial in trials if trial["method"] == summary["method"]]
         top = 1.0 - (0.75 + _TABLE) / height
-        _table(figure.add_axes((left, top, share - 0.1 / width, (_TABLE - 0.65) / height)), summary)
+        _draw_table(figure.add_axes((left, top, share - 0.1 / width, (_TABLE - 0.65) / height)), summary)
         strip = figure.add_axes((left, 0.65 / height, share - 0.1 / width, _LINE * len(rows) / height))
-        _strip(strip, mine, rows, seeds, with_names=number == 0)
+        _draw_strip(strip, mine, rows, seeds, with_names=number == 0)
     figure.text(
         0.1 / width, 1.0 - 0.28 / height, "How often the answer is wrong: the stability matrix", color=_INK, fontsize=12
     )
@@ -76,7 +76,7 @@ def figure_of(content: Mapping) -> Figure:
     return figure
 
 
-def _table(axes: Axes, summary: Mapping) -> None:
+def _draw_table(axes: Axes, summary: Mapping) -> None:
     """Counts of outcomes by what was asked, and the rates with their 95 % intervals."""
     columns = list(_OUTCOME_LABELS)
     axes.set_xlim(-1.2, len(columns))
@@ -93,13 +93,13 @@ def _table(axes: Axes, summary: Mapping) -> None:
             axes.text(x + 0.5, y + 0.5, str(count) if count else "·", ha="center", va="center", color=_INK, fontsize=9)
     lines = [
         f"{summary['method']}: {summary['trials']} trials",
-        f"false accepts {_rate(summary['false_accept'])}",
-        f"false refusals {_rate(summary['false_refuse'])}",
+        f"false accepts {_format_rate(summary['false_accept'])}",
+        f"false refusals {_format_rate(summary['false_refuse'])}",
     ]
     axes.set_title("\n".join(lines), loc="left", fontsize=9, color=_INK, pad=14)
 
 
-def _strip(
+def _draw_strip(
     axes: Axes, trials: Sequence[Mapping], rows: Sequence[tuple[int, str]], seeds: Sequence[int], *, with_names: bool
 ) -> None:
     """A line a row, a cell a seed: the colour tells the outcome, the text the verdict."""
@@ -124,7 +124,7 @@ def _strip(
         axes.set_xlabel("*: what the row measures besides is outside its limits", fontsize=6.5, color=_MUTED)
 
 
-def _rate(rate: Mapping) -> str:
+def _format_rate(rate: Mapping) -> str:
     if rate["rate"] is None:
         return "not tried"
     return f"{rate['count']}/{rate['of']} = {rate['rate']:.1%} (95 %: {rate['low']:.1%} to {rate['high']:.1%})"

@@ -9,162 +9,173 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.masks import masked
+from splatnode.capture.masks import apply_mask
 from splatnode.recon.evaluate.stability import corruptions
-from splatnode.recon.evaluate.stability.case import Case, accepted, either, frames, refused, row
+from splatnode.recon.evaluate.stability.case import (
+    TrialCase,
+    make_accept_case,
+    make_either_case,
+    make_frames,
+    make_refuse_case,
+    row,
+)
 from splatnode.recon.evaluate.stability.corruptions import Image
-from splatnode.recon.evaluate.stability.places import Photo, Sampler
+from splatnode.recon.evaluate.stability.places import Sampler, TrialImage
 from splatnode.recon.result.verdict import Code
 
 
 @row(12, "epsilon noise")
-def epsilon_noise(sampler: Sampler) -> Case:
+def epsilon_noise(sampler: Sampler) -> TrialCase:
     rng, sigma = sampler.rng, 1 + sampler.seed % 3
-    photos = _changed(sampler.photos(4), lambda image: corruptions.noisy(image, sigma, rng))
-    return accepted(photos, f"{sigma} grey levels of noise")
+    photos = _change_images(sampler.load_images(4), lambda image: corruptions.add_noise(image, sigma, rng))
+    return make_accept_case(photos, f"{sigma} grey levels of noise")
 
 
 @row(13, "texture lost in part")
-def partly_flat(sampler: Sampler) -> Case:
+def partly_flat(sampler: Sampler) -> TrialCase:
     share, side = (0.2, 0.3, 0.4)[sampler.seed % 3], 1 + 2 * int(sampler.rng.integers(2))
-    photos = _changed(sampler.photos(4), lambda image: corruptions.flattened(image, share, side))
-    return accepted(photos, f"{share:.0%} without texture", Code.OK_PARTIAL)
+    photos = _change_images(sampler.load_images(4), lambda image: corruptions.remove_texture(image, share, side))
+    return make_accept_case(photos, f"{share:.0%} without texture", Code.OK_PARTIAL)
 
 
 @row(13, "texture mostly lost")
-def mostly_flat(sampler: Sampler) -> Case:
+def mostly_flat(sampler: Sampler) -> TrialCase:
     share, side = (0.5, 0.75)[sampler.seed % 2], 1 + 2 * int(sampler.rng.integers(2))
-    photos = _changed(sampler.photos(4), lambda image: corruptions.flattened(image, share, side))
+    photos = _change_images(sampler.load_images(4), lambda image: corruptions.remove_texture(image, share, side))
     fitting = (Code.LOW_TEXTURE, Code.NO_OVERLAP, Code.BASELINE_TOO_SMALL, Code.AMBIGUOUS, Code.PLANAR_ONLY)
-    return either(photos, f"{share:.0%} without texture", *fitting)
+    return make_either_case(photos, f"{share:.0%} without texture", *fitting)
 
 
 @row(13, "white wall")
-def white_wall(sampler: Sampler) -> Case:
+def white_wall(sampler: Sampler) -> TrialCase:
     rng = sampler.rng
-    photos = [Photo(f"wall_{i}.png", corruptions.white_wall(480, 640, rng), None) for i in range(4)]
-    return refused(photos, "", Code.LOW_TEXTURE, Code.TOO_FEW_VIEWS)
+    photos = [TrialImage(f"wall_{i}.png", corruptions.render_white_wall(480, 640, rng), None) for i in range(4)]
+    return make_refuse_case(photos, "", Code.LOW_TEXTURE, Code.TOO_FEW_VIEWS)
 
 
 @row(15, "motion blur of one frame")
-def one_blurred(sampler: Sampler) -> Case:
-    photos, length = sampler.photos(5), (5, 11, 21)[sampler.seed % 3]
+def one_blurred(sampler: Sampler) -> TrialCase:
+    photos, length = sampler.load_images(5), (5, 11, 21)[sampler.seed % 3]
     angle = float(sampler.rng.uniform(0, 180))
-    photos[2] = replace(photos[2], image=corruptions.motion_blurred(photos[2].image, length, angle))
+    photos[2] = replace(photos[2], image=corruptions.apply_motion_blur(photos[2].image, length, angle))
     fitting = (Code.OK_PARTIAL, Code.OUTLIER_VIEW, Code.BLUR)
-    return accepted(photos, f"one smeared over {length} px", *fitting)
+    return make_accept_case(photos, f"one smeared over {length} px", *fitting)
 
 
 @row(15, "motion blur of all frames")
-def all_blurred(sampler: Sampler) -> Case:
+def all_blurred(sampler: Sampler) -> TrialCase:
     length, angles = (5, 11, 21)[sampler.seed % 3], iter(sampler.rng.uniform(0, 180, 4))
-    photos = _changed(sampler.photos(4), lambda image: corruptions.motion_blurred(image, length, float(next(angles))))
+    photos = _change_images(
+        sampler.load_images(4), lambda image: corruptions.apply_motion_blur(image, length, float(next(angles)))
+    )
     fitting = (Code.BLUR, Code.LOW_TEXTURE, Code.NO_OVERLAP, Code.BASELINE_TOO_SMALL, Code.AMBIGUOUS)
-    return either(photos, f"4 frames smeared over {length} px", *fitting, Code.TOO_FEW_VIEWS)
+    return make_either_case(photos, f"4 frames smeared over {length} px", *fitting, Code.TOO_FEW_VIEWS)
 
 
 @row(16, "exposure and white balance")
-def exposure(sampler: Sampler) -> Case:
+def exposure(sampler: Sampler) -> TrialCase:
     rng = sampler.rng
-    photos = _changed(
-        sampler.photos(4),
-        lambda image: corruptions.exposed(
+    photos = _change_images(
+        sampler.load_images(4),
+        lambda image: corruptions.change_exposure(
             image, float(2.0 ** rng.uniform(-1, 1)), float(rng.uniform(0.8, 1.25)), rng.uniform(0.8, 1.2, 3)
         ),
     )
     note = "gain 0.5 to 2, gamma, 20 % white balance"
-    return accepted(photos, note, Code.OK_PARTIAL)
+    return make_accept_case(photos, note, Code.OK_PARTIAL)
 
 
 @row(17, "lens and sensor")
-def degraded(sampler: Sampler) -> Case:
+def sensor_degradation(sampler: Sampler) -> TrialCase:
     rng = sampler.rng
     name, change = (
-        ("60 % vignetting", lambda image: corruptions.vignetted(image, 0.6)),
-        ("JPEG of quality 20", lambda image: corruptions.as_jpeg(image, 20)),
-        ("low light", lambda image: corruptions.in_low_light(image, 400.0, rng)),
+        ("60 % vignetting", lambda image: corruptions.apply_vignetting(image, 0.6)),
+        ("JPEG of quality 20", lambda image: corruptions.compress_jpeg(image, 20)),
+        ("low light", lambda image: corruptions.simulate_low_light(image, 400.0, rng)),
     )[sampler.seed % 3]
-    return accepted(_changed(sampler.photos(4), change), f"{name}")
+    return make_accept_case(_change_images(sampler.load_images(4), change), f"{name}")
 
 
 @row(18, "moving object")
-def moving_object(sampler: Sampler) -> Case:
+def moving_object(sampler: Sampler) -> TrialCase:
     """A cut-out of another place that moves by itself, of growing size."""
     share = (0.05, 0.15, 0.3)[sampler.seed % 3]
-    photos = _with_passer_by(sampler, sampler.photos(5), share)
+    photos = _add_passer_by(sampler, sampler.load_images(5), share)
     note, fitting = f"{share:.0%} covered", (Code.OK_PARTIAL, Code.MOVING_SCENE)
-    return (either if share > 0.2 else accepted)(photos, note, *fitting)
+    return (make_either_case if share > 0.2 else make_accept_case)(photos, note, *fitting)
 
 
 @row(18, "another thing in each frame")
-def passers_by(sampler: Sampler) -> Case:
+def passers_by(sampler: Sampler) -> TrialCase:
     """Cut-outs of other photographs, one a frame: nothing matches them."""
     share = (0.05, 0.15, 0.3)[sampler.seed % 3]
-    photos = sampler.photos(5)
-    things = [sampler.photos(1, photos)[0].image for _ in photos]
-    covered = [photo for photo, _ in _with_things(sampler, photos, things, share)]
+    photos = sampler.load_images(5)
+    things = [sampler.load_images(1, photos)[0].image for _ in photos]
+    covered = [photo for photo, _ in _add_things(sampler, photos, things, share)]
     note, fitting = f"{share:.0%} covered", (Code.OK_PARTIAL, Code.MOVING_SCENE)
-    return (either if share > 0.2 else accepted)(covered, note, *fitting)
+    return (make_either_case if share > 0.2 else make_accept_case)(covered, note, *fitting)
 
 
 @row(18, "wrong masks")
-def wrong_masks(sampler: Sampler) -> Case:
+def wrong_masks(sampler: Sampler) -> TrialCase:
     """A thing moves; the masks are those of the next frame, or are inverted: they leave nothing but the thing."""
-    photos = sampler.photos(5)
-    things = [sampler.photos(1, photos)[0].image] * len(photos)
-    covered = _with_things(sampler, photos, things, share=0.15)
+    photos = sampler.load_images(5)
+    things = [sampler.load_images(1, photos)[0].image] * len(photos)
+    covered = _add_things(sampler, photos, things, share=0.15)
     free = [~thing for _, thing in covered]
     inverted = sampler.seed % 2 == 1
     masks = [~mask for mask in free] if inverted else [*free[1:], free[0]]
     changed = [photo for photo, _ in covered]
-    hidden = tuple(masked(frame, mask) for frame, mask in zip(frames(changed), masks, strict=True))
+    hidden = tuple(apply_mask(frame, mask) for frame, mask in zip(make_frames(changed), masks, strict=True))
     fitting = Code.NO_PARALLAX, Code.PLANAR_ONLY, Code.NO_OVERLAP, Code.MOVING_SCENE, Code.LOW_TEXTURE, Code.AMBIGUOUS
     if inverted:
-        return replace(refused(changed, "masks that leave only what moves", *fitting), source=partial(list, hidden))
-    case = either(changed, "each with the mask of the next", Code.MOVING_SCENE, Code.AMBIGUOUS)
+        return replace(
+            make_refuse_case(changed, "masks that leave only what moves", *fitting), source=partial(list, hidden)
+        )
+    case = make_either_case(changed, "each with the mask of the next", Code.MOVING_SCENE, Code.AMBIGUOUS)
     return replace(case, source=partial(list, hidden))
 
 
 @row(18, "own body in view")
-def own_body(sampler: Sampler) -> Case:
+def own_body(sampler: Sampler) -> TrialCase:
     """The robot's bumper: the lowest rows of every frame are the same."""
-    photos, share = sampler.photos(4), (0.1, 0.2)[sampler.seed % 2]
-    body = sampler.photos(1, photos)[0].image
+    photos, share = sampler.load_images(4), (0.1, 0.2)[sampler.seed % 2]
+    body = sampler.load_images(1, photos)[0].image
 
-    def with_body(image: Image) -> Image:
+    def paste_body(image: Image) -> Image:
         rows, width = round(share * image.shape[0]), min(image.shape[1], body.shape[1])
         bumper = body[-rows:, :width]
-        return corruptions.pasted(image, bumper, np.ones((rows, width), np.float32), 0, image.shape[0] - rows)
+        return corruptions.paste_patch(image, bumper, np.ones((rows, width), np.float32), 0, image.shape[0] - rows)
 
     note = f"the lowest {share:.0%} are the robot itself"
-    return accepted(_changed(photos, with_body), note, Code.OK_PARTIAL, Code.MOVING_SCENE)
+    return make_accept_case(_change_images(photos, paste_body), note, Code.OK_PARTIAL, Code.MOVING_SCENE)
 
 
 @row(23, "reflection of a lamp")
-def highlight(sampler: Sampler) -> Case:
+def highlight(sampler: Sampler) -> TrialCase:
     """It moves with the camera, and over the scene."""
     rng = sampler.rng
     where = rng.uniform(0.3, 0.7, 2)
-    photos = _changed(
-        sampler.photos(4),
-        lambda image: corruptions.with_highlight(image, *(where + rng.uniform(-0.05, 0.05, 2)), size=0.2),
+    photos = _change_images(
+        sampler.load_images(4),
+        lambda image: corruptions.add_highlight(image, *(where + rng.uniform(-0.05, 0.05, 2)), size=0.2),
     )
-    return accepted(photos, "a highlight of a fifth of the width")
+    return make_accept_case(photos, "a highlight of a fifth of the width")
 
 
-def _changed(photos: Sequence[Photo], change: Callable[[Image], Image]) -> list[Photo]:
+def _change_images(photos: Sequence[TrialImage], change: Callable[[Image], Image]) -> list[TrialImage]:
     return [replace(photo, image=change(photo.image)) for photo in photos]
 
 
-def _with_passer_by(sampler: Sampler, photos: Sequence[Photo], share: float) -> list[Photo]:
+def _add_passer_by(sampler: Sampler, photos: Sequence[TrialImage], share: float) -> list[TrialImage]:
     """One ellipse of another place's photograph over all frames."""
-    cutout = sampler.photos(1, photos)[0].image
-    return [photo for photo, _ in _with_things(sampler, photos, [cutout] * len(photos), share)]
+    cutout = sampler.load_images(1, photos)[0].image
+    return [photo for photo, _ in _add_things(sampler, photos, [cutout] * len(photos), share)]
 
 
-def _with_things(
-    sampler: Sampler, photos: Sequence[Photo], things: Sequence[Image], share: float
-) -> list[tuple[Photo, npt.NDArray[np.bool_]]]:
+def _add_things(
+    sampler: Sampler, photos: Sequence[TrialImage], things: Sequence[Image], share: float
+) -> list[tuple[TrialImage, npt.NDArray[np.bool_]]]:
     """The photographs, over each an ellipse of its thing, covering `share` of it, on a way of its own; where it is."""
     rng = sampler.rng
     way = np.cumsum(rng.normal(scale=0.12, size=(len(photos), 2)), axis=0) + rng.uniform(0.3, 0.7, 2)
@@ -175,8 +186,8 @@ def _with_things(
         size = min(round(side * height), cutout.shape[0]), min(round(side * width), cutout.shape[1])
         left, top = round(across * width - size[1] / 2), round(down * height - size[0] / 2)
         patch = cutout[: size[0], : size[1]]
-        ellipse = corruptions.ellipse(*size)
-        covered = replace(photo, image=corruptions.pasted(photo.image, patch, ellipse, left, top))
+        ellipse = corruptions.make_ellipse_mask(*size)
+        covered = replace(photo, image=corruptions.paste_patch(photo.image, patch, ellipse, left, top))
         black, white = np.zeros_like(photo.image), np.full((*size, 3), 255, np.uint8)
-        result.append((covered, corruptions.pasted(black, white, ellipse, left, top).max(2) > 0))
+        result.append((covered, corruptions.paste_patch(black, white, ellipse, left, top).max(2) > 0))
     return result

@@ -10,8 +10,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.recon.evaluate.stability import warps
-from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row
-from splatnode.recon.evaluate.stability.places import Photo, Sampler
+from splatnode.recon.evaluate.stability.case import TrialCase, make_accept_case, make_either_case, make_refuse_case, row
+from splatnode.recon.evaluate.stability.places import Sampler, TrialImage
 from splatnode.recon.evaluate.truth import TrueCamera
 from splatnode.recon.result.verdict import Code
 
@@ -20,41 +20,41 @@ _DOUBTS = (Code.FOCAL_SUSPECT, Code.MIXED_CAMERAS, Code.AMBIGUOUS, Code.BASELINE
 
 
 @row(19, "true focal length given")
-def true_focal(sampler: Sampler) -> Case:
-    photos = _with_focal_length(sampler.photos(4), 1.0, "given")
-    return accepted(photos, "4 frames with their true focal length")
+def true_focal(sampler: Sampler) -> TrialCase:
+    photos = _set_focal_length(sampler.load_images(4), 1.0, "given")
+    return make_accept_case(photos, "4 frames with their true focal length")
 
 
 @row(19, "wrong focal length given")
-def wrong_focal(sampler: Sampler) -> Case:
+def wrong_focal(sampler: Sampler) -> TrialCase:
     factor = (0.7, 1.4)[sampler.seed % 2]
-    photos = _with_focal_length(sampler.photos(5), factor, "given")
-    return refused(photos, f"given focal length x{factor}", Code.FOCAL_SUSPECT)
+    photos = _set_focal_length(sampler.load_images(5), factor, "given")
+    return make_refuse_case(photos, f"given focal length x{factor}", Code.FOCAL_SUSPECT)
 
 
 @row(19, "EXIF lies")
-def exif_lies(sampler: Sampler) -> Case:
+def exif_lies(sampler: Sampler) -> TrialCase:
     factor = (0.7, 1.4)[sampler.seed % 2]
-    photos = _with_focal_length(sampler.photos(5), factor, "exif")
-    return either(photos, f"EXIF focal length x{factor}", *_DOUBTS)
+    photos = _set_focal_length(sampler.load_images(5), factor, "exif")
+    return make_either_case(photos, f"EXIF focal length x{factor}", *_DOUBTS)
 
 
 @row(20, "radial distortion")
-def distortion(sampler: Sampler) -> Case:
+def distortion(sampler: Sampler) -> TrialCase:
     k1 = (-0.1, 0.1)[sampler.seed % 2]
-    photos = [warps.distorted(photo, k1) for photo in sampler.photos(5)]
-    return accepted(photos, f"k1 {k1:+}", Code.OK_PARTIAL)
+    photos = [warps.distort_image(photo, k1) for photo in sampler.load_images(5)]
+    return make_accept_case(photos, f"k1 {k1:+}", Code.OK_PARTIAL)
 
 
 @row(20, "strong radial distortion")
-def strong_distortion(sampler: Sampler) -> Case:
+def strong_distortion(sampler: Sampler) -> TrialCase:
     k1 = (-0.3, 0.3)[sampler.seed % 2]
-    photos = [warps.distorted(photo, k1) for photo in sampler.photos(5)]
-    return either(photos, f"k1 {k1:+}", *_DOUBTS)
+    photos = [warps.distort_image(photo, k1) for photo in sampler.load_images(5)]
+    return make_either_case(photos, f"k1 {k1:+}", *_DOUBTS)
 
 
 @row(20, "calibrated fisheye")
-def fisheye(sampler: Sampler) -> Case:
+def fisheye(sampler: Sampler) -> TrialCase:
     """The built-in place, through a fisheye: no recorded scene has one whose cameras are known."""
     across_deg, views = (120.0, 170.0)[sampler.seed % 2], (6, 8)[sampler.seed // 2 % 2]
     focal = _SIDES[0] / math.radians(across_deg)
@@ -63,47 +63,52 @@ def fisheye(sampler: Sampler) -> Case:
     pinhole = wide_pinhole("the photograph", lens)
     photos = []
     for index, (T_world_camera, _) in enumerate(cameras := synthetic.scene_cameras(config)):
-        image = synthetic.photograph(config, cameras[index], index)
+        image = synthetic.render_image(config, cameras[index], index)
         camera = TrueCamera(T_world_camera, pinhole.K, pinhole.width, pinhole.height)
-        photos.append(Photo(synthetic.frame_name(index), image, camera, "built-in", lens))
-    return accepted(photos, f"through {across_deg:g} degrees")
+        photos.append(TrialImage(synthetic.frame_name(index), image, camera, "built-in", lens))
+    return make_accept_case(photos, f"through {across_deg:g} degrees")
 
 
 @row(21, "rolling shutter")
-def rolling_shutter(sampler: Sampler) -> Case:
+def rolling_shutter(sampler: Sampler) -> TrialCase:
     shift = (0.002, 0.01)[sampler.seed % 2]
-    photos = [warps.rolled(photo, shift * (-1) ** number) for number, photo in enumerate(sampler.photos(4))]
+    photos = [
+        warps.apply_rolling_shutter(photo, shift * (-1) ** number)
+        for number, photo in enumerate(sampler.load_images(4))
+    ]
     note = f"rows shifted by {shift:.1%} in turns"
     return (
-        accepted(photos, note)
+        make_accept_case(photos, note)
         if sampler.seed % 2 == 0
-        else either(photos, note, Code.BLUR, *_DOUBTS, Code.MOVING_SCENE)
+        else make_either_case(photos, note, Code.BLUR, *_DOUBTS, Code.MOVING_SCENE)
     )
 
 
 @row(22, "portrait and landscape")
-def turned(sampler: Sampler) -> Case:
-    photos = [warps.on_its_side(photo) if number % 2 else photo for number, photo in enumerate(sampler.photos(4))]
-    return accepted(photos, "2 on their side", Code.OK_PARTIAL)
+def portrait_and_landscape(sampler: Sampler) -> TrialCase:
+    photos = [warps.rotate_image(photo) if number % 2 else photo for number, photo in enumerate(sampler.load_images(4))]
+    return make_accept_case(photos, "2 on their side", Code.OK_PARTIAL)
 
 
 @row(22, "two resolutions")
-def two_resolutions(sampler: Sampler) -> Case:
-    photos = [warps.resized(photo, 0.6) if number % 2 else photo for number, photo in enumerate(sampler.photos(4))]
-    return accepted(photos, "2 at 60 %", Code.OK_PARTIAL)
+def two_resolutions(sampler: Sampler) -> TrialCase:
+    photos = [
+        warps.resize_image(photo, 0.6) if number % 2 else photo for number, photo in enumerate(sampler.load_images(4))
+    ]
+    return make_accept_case(photos, "2 at 60 %", Code.OK_PARTIAL)
 
 
 @row(22, "crops")
-def crops(sampler: Sampler) -> Case:
+def crops(sampler: Sampler) -> TrialCase:
     rng = sampler.rng
     photos = [
-        warps.cropped(photo, 0.75, *rng.uniform(size=2)) if number % 2 else photo
-        for number, photo in enumerate(sampler.photos(5))
+        warps.crop_image(photo, 0.75, *rng.uniform(size=2)) if number % 2 else photo
+        for number, photo in enumerate(sampler.load_images(5))
     ]
-    return either(photos, "2 cropped off-centre to 75 %", *_DOUBTS)
+    return make_either_case(photos, "2 cropped off-centre to 75 %", *_DOUBTS)
 
 
-def _with_focal_length(photos: Sequence[Photo], factor: float, source: str) -> list[Photo]:
+def _set_focal_length(photos: Sequence[TrialImage], factor: float, source: str) -> list[TrialImage]:
     """The photographs with their true focal length times `factor` as what `source` says of them."""
     changed = []
     for photo in photos:

@@ -17,14 +17,14 @@ from splatnode.recon.evaluate.stability import (
     mixtures,
     streams,
 )
-from splatnode.recon.evaluate.stability.case import Row
+from splatnode.recon.evaluate.stability.case import MatrixRow
 
 _FAMILIES = (cameras, degenerate, imaging, lenses, mixtures, streams)
 
-ROWS: tuple[Row, ...] = tuple(
+ROWS: tuple[MatrixRow, ...] = tuple(
     sorted(
         (
-            *(found for family in _FAMILIES for found in vars(family).values() if isinstance(found, Row)),
+            *(found for family in _FAMILIES for found in vars(family).values() if isinstance(found, MatrixRow)),
             *lens_assumptions.ROWS,
         ),
         key=lambda r: r.number,
@@ -32,7 +32,7 @@ ROWS: tuple[Row, ...] = tuple(
 )
 
 
-def chosen(numbers: Collection[int]) -> tuple[Row, ...]:
+def select_rows(numbers: Collection[int]) -> tuple[MatrixRow, ...]:
     """The rows with these numbers; all, where there are none. Raises ValueError for a number that no row has."""
     known = {found.number for found in ROWS}
     unknown = sorted(set(numbers) - known)

@@ -6,28 +6,28 @@ from collections import deque
 from collections.abc import Callable, Iterable
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.pipeline import reconstruct, reconstruct_stream
 from splatnode.recon.result.snapshot import Snapshot
 
-Method = Callable[[Iterable[Frame | DroppedFrame], Config], Snapshot]
+Method = Callable[[Iterable[Frame | DroppedFrame], ReconstructionConfig], Snapshot]
 
 NAMES = ("splatnode", "colmap", "glomap")
 
 
-def splatnode(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+def splatnode(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
     """The last snapshot."""
     (last,) = deque(reconstruct(frames, config), maxlen=1)
     return last
 
 
-def splatnode_stream(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+def splatnode_stream(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
     """The last snapshot of frames that come one at a time."""
     (last,) = deque(reconstruct_stream(frames, config), maxlen=1)
     return last
 
 
-def by_name(name: str, stream: bool = False) -> Method:
+def find_method(name: str, stream: bool = False) -> Method:
     """The method; `stream`: for frames that come one at a time, if it can.
 
     Raises ValueError for a method that there is not, or that needs a package that is not installed.

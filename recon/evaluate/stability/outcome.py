@@ -7,7 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splatnode.recon.evaluate.stability.case import Demand, World
-from splatnode.recon.evaluate.stability.claim import CameraError, all_right, errors_of, whole_errors
+from splatnode.recon.evaluate.stability.claim import (
+    CameraError,
+    has_only_right_cameras,
+    measure_camera_errors,
+    measure_set_errors,
+)
 from splatnode.recon.result.snapshot import CameraEstimate
 
 
@@ -35,7 +40,7 @@ class Score:
     errors: tuple[CameraError, ...] = ()  # of the cameras of the world that has most of them
 
 
-def compare(cameras: Sequence[CameraEstimate], worlds: Sequence[World], rough: bool = False) -> Score:
+def score_cameras(cameras: Sequence[CameraEstimate], worlds: Sequence[World], rough: bool = False) -> Score:
     """Right if all `cameras` are of one world, at least two of them apart, and none is wrong.
 
     Wrong is a camera beyond 2.5 times one of its 95 % bounds; or, unless the verdict says that the cameras are known
@@ -47,13 +52,13 @@ def compare(cameras: Sequence[CameraEstimate], worlds: Sequence[World], rough: b
     known = [camera for camera in cameras if camera.name in here]
     if len(known) < 2:
         return Score(False, None, None)
-    whole, errors = whole_errors(known, here), errors_of(known, here)
+    whole, errors = measure_set_errors(known, here), measure_camera_errors(known, here)
     together = len(known) == len(cameras)
-    right = together and not any(error.wrong(rough) for error in errors)
-    return Score(right, whole.rotation_pair_deg, whole.centre_pct, together and all_right(errors), errors)
+    right = together and not any(error.is_wrong(rough) for error in errors)
+    return Score(right, whole.rotation_pair_deg, whole.centre_pct, together and has_only_right_cameras(errors), errors)
 
 
-def outcome(demand: Demand, published: bool, published_right: bool, code_fits: bool) -> Outcome:
+def classify_outcome(demand: Demand, published: bool, published_right: bool, code_fits: bool) -> Outcome:
     """A wrong scene that is published is a false accept whatever was asked."""
     if published:
         return Outcome.ACCEPTED if published_right else Outcome.FALSE_ACCEPT

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.registration.register import register
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.verification.verify import verify
 
 
-def registered(estimate: Estimate, config: Config) -> Estimate:
+def ensure_registration(estimate: Reconstruction, config: ReconstructionConfig) -> Reconstruction:
     """The estimate with the cameras and the evidence of a registration, also where the verdict needed none."""
     if estimate.registration is not None:
         return estimate
@@ -23,7 +23,7 @@ def registered(estimate: Estimate, config: Config) -> Estimate:
     )
 
 
-def cameras_of(estimate: Estimate) -> tuple[CameraEstimate, ...]:
+def list_registered_cameras(estimate: Reconstruction) -> tuple[CameraEstimate, ...]:
     """The registered cameras, for their frames at full size; those that were placed, where a scene may be published."""
     if estimate.registration is None:
         return ()
@@ -34,4 +34,6 @@ def cameras_of(estimate: Estimate) -> tuple[CameraEstimate, ...]:
         K[:2, 2] = camera.principal
         of_camera = (camera.T_world_camera, K, frame.width, frame.height, bounds.get(frame.name))
         found.append(CameraEstimate(frame.name, frame.frame_id, *of_camera))
-    return tuple(each for each in found if not estimate.verdict.publishable or each.name in estimate.placed)
+    return tuple(
+        each for each in found if not estimate.verdict.publishable or each.name in estimate.publishable_camera_names
+    )

@@ -5,31 +5,37 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.rivals.colmap import Mapper, RegisteredFrame, global_, incremental, sparse_model
-from splatnode.recon.evaluate.rivals.outcome import verdict
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.rivals.colmap import (
+    Mapper,
+    RegisteredFrame,
+    map_globally,
+    map_incrementally,
+    reconstruct_sparse_model,
+)
+from splatnode.recon.evaluate.rivals.outcome import make_verdict
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 
 
-def colmap(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+def colmap(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
     """Incremental mapping."""
-    return _reconstructed(frames, config, incremental)
+    return _reconstruct(frames, config, map_incrementally)
 
 
-def glomap(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+def glomap(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
     """Global mapping."""
-    return _reconstructed(frames, config, global_)
+    return _reconstruct(frames, config, map_globally)
 
 
-def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mapping: Mapper) -> Snapshot:
+def _reconstruct(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig, mapping: Mapper) -> Snapshot:
     usable = [frame for frame in frames if isinstance(frame, Frame)]
-    model = sparse_model(usable, config.seed, mapping)
+    model = reconstruct_sparse_model(usable, config.seed, mapping)
     registered = () if model is None else model.registered
-    found = verdict(usable, {each.frame.name for each in registered})
+    found = make_verdict(usable, {each.frame.name for each in registered})
     return Snapshot(
         sequence=1,
         verdict=found,
-        cameras=tuple(map(camera_estimate, registered)) if found.publishable else (),
+        cameras=tuple(map(make_camera_estimate, registered)) if found.publishable else (),
         gaussians=GaussianArrays.empty(),
         images={},
         dropped=(),
@@ -38,7 +44,7 @@ def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mappi
     )
 
 
-def camera_estimate(registered: RegisteredFrame) -> CameraEstimate:
+def make_camera_estimate(registered: RegisteredFrame) -> CameraEstimate:
     """The camera of a registered frame, for the frame at full size; nothing is claimed of it."""
     frame = registered.frame
     return CameraEstimate(

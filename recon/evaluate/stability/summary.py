@@ -26,7 +26,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class Summary:
-    """Of one method. `confusion` counts outcomes by what was asked."""
+    """The counts and rates of one method. `confusion` counts outcomes by what was asked."""
 
     method: str
     trials: int
@@ -41,7 +41,7 @@ class Summary:
     processor_seconds_mean: float | None
 
 
-def rate(count: int, of: int) -> Rate:
+def compute_rate(count: int, of: int) -> Rate:
     """Wilson's interval: unlike the normal one it is right for rates near 0, which is where they should be."""
     if of == 0:
         return Rate(count, 0, None, None, None)
@@ -53,7 +53,7 @@ def rate(count: int, of: int) -> Rate:
 
 
 def summarise(trials: Sequence[Mapping], method: str) -> Summary:
-    """Of the records of stability.json that are of `method`."""
+    """Summarises the records of stability.json that are of `method`."""
     mine = [trial for trial in trials if trial["method"] == method]
     confusion = {
         demand.value: {
@@ -71,19 +71,19 @@ def summarise(trials: Sequence[Mapping], method: str) -> Summary:
         method=method,
         trials=len(mine),
         confusion=confusion,
-        false_accept=rate(outcomes[Outcome.FALSE_ACCEPT], len(mine)),
-        wrong_of_published=rate(outcomes[Outcome.FALSE_ACCEPT], published),
-        false_refuse=rate(asked[Outcome.FALSE_REFUSE.value] + asked[Outcome.FAILED.value], sum(asked.values())),
-        other_code=rate(outcomes[Outcome.REFUSED_OTHERWISE], refused),
-        missed_limits=rate(held.count(False), len(held)),
+        false_accept=compute_rate(outcomes[Outcome.FALSE_ACCEPT], len(mine)),
+        wrong_of_published=compute_rate(outcomes[Outcome.FALSE_ACCEPT], published),
+        false_refuse=compute_rate(asked[Outcome.FALSE_REFUSE.value] + asked[Outcome.FAILED.value], sum(asked.values())),
+        other_code=compute_rate(outcomes[Outcome.REFUSED_OTHERWISE], refused),
+        missed_limits=compute_rate(held.count(False), len(held)),
         seconds_median=_median([t["seconds"] for t in mine]),
         refusal_seconds_median=_median([t["seconds"] for t in mine if not t["published"]]),
         processor_seconds_mean=_mean([t["processor_seconds"] for t in mine]),
     )
 
 
-def report(trials: Sequence[Mapping]) -> dict[str, Any]:
-    """What stability.json holds besides its trials. The rates at its top are those of the first method."""
+def make_report(trials: Sequence[Mapping]) -> dict[str, Any]:
+    """Returns what stability.json holds besides its trials; the top rates are the first method's."""
     methods = list(dict.fromkeys(trial["method"] for trial in trials))
     summaries = [summarise(trials, method) for method in methods]
     first = summaries[0] if summaries else summarise(trials, "")

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from splatnode.recon.clock import Clock
-from splatnode.recon.evaluate.stability.case import Case, Measured
+from splatnode.recon.evaluate.stability.case import ProbeResult, TrialCase
 from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
-from splatnode.recon.evaluate.stability.methods import by_name
-from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
-from splatnode.recon.evaluate.timing import Timing, timing
+from splatnode.recon.evaluate.stability.methods import find_method
+from splatnode.recon.evaluate.stability.outcome import Outcome, classify_outcome, score_cameras
+from splatnode.recon.evaluate.stability.own_cameras import ensure_registration, list_registered_cameras
+from splatnode.recon.evaluate.timing import Timing, measure_timing
 from splatnode.recon.jobs import call
 from splatnode.recon.jobs.alone import now
 from splatnode.recon.pipeline import estimate_frames
@@ -57,8 +57,8 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class Reconstructed:
-    """What the other process returns."""
+class TrialResult:
+    """The result that the other process returns."""
 
     verdict: Verdict
     cameras: tuple[CameraEstimate, ...]  # those published; of splatnode's refusals, those that were registered
@@ -68,10 +68,10 @@ class Reconstructed:
     timed_on: Timing
     processor_seconds: float
     peak_rss_mb: float | None
-    measured: Measured | None
+    measured: ProbeResult | None
 
 
-def judged(case: Case, row: int, name: str, seed: int, method: str, answer: call.Answer) -> Trial:
+def judge_trial(case: TrialCase, row: int, name: str, seed: int, method: str, answer: call.Answer) -> Trial:
     """The trial of a case that `reconstructed` was called for; its photographs are not looked at."""
     head = {
         "row": row,
@@ -85,17 +85,17 @@ def judged(case: Case, row: int, name: str, seed: int, method: str, answer: call
     if answer.pickled is None:
         failed, why = Outcome.FAILED, answer.reason
         return Trial(**head, verdict=FAILED, published=False, right=failed.right, outcome=failed.value, message=why)
-    made: Reconstructed = answer.value()
+    made: TrialResult = answer.value()
     verdict = made.verdict
-    score = compare(made.cameras, case.worlds, rough=verdict.code.value == ROUGH)
-    found = outcome(case.demand, verdict.publishable, score.right, verdict.code in case.codes)
+    score = score_cameras(made.cameras, case.worlds, rough=verdict.code.value == ROUGH)
+    found = classify_outcome(case.demand, verdict.publishable, score.right, verdict.code in case.codes)
     return Trial(
         **head,
         verdict=verdict.code.value,
         published=verdict.publishable,
         right=found.right,
         outcome=found.value,
-        seconds=made.seconds if made.timed_on.alone else None,
+        seconds=made.seconds if made.timed_on.is_alone else None,
         cores=made.timed_on.cores,
         processor=made.timed_on.processor,
         others=made.timed_on.others,
@@ -114,19 +114,19 @@ def judged(case: Case, row: int, name: str, seed: int, method: str, answer: call
     )
 
 
-def reconstructed(case: Case, method: str) -> Reconstructed:
-    """What a method makes of the photographs; `case` comes without the truth. It is called in a process of its own."""
-    reconstruct = by_name(method, case.stream)
+def run_trial(case: TrialCase, method: str) -> TrialResult:
+    """Runs a method on the images of `case`, without the truth, in a process of its own."""
+    reconstruct = find_method(method, case.stream)
     since, started, worked = now(), time.perf_counter(), time.process_time()
     snapshot = reconstruct(case.source(), case.config)
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - worked
-    timed_on, peak = timing(since), peak_rss_mb()
+    timed_on, peak = measure_timing(since), peak_rss_mb()
     probe = case.probe if snapshot.verdict.publishable and method == "splatnode" else None
     cameras, evidence = snapshot.cameras, snapshot.evidence
     if method == "splatnode" and not snapshot.verdict.publishable:
-        estimate = registered(estimate_frames(case.source(), case.config, Clock())[0], case.config)
-        cameras, evidence = cameras_of(estimate), estimate.evidence_record
-    return Reconstructed(
+        estimate = ensure_registration(estimate_frames(case.source(), case.config, Clock())[0], case.config)
+        cameras, evidence = list_registered_cameras(estimate), estimate.evidence_record
+    return TrialResult(
         verdict=snapshot.verdict,
         cameras=cameras,
         evidence=evidence,

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
 
 # What map_saver writes. 205 is not seen only with a threshold of .196; of nav2's default, .25, it would be free.
-_GREY = {State.NOT_SEEN: 205, State.FREE: 254, State.OCCUPIED: 0}
+_GREY = {VoxelState.NOT_SEEN: 205, VoxelState.FREE: 254, VoxelState.OCCUPIED: 0}
 _FREE_BELOW, _OCCUPIED_ABOVE = 0.196, 0.65
 
 
@@ -21,7 +21,7 @@ def encode_nav2(occupancy: OccupancyMap, band: Sequence[float]) -> dict[str, byt
     A cell is occupied where any of these voxels is, free where all of them are. Raises ValueError for a band that is
     none, or that the map does not reach.
     """
-    cells = flattened(occupancy, band)
+    cells = project_band(occupancy, band)
     x, y = occupancy.origin[:2].tolist()
     low, high = band
     yaml = (
@@ -41,7 +41,7 @@ def encode_nav2(occupancy: OccupancyMap, band: Sequence[float]) -> dict[str, byt
     return {"map.pgm": header.encode() + rows.tobytes(), "map.yaml": yaml.encode()}
 
 
-def flattened(occupancy: OccupancyMap, band: Sequence[float]) -> npt.NDArray[np.uint8]:
+def project_band(occupancy: OccupancyMap, band: Sequence[float]) -> npt.NDArray[np.uint8]:
     """(X, Y) the states of a band of heights, as `encode_nav2` has them. Raises ValueError."""
     if len(band) != 2 or not all(math.isfinite(height) for height in band) or not band[0] < band[1]:
         raise ValueError(f"a band must be two heights, the lower one first, got {list(band)}")
@@ -53,5 +53,5 @@ def flattened(occupancy: OccupancyMap, band: Sequence[float]) -> npt.NDArray[np.
             "is not within"
         )
     part = occupancy.states[:, :, math.floor(first) : math.ceil(last)]
-    free, occupied = (part == State.FREE).all(2), (part == State.OCCUPIED).any(2)
-    return np.select([occupied, free], [State.OCCUPIED, State.FREE], State.NOT_SEEN).astype(np.uint8)
+    free, occupied = (part == VoxelState.FREE).all(2), (part == VoxelState.OCCUPIED).any(2)
+    return np.select([occupied, free], [VoxelState.OCCUPIED, VoxelState.FREE], VoxelState.NOT_SEEN).astype(np.uint8)

@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
 
 AXES = "states[i, j, k] along x, y, z of the map: x forward of the first camera, y to its left, z up"
 
@@ -21,7 +21,7 @@ def encode_npz(occupancy: OccupancyMap) -> bytes:
         voxel=np.float64(occupancy.voxel),
         T_world_map=occupancy.T_world_map,
         axes=np.array(AXES),
-        meaning=np.array(", ".join(f"{state.value}: {state.name.lower()}" for state in State)),
+        meaning=np.array(", ".join(f"{state.value}: {state.name.lower()}" for state in VoxelState)),
         scale=np.array(occupancy.scale.sentence),
         up=np.array(occupancy.upright.source),
         height=np.array(occupancy.upright.height),

@@ -38,7 +38,7 @@ def encode_octomap(occupancy: OccupancyMap) -> bytes:
         inner = np.argwhere(level.codes == _MIXED) if height < LEVELS else np.zeros((1, 3), np.int64)
         bits = children[tuple(inner.T)].astype(np.uint32)
         words.append((bits << (2 * np.arange(8, dtype=np.uint32))).sum(1).astype("<u2"))
-        paths.append(_interleaved(inner + first) << np.uint64(3 * height))
+        paths.append(_interleave_bits(inner + first) << np.uint64(3 * height))
         heights.append(np.full(len(inner), height))
         count += int((bits > 0).sum())
     order = np.lexsort([-np.concatenate(heights), np.concatenate(paths)])
@@ -62,7 +62,7 @@ def _parents(children: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return np.where((children == first[..., None]).all(-1), first, np.uint8(_MIXED))
 
 
-def _interleaved(numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.uint64]:
+def _interleave_bits(numbers: npt.NDArray[np.int64]) -> npt.NDArray[np.uint64]:
     """(M,) the bits of numbers (M, 3) in turn, x the lowest: nodes in this order are in that of their paths."""
     bits = (numbers[:, :, None].astype(np.uint64) >> _EVERY_THIRD) & np.uint64(1)
     return (bits << (3 * _EVERY_THIRD + np.arange(3, dtype=np.uint64)[:, None])).sum((1, 2), dtype=np.uint64)

@@ -18,8 +18,8 @@ import msgspec
 import torch
 from torch import Tensor
 
-from splatnode.recon.optimize.control.control import Change, Step
-from splatnode.recon.rasterize.reference import rotations
+from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
+from splatnode.recon.rasterize.reference import compute_rotations
 from splatnode.recon.scene.gaussians import Gaussians, concatenate, logit
 
 NEVER = 2.0  # for `reset_every`: a share of the iterations that is never reached
@@ -48,7 +48,7 @@ def extent(Ts_world_camera: Sequence[Tensor]) -> float:
     return _EXTENT_MARGIN * float((centres - centres.mean(0)).norm(dim=1).max())
 
 
-def image_gradient(step: Step) -> Tensor:
+def image_gradient(step: OptimizerStep) -> Tensor:
     """(N,) length of the loss's gradient with respect to the positions in the image, in halves of the image's sides.
 
     It follows from the gradient with respect to the means across the line of sight: du = f / z dx.
@@ -62,14 +62,14 @@ def image_gradient(step: Step) -> Tensor:
     return (across * halves.to(means.device)).norm(dim=1)
 
 
-def limit(step: Step, config: Config) -> int:
+def limit(step: OptimizerStep, config: Config) -> int:
     """The largest number of Gaussians that rounds may lead to."""
     return config.max_gaussians if step.max_gaussians is None else min(config.max_gaussians, step.max_gaussians)
 
 
-def densified(
+def densify(
     gaussians: Gaussians, gradient: Tensor, size: float, most: int, config: Config, generator: torch.Generator
-) -> Change:
+) -> GaussianChange:
     """Clones and splits Gaussians by their mean gradient (N,), in a scene of extent `size`; none beyond `most`."""
     selected = gradient >= config.min_gradient
     if len(gaussians) + int(selected.sum()) > most:
@@ -78,20 +78,20 @@ def densified(
     clones = gaussians.subset(selected & ~large)
     split = gaussians.subset(selected & large)
     kept = ~(selected & large)
-    parts = [_drawn_from(split, config.split_factor, generator) for _ in range(_PARTS)]
+    parts = [_sample_children(split, config.split_factor, generator) for _ in range(_PARTS)]
     grown = concatenate([gaussians.subset(kept), clones, *parts])
     rows = torch.nonzero(kept)[:, 0]
-    return Change(grown, torch.cat([rows, rows.new_full((len(grown) - len(rows),), -1)]))
+    return GaussianChange(grown, torch.cat([rows, rows.new_full((len(grown) - len(rows),), -1)]))
 
 
-def _drawn_from(gaussians: Gaussians, split_factor: float, generator: torch.Generator) -> Gaussians:
+def _sample_children(gaussians: Gaussians, split_factor: float, generator: torch.Generator) -> Gaussians:
     """For each Gaussian one that is smaller by `split_factor`, its mean drawn from it."""
     drawn = torch.randn(gaussians.means.shape, generator=generator).to(gaussians.means.device) * gaussians.scales
-    offset = (rotations(gaussians.quats) @ drawn[..., None])[..., 0]
+    offset = (compute_rotations(gaussians.quats) @ drawn[..., None])[..., 0]
     return replace(gaussians, means=gaussians.means + offset, log_scales=gaussians.log_scales - math.log(split_factor))
 
 
-def radius_px(gaussians: Gaussians, step: Step) -> Tensor:
+def radius_px(gaussians: Gaussians, step: OptimizerStep) -> Tensor:
     """(N,) three standard deviations, in pixels, in the training view in which a Gaussian is largest."""
     largest = torch.zeros_like(gaussians.logit_opacities)
     for T_world_camera, image in zip(step.Ts_world_camera, step.images, strict=True):
@@ -108,7 +108,7 @@ class AdaptiveControl:
         self._generator = torch.Generator().manual_seed(seed)
         self._sum = self._count = torch.zeros(0)  # of each Gaussian's gradients since the last round, and how many
 
-    def after_step(self, step: Step) -> Change | None:
+    def after_step(self, step: OptimizerStep) -> GaussianChange | None:
         config = self._config
         if step.progress > config.end:
             return None
@@ -118,32 +118,32 @@ class AdaptiveControl:
         if is_round(step, config):
             mean = self._sum / self._count.clamp_min(1)
             size, most = extent(step.Ts_world_camera), limit(step, config)
-            change = densified(gaussians, mean, size, most, config, self._generator)
-            change = self._pruned(change, step)
+            change = densify(gaussians, mean, size, most, config, self._generator)
+            change = self._prune(change, step)
             self._sum = torch.zeros(0)
         if step.iteration % max(1, round(config.reset_every * step.iterations)) == 0:
-            change = change or Change(gaussians, torch.arange(len(gaussians), device=gaussians.means.device))
+            change = change or GaussianChange(gaussians, torch.arange(len(gaussians), device=gaussians.means.device))
             logits = change.gaussians.logit_opacities.clamp_max(logit(config.reset_opacity))
-            change = Change(replace(change.gaussians, logit_opacities=logits), change.origin)
+            change = GaussianChange(replace(change.gaussians, logit_opacities=logits), change.origin)
         return change
 
-    def _observe(self, step: Step) -> None:
+    def _observe(self, step: OptimizerStep) -> None:
         length = image_gradient(step)
         if len(length) != len(self._sum):
             self._sum, self._count = torch.zeros_like(length), torch.zeros_like(length)
         self._sum += length
         self._count += length > 0
 
-    def _pruned(self, change: Change, step: Step) -> Change:
+    def _prune(self, change: GaussianChange, step: OptimizerStep) -> GaussianChange:
         config, gaussians = self._config, change.gaussians
         keep = gaussians.opacities >= config.min_opacity
         if step.iteration > config.reset_every * step.iterations:
             keep &= gaussians.scales.amax(1) <= config.max_scale * extent(step.Ts_world_camera)
             keep &= radius_px(gaussians, step) <= config.max_radius_px
-        return Change(gaussians.subset(keep), change.origin[keep])
+        return GaussianChange(gaussians.subset(keep), change.origin[keep])
 
 
-def is_round(step: Step, config: Config) -> bool:
+def is_round(step: OptimizerStep, config: Config) -> bool:
     """Whether Gaussians are added and pruned after this iteration."""
     return config.start <= step.progress <= config.end and step.iteration % config.every == 0
 

@@ -21,7 +21,7 @@ class ControlChoice(Plugin):
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class OptimizerStep:
     """An iteration that the optimiser has just made."""
 
     iteration: int  # 1 for the first
@@ -35,7 +35,7 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class GaussianChange:
     """The Gaussians with which the optimiser goes on."""
 
     gaussians: Gaussians  # M of them, not leaves
@@ -45,6 +45,6 @@ class Change:
 class Control(Protocol):
     """A loaded density control. Its file has `Config` and `load(config, seed)`."""
 
-    def after_step(self, step: Step) -> Change | None:
+    def after_step(self, step: OptimizerStep) -> GaussianChange | None:
         """The change after this iteration; None: no change. Called after every iteration."""
         ...

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatnode.recon.optimize.control import adaptive
-from splatnode.recon.optimize.control.control import Change, Step
+from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.scene.gaussians import Gaussians, concatenate
 
 
@@ -26,7 +26,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_distance: float = 0.05
 
 
-def unpooled(gaussians: Gaussians, min_distance: float, neighbours: int) -> Gaussians:
+def unpool(gaussians: Gaussians, min_distance: float, neighbours: int) -> Gaussians:
     """The new Gaussians, half-way from each whose mean distance to its `neighbours` is above `min_distance` to these.
 
     The distance is in units of the world.
@@ -56,16 +56,16 @@ class ProximityControl:
         self._config = config
         self._adaptive = adaptive.load(config.adaptive, seed)
 
-    def after_step(self, step: Step) -> Change | None:
+    def after_step(self, step: OptimizerStep) -> GaussianChange | None:
         change = self._adaptive.after_step(step)
         if change is None or not adaptive.is_round(step, self._config.adaptive):
             return change
         min_distance = self._config.min_distance * adaptive.extent(step.Ts_world_camera)
-        grown = unpooled(change.gaussians, min_distance, self._config.neighbours)
+        grown = unpool(change.gaussians, min_distance, self._config.neighbours)
         if len(change.gaussians) + len(grown) > adaptive.limit(step, self._config.adaptive):
             return change
         fresh: Tensor = change.origin.new_full((len(grown),), -1)
-        return Change(concatenate([change.gaussians, grown]), torch.cat([change.origin, fresh]))
+        return GaussianChange(concatenate([change.gaussians, grown]), torch.cat([change.origin, fresh]))
 
 
 def load(config: Config, seed: int) -> ProximityControl:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatnode.recon.optimize.control.control import Change, Step
-from splatnode.recon.optimize.pseudo_views import between
+from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
+from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.contrast_masking import visibility
@@ -42,8 +42,8 @@ class Pruning:
         self._rng = np.random.default_rng(seed)
         self._due = list(config.at)
 
-    def after_step(self, step: Step) -> Change | None:
-        if not self._due or step.progress < self._due[0] or not self._timely(step):
+    def after_step(self, step: OptimizerStep) -> GaussianChange | None:
+        if not self._due or step.progress < self._due[0] or not self._is_due(step):
             return None
         while self._due and step.progress >= self._due[0]:
             self._due.pop(0)
@@ -51,13 +51,13 @@ class Pruning:
         cameras = [Camera(T, i.K, i.width, i.height) for T, i in zip(step.Ts_world_camera, step.images, strict=True)]
         count, off_path = self._config.between * len(cameras), self._config.off_path
         # What is hidden in all photographs shows between them.
-        cameras += [view.camera for view in between(cameras, count, off_path=off_path, rng=self._rng)]
-        worth = changes_without(gaussians, cameras, self._config.probes, self._generator)
+        cameras += [view.camera for view in sample_pseudo_views(cameras, count, off_path=off_path, rng=self._rng)]
+        worth = estimate_removal_changes(gaussians, cameras, self._config.probes, self._generator)
         worth[gaussians.source_frame == SHELL] = torch.inf  # the far shell is for what no photograph shows
-        kept = most_worth(worth, self._config.least_change, step.max_gaussians)
-        return Change(gaussians.subset(kept), kept)
+        kept = select_most_worthwhile(worth, self._config.least_change, step.max_gaussians)
+        return GaussianChange(gaussians.subset(kept), kept)
 
-    def _timely(self, step: Step) -> bool:
+    def _is_due(self, step: OptimizerStep) -> bool:
         """Whether the Gaussians have been, and can still be, fitted for long enough, or are more than allowed.
 
         The iterations that are left follow from the progress, which a deadline hastens.
@@ -70,7 +70,7 @@ class Pruning:
         return (step.iteration > needed_before and left >= needed_after) or too_many
 
 
-def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
+def select_most_worthwhile(worth: Tensor, least: float, limit: int | None) -> Tensor:
     """The indices, rising, of Gaussians of at least that `worth` (N,); the best `limit` of them where they are more."""
     kept = (worth >= least).nonzero()[:, 0]
     if limit is not None and len(kept) > limit:
@@ -78,7 +78,9 @@ def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
     return kept
 
 
-def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int, generator: torch.Generator) -> Tensor:
+def estimate_removal_changes(
+    gaussians: Gaussians, cameras: Sequence[Camera], probes: int, generator: torch.Generator
+) -> Tensor:
     """(N,) the squared visible difference to all images together if one Gaussian is left out: an estimate.
 
     What a pixel shows is linear in each opacity, so leaving a Gaussian out changes it by opacity * derivative.

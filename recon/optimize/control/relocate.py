@@ -14,8 +14,8 @@ import msgspec
 import torch
 from torch import Tensor
 
-from splatnode.recon.optimize.control.control import Change, Step
-from splatnode.recon.rasterize.reference import rotations
+from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
+from splatnode.recon.rasterize.reference import compute_rotations
 from splatnode.recon.scene.gaussians import Gaussians
 
 MAX_COPIES = 51  # of one Gaussian, itself included: the size of the authors' tables
@@ -42,17 +42,17 @@ class Relocation:
         self._config = config
         self._generator = torch.Generator().manual_seed(seed)
 
-    def after_step(self, step: Step) -> Change:
+    def after_step(self, step: OptimizerStep) -> GaussianChange:
         config = self._config
         gaussians = step.gaussians.map(Tensor.detach)
         origin = torch.arange(len(gaussians), device=gaussians.means.device)
         if step.iteration % config.every == 0 and step.progress < config.until:
-            gaussians, origin = relocated(gaussians, config.dead, self._generator)
+            gaussians, origin = relocate_dead(gaussians, config.dead, self._generator)
         size = config.noise * config.rate * config.final**step.progress
-        return Change(with_noise(gaussians, size, self._generator), origin)
+        return GaussianChange(add_noise(gaussians, size, self._generator), origin)
 
 
-def relocated(gaussians: Gaussians, dead: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
+def relocate_dead(gaussians: Gaussians, dead: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
     """The Gaussians with each dead one moved to a live one, and (N,) `Change.origin`.
 
     Those that now share a place look together as the live one did.
@@ -69,7 +69,7 @@ def relocated(gaussians: Gaussians, dead: float, generator: torch.Generator) -> 
     source = origin.clone()
     source[dead_rows] = drawn
     changed = copies[source] > 1
-    opacity, relative_scale = shared_by(copies[source][changed], opacities[source][changed])
+    opacity, relative_scale = split_opacity(copies[source][changed], opacities[source][changed])
     moved = gaussians.subset(source)
     logits, log_scales = moved.logit_opacities.clone(), moved.log_scales.clone()
     logits[changed] = torch.logit(opacity.clamp(dead, _ALMOST_OPAQUE))
@@ -77,7 +77,7 @@ def relocated(gaussians: Gaussians, dead: float, generator: torch.Generator) -> 
     return replace(moved, logit_opacities=logits, log_scales=log_scales), torch.where(changed, -1, origin)
 
 
-def shared_by(copies: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+def split_opacity(copies: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity, and scale relative to the one that is shared (M,), of each of `copies` that together look like one.
 
     `copies` and `opacities` are (M,); equation 9 of the paper.
@@ -91,10 +91,10 @@ def shared_by(copies: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
     return shared, opacities / total
 
 
-def with_noise(gaussians: Gaussians, size: float, generator: torch.Generator) -> Gaussians:
+def add_noise(gaussians: Gaussians, size: float, generator: torch.Generator) -> Gaussians:
     """The Gaussians with their means moved by `size` times covariance times normal noise, less the more opaque."""
     weight = torch.sigmoid(-_SHARPNESS * (gaussians.opacities - _TRANSPARENT))
-    axes = rotations(gaussians.quats) * gaussians.scales[:, None, :]
+    axes = compute_rotations(gaussians.quats) * gaussians.scales[:, None, :]
     noise = torch.randn(gaussians.means.shape, generator=generator).to(weight.device) * weight[:, None]
     moves = size * (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[:, :, 0]
     return replace(gaussians, means=gaussians.means + moves)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
-from splatnode.recon.optimize.supervision import Supervision, SurfaceTarget, at_size
+from splatnode.recon.optimize.supervision import Supervision, SurfaceTarget, resample_target
 from splatnode.recon.rasterize.render import Render
 
 _MIN_KNOWN = 0.5  # share of a patch's pixels whose depth is known
@@ -36,7 +36,7 @@ def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:
     def against(targets: Sequence[SurfaceTarget]) -> Evaluate:
         def evaluate(index: int, render: Render) -> Tensor:
             assert render.depth is not None  # it was asked for
-            truth, weights = (at_size(t, render.depth) for t in (targets[index].depth, targets[index].weights))
+            truth, weights = (resample_target(t, render.depth) for t in (targets[index].depth, targets[index].weights))
             patch, share = config.patch, config.share
             return local_depth_loss(render.depth, truth, weights, patch=patch, share=share, generator=generator)
 

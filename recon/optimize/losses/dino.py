@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatnode.recon.networks import weight_loading
-from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalised
-from splatnode.recon.networks.weight_folder import located
+from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalize_image
+from splatnode.recon.networks.weight_folder import locate_weights
 
 WEIGHTS = "dinov2/dinov2_vits14_pretrain.pth"
 
@@ -28,7 +28,7 @@ class DinoFeatures:
         scale = self.longer_side / max(image.shape[:2])
         size = [max(1, round(side * scale / PATCH)) * PATCH for side in image.shape[:2]]
         resized = functional.interpolate(
-            normalised(image)[None], size=size, mode="bilinear", antialias=True, align_corners=False
+            normalize_image(image)[None], size=size, mode="bilinear", antialias=True, align_corners=False
         )
         (tokens,) = self.network(resized, (len(self.network.blocks) - 1,))
         return functional.normalize(tokens[0, 0], dim=0)
@@ -36,7 +36,7 @@ class DinoFeatures:
 
 def load_dino() -> DinoFeatures | None:
     """None without weights. Raises ValueError where they are of another model."""
-    path = located(WEIGHTS)
+    path = locate_weights(WEIGHTS)
     return None if path is None else DinoFeatures(load_network(path))
 
 

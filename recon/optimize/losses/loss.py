@@ -30,7 +30,7 @@ class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     start: float = 0.0  # share of the iterations after which it counts
     end: float = 1.0  # share of the iterations after which it counts no more
 
-    def at(self, progress: float) -> float:
+    def weight_at(self, progress: float) -> float:
         """The weight at `progress` in [0, 1]."""
         return self.weight if self.start <= progress < self.end else 0.0
 

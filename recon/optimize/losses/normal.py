@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
-from splatnode.recon.optimize.supervision import Supervision, SurfaceTarget, at_size
+from splatnode.recon.optimize.supervision import Supervision, SurfaceTarget, resample_target
 from splatnode.recon.rasterize.render import Render
 
 _MIN_SQUARED_LENGTH = 1e-6  # of a rendered normal: thinner coverage has no direction
@@ -26,7 +26,10 @@ def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:
         def evaluate(index: int, render: Render) -> Tensor:
             assert render.normal is not None  # it was asked for
             target = targets[index]
-            truth, weights = at_size(target.normal, render.normal), at_size(target.weights, render.normal)
+            truth, weights = (
+                resample_target(target.normal, render.normal),
+                resample_target(target.weights, render.normal),
+            )
             return normal_loss(render.normal, truth, weights)
 
         return evaluate

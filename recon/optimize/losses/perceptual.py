@@ -25,7 +25,7 @@ class Perceptual(Protocol):
         """Which measure it is, for the report."""
         ...
 
-    def prepared(self, truth: Tensor) -> Distance:
+    def prepare_distance(self, truth: Tensor) -> Distance:
         """The distance from `truth` (H, W, 3) in [0, 1], whose own features are computed once; 0 for equal images."""
         ...
 
@@ -35,7 +35,7 @@ class LpipsDistance:
     network: Lpips
     name: str
 
-    def prepared(self, truth: Tensor) -> Distance:
+    def prepare_distance(self, truth: Tensor) -> Distance:
         with torch.no_grad():
             features = self.network.features(truth)
         return lambda image: self.network.distance(image, features)
@@ -51,7 +51,7 @@ class MultiScaleGradient:
     scales: int = 4
     name: str = "multi-scale gradient"
 
-    def prepared(self, truth: Tensor) -> Distance:
+    def prepare_distance(self, truth: Tensor) -> Distance:
         expected = [_slopes(level) for level in _pyramid(truth, self.scales)]
         strength = [sum(slope.abs().mean() for slope in level) + _FLAT for level in expected]
 

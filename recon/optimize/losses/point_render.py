@@ -19,12 +19,12 @@ def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:
     """LPIPS, or its stand-in without weights, between render and point render of each pseudo view."""
     perceptual = load_perceptual()
     renders = supervision.point_renders
-    distances = [perceptual.prepared(torch.from_numpy(shown.rgb)) for shown in renders]
+    distances = [perceptual.prepare_distance(torch.from_numpy(shown.rgb)) for shown in renders]
     seen = [torch.from_numpy(shown.seen)[..., None] for shown in renders]
 
-    def on_pseudo_view(index: int, render: Render) -> Tensor:
+    def evaluate_pseudo_view(index: int, render: Render) -> Tensor:
         assert render.rgb is not None  # it was asked for
         rgb = render.rgb if config.compare_unseen else torch.where(seen[index], render.rgb, 1.0)
         return distances[index](rgb)
 
-    return Loss(perceptual.name, on_pseudo_view=on_pseudo_view)
+    return Loss(perceptual.name, on_pseudo_view=evaluate_pseudo_view)

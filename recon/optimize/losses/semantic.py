@@ -42,11 +42,11 @@ def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:
         embeddings = [encode(_unit(image)) for image in supervision.images]
     nearest = [view.nearest for view in supervision.pseudo_views]
 
-    def on_pseudo_view(index: int, render: Render) -> Tensor:
+    def evaluate_pseudo_view(index: int, render: Render) -> Tensor:
         assert render.rgb is not None  # it was asked for
         return semantic_loss(encode(render.rgb), embeddings[nearest[index]])
 
-    return Loss(encode.name, on_pseudo_view=on_pseudo_view)
+    return Loss(encode.name, on_pseudo_view=evaluate_pseudo_view)
 
 
 def semantic_loss(embedding: Tensor, truth: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 
-def sampled(maps: Tensor, positions: Tensor) -> Tensor:
+def sample_maps(maps: Tensor, positions: Tensor) -> Tensor:
     """(C, ...): maps (C, H, W) at positions (..., 2), x and y in pixels from the first one's centre; 0 outside."""
     size = positions.new_tensor([maps.shape[2], maps.shape[1]])
     grid = ((2.0 * positions + 1.0) / size - 1.0).reshape(1, 1, -1, 2)
@@ -15,14 +15,14 @@ def sampled(maps: Tensor, positions: Tensor) -> Tensor:
     return found.reshape(len(maps), *positions.shape[:-1])
 
 
-def window(size: int) -> Tensor:
+def make_window(size: int) -> Tensor:
     """(size * size, 2): x and y of a window's pixels from its middle, row by row."""
     steps = torch.arange(size) - size // 2
     y, x = torch.meshgrid(steps, steps, indexing="ij")
     return torch.stack([x, y], -1).reshape(-1, 2)
 
 
-def _bounded(shifts: Tensor, height: int, width: int) -> Tensor:
+def _clamp_shifts(shifts: Tensor, height: int, width: int) -> Tensor:
     """Shifts that reach over at most a quarter of the longer side, as in training."""
     most = max(height, width) / 4.0
     return shifts.clamp(-most, most)
@@ -41,11 +41,11 @@ class DeformableConv(nn.Module):
     def forward(self, maps: Tensor) -> Tensor:
         """(1, C, H, W) to (1, C', H, W)."""
         height, width = maps.shape[2:]
-        shifts = _bounded(self.offset_conv(maps)[0], height, width)
+        shifts = _clamp_shifts(self.offset_conv(maps)[0], height, width)
         shifts = shifts.reshape(-1, 2, height, width).permute(0, 2, 3, 1).flip(-1)  # y comes first
         y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-        unshifted = torch.stack([x, y], -1) + window(self.SIZE)[:, None, None]  # (9, H, W, 2)
-        samples = sampled(maps[0], unshifted + shifts)
+        unshifted = torch.stack([x, y], -1) + make_window(self.SIZE)[:, None, None]  # (9, H, W, 2)
+        samples = sample_maps(maps[0], unshifted + shifts)
         weight = self.regular_conv.weight
         return torch.einsum("ocs,cshw->ohw", weight.flatten(2), samples)[None]
 
@@ -68,9 +68,11 @@ class DeformableDescriptor(nn.Module):
     def forward(self, features: Tensor, positions: Tensor) -> Tensor:
         """(M, C) descriptors of unit length: features (C, H, W) at positions (M, 2) in pixels from the first one's."""
         height, width = features.shape[1:]
-        patches = sampled(features, positions.floor()[:, None] + window(self.SIZE).to(positions))
+        patches = sample_maps(features, positions.floor()[:, None] + make_window(self.SIZE).to(positions))
         patches = patches.permute(1, 0, 2).reshape(len(positions), -1, self.SIZE, self.SIZE)
-        shifts = _bounded(self.offset_conv(patches), height, width).reshape(-1, 2, self.SAMPLES)  # all x, then all y
-        samples = sampled(features, positions[:, None] + shifts.transpose(1, 2))
+        shifts = _clamp_shifts(self.offset_conv(patches), height, width).reshape(
+            -1, 2, self.SAMPLES
+        )  # all x, then all y
+        samples = sample_maps(features, positions[:, None] + shifts.transpose(1, 2))
         seen = F.selu(self.sf_conv(samples[None])[0])
         return F.normalize(torch.einsum("cms,scd->md", seen, self.agg_weights), dim=1)

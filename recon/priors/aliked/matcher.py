@@ -12,8 +12,8 @@ from torch import Tensor
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.networks.crop import crop, cropped
-from splatnode.recon.priors.aliked.network import STRIDE, Aliked, Found
+from splatnode.recon.networks.crop import crop, crop_image
+from splatnode.recon.priors.aliked.network import STRIDE, Aliked, Keypoints
 
 
 class AlikedMatcher:
@@ -21,38 +21,38 @@ class AlikedMatcher:
 
     def __init__(self, network: Aliked, longer_side: int, num_keypoints: int) -> None:
         self._network, self._longer_side, self._count = network, longer_side, num_keypoints
-        self._found: WeakKeyDictionary[Frame, Found] = WeakKeyDictionary()
+        self._found: WeakKeyDictionary[Frame, Keypoints] = WeakKeyDictionary()
 
-    def with_points(self, keyframe: Keyframe) -> Keyframe:
-        features, mine = keyframe.features, self._keypoints(keyframe).points.numpy()
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
+        features, mine = keyframe.features, self._find_keypoints(keyframe).points.numpy()
         if len(mine) == 0 or np.array_equal(features.points[-len(mine) :], mine):
             return keyframe
         return replace(keyframe, features=replace(features, points=np.concatenate([features.points, mine])))
 
     def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
-        first, second = self._keypoints(keyframe1), self._keypoints(keyframe2)
+        first, second = self._find_keypoints(keyframe1), self._find_keypoints(keyframe2)
         added = [
             len(keyframe.features.points) - len(found.points)
             for keyframe, found in ((keyframe1, first), (keyframe2, second))
         ]
-        return mutual(first.descriptors, second.descriptors).numpy() + np.array(added)
+        return match_mutual(first.descriptors, second.descriptors).numpy() + np.array(added)
 
-    def _keypoints(self, keyframe: Keyframe) -> Found:
+    def _find_keypoints(self, keyframe: Keyframe) -> Keypoints:
         frame = keyframe.frame
         if frame not in self._found:
-            self._found[frame] = self._extracted(frame.image)
+            self._found[frame] = self._extract_keypoints(frame.image)
         return self._found[frame]
 
     @torch.inference_mode()
-    def _extracted(self, image: npt.NDArray[np.uint8]) -> Found:
+    def _extract_keypoints(self, image: npt.NDArray[np.uint8]) -> Keypoints:
         """In pixels of an image (H, W, 3)."""
         height, width = image.shape[:2]
         to = crop(width, height, min(self._longer_side, max(width, height)), STRIDE)
-        found = self._network(cropped(image, to).permute(2, 0, 1), self._count)
-        return replace(found, points=torch.from_numpy(to.to_photograph(found.points.double().numpy())))
+        found = self._network(crop_image(image, to).permute(2, 0, 1), self._count)
+        return replace(found, points=torch.from_numpy(to.map_to_image(found.points.double().numpy())))
 
 
-def mutual(descriptors1: Tensor, descriptors2: Tensor) -> Tensor:
+def match_mutual(descriptors1: Tensor, descriptors2: Tensor) -> Tensor:
     """(M, 2) indices of descriptors (*, C) of unit length that are each other's nearest, the most distinct first.
 
     A match is the more distinct the nearer it is compared with the second-nearest.

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from splatnode.recon.networks.weight_loading import load_network, read_weights
 from splatnode.recon.priors.aliked.deformable import DeformableConv, DeformableDescriptor
-from splatnode.recon.priors.aliked.detection import detected
+from splatnode.recon.priors.aliked.detection import detect_keypoints
 
 STRIDE = 32  # of the coarsest features: an image has sides that this divides
 _STRIDES = (1, 2, 8, STRIDE)
@@ -23,7 +23,7 @@ _N16 = 16  # width of the N16 network
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Keypoints:
     """The best keypoints of an image, the best first."""
 
     points: Tensor  # (M, 2) pixels, top-left pixel centre at (0.5, 0.5)
@@ -47,7 +47,7 @@ class Aliked(nn.Module):
         )
         self.desc_head = DeformableDescriptor(channels)
 
-    def maps(self, image: Tensor) -> tuple[Tensor, Tensor]:
+    def compute_maps(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Features (C, H, W) of unit length, and scores (H, W) from 0 to 1, of an RGB image (3, H, W) in [0, 1].
 
         Raises ValueError where the image's sides are no multiples of STRIDE.
@@ -68,11 +68,11 @@ class Aliked(nn.Module):
         scores = torch.sigmoid(self.score_head(together))
         return F.normalize(together, dim=1)[0], scores[0, 0]
 
-    def forward(self, image: Tensor, count: int) -> Found:
+    def forward(self, image: Tensor, count: int) -> Keypoints:
         """At most `count` keypoints of an image as `maps` takes it."""
-        features, scores = self.maps(image)
-        positions = detected(scores, count)
-        return Found(positions + 0.5, self.desc_head(features, positions))
+        features, scores = self.compute_maps(image)
+        positions = detect_keypoints(scores, count)
+        return Keypoints(positions + 0.5, self.desc_head(features, positions))
 
 
 class _Block(nn.Module):
@@ -85,9 +85,9 @@ class _Block(nn.Module):
         self.conv2, self.bn2 = conv(out_channels, out_channels), nn.BatchNorm2d(out_channels)
 
     def forward(self, maps: Tensor) -> Tensor:
-        return F.selu(self._convolved(maps))
+        return F.selu(self._convolve(maps))
 
-    def _convolved(self, maps: Tensor) -> Tensor:
+    def _convolve(self, maps: Tensor) -> Tensor:
         return self.bn2(self.conv2(F.selu(self.bn1(self.conv1(maps)))))
 
 
@@ -99,7 +99,7 @@ class _ResidualBlock(_Block):
         self.downsample = nn.Conv2d(channels, out_channels, 1)
 
     def forward(self, maps: Tensor) -> Tensor:
-        return F.selu(self._convolved(maps) + self.downsample(maps))
+        return F.selu(self._convolve(maps) + self.downsample(maps))
 
 
 def _conv(channels: int, out_channels: int, size: int = 3) -> nn.Conv2d:

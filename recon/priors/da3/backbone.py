@@ -46,9 +46,9 @@ class Backbone(Dinov2):
         self.norm = nn.LayerNorm(size.vit.width)
         self._joint_from, self._layers = size.joint_from, size.layers
 
-    def views(self, images: Tensor, cameras: Tensor | None) -> Features:
-        """Of `normalised` images (S, 3, H, W); `cameras` (S, width) are tokens of known ones."""
-        tokens = self.embedded(images)
+    def encode_views(self, images: Tensor, cameras: Tensor | None) -> Features:
+        """Encodes images (S, 3, H, W) of `normalize_image`; `cameras` (S, width) are tokens of known ones."""
+        tokens = self.embed_patches(images)
         rows, columns = (side // dinov2.PATCH for side in images.shape[2:])
         within, across = self._rotaries(rows, columns, len(images))
         order = torch.arange(len(images))
@@ -56,7 +56,7 @@ class Backbone(Dinov2):
         patches, last = [], tokens
         for index, block in enumerate(self.blocks):
             if index == self._joint_from - 1 and cameras is None and len(images) >= _MIN_VIEWS_TO_CHOOSE:
-                order = _reference_first(tokens[:, 0])
+                order = _order_reference_first(tokens[:, 0])
                 tokens, own = tokens[order], own[order]
             if index == self._joint_from:
                 tokens = torch.cat([self._camera_tokens(cameras, len(images))[:, None], tokens[:, 1:]], 1)
@@ -80,10 +80,12 @@ class Backbone(Dinov2):
         """Within a view patches are at their places from 1 and the camera's token at 0; across views all are at 1."""
         dimension = self.size.width // self.size.heads
         places = torch.cat([torch.zeros(1, 2), 1.0 + grid_positions(rows, columns)])
-        return Rotary.of(places, dimension), Rotary.of(places.clamp(max=1.0).repeat(count, 1), dimension)
+        return Rotary.create_from_positions(places, dimension), Rotary.create_from_positions(
+            places.clamp(max=1.0).repeat(count, 1), dimension
+        )
 
 
-def _reference_first(tokens: Tensor) -> Tensor:
+def _order_reference_first(tokens: Tensor) -> Tensor:
     """The order of views (S,) by their class tokens (S, C): first the most usual one, then the others as they came.
 
     It is the one whose likeness to the others, length and variance lie nearest to the middle of their ranges.

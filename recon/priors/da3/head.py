@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from splatnode.recon.networks.dinov2 import PATCH
-from splatnode.recon.networks.feature_fusion import Scratch, enlarged, resizers
+from splatnode.recon.networks.feature_fusion import Scratch, resizers, upsample
 from splatnode.recon.networks.transformer import Block, Mlp
 from splatnode.recon.priors.da3.backbone import Size
 
@@ -33,9 +33,9 @@ class DepthHead(nn.Module):
         images = []
         for tokens, project, resize in zip(layers, self.projects, self.resize_layers, strict=True):
             image = project(self.norm(tokens).transpose(1, 2).unflatten(2, grid))
-            images.append(resize(_positioned(image, aspect)))
-        fused = self.scratch.output_conv1(self.scratch.fused(images))
-        raw = self.scratch.output_conv2(_positioned(enlarged(fused, (height, width)), aspect))
+            images.append(resize(_add_position_waves(image, aspect)))
+        fused = self.scratch.output_conv1(self.scratch.fuse(images))
+        raw = self.scratch.output_conv2(_add_position_waves(upsample(fused, (height, width)), aspect))
         return raw[:, 0].exp(), 1.0 + raw[:, 1].exp()
 
 
@@ -82,7 +82,7 @@ class CameraEncoder(nn.Module):
         return self.trunk_norm(tokens)
 
 
-def _positioned(image: Tensor, aspect: float) -> Tensor:
+def _add_position_waves(image: Tensor, aspect: float) -> Tensor:
     """(S, C, h, w) with sines and cosines of each pixel's place added; `aspect` is the photograph's width by height."""
     _, channels, height, width = image.shape
     diagonal = (1.0 + aspect**2) ** 0.5

@@ -12,15 +12,15 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.networks.crop import Crop, crop, cropped
-from splatnode.recon.networks.dinov2 import PATCH, normalised
-from splatnode.recon.priors.da3.network import Estimate, PlacedCamera
+from splatnode.recon.networks.crop import Crop, crop, crop_image
+from splatnode.recon.networks.dinov2 import PATCH, normalize_image
+from splatnode.recon.priors.da3.network import DepthEstimate, PlacedCamera
 
 
 class Network(Protocol):
-    """What the prior needs of a network; `DepthAnything3` is one."""
+    """The interface of the prior's network; `DepthAnything3` implements it."""
 
-    def __call__(self, images: Tensor, cameras: Sequence[PlacedCamera] | None = None) -> list[Estimate]: ...
+    def __call__(self, images: Tensor, cameras: Sequence[PlacedCamera] | None = None) -> list[DepthEstimate]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,28 +32,30 @@ class KnownCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What the network says of a keyframe, and how that was cropped for it."""
+class CroppedEstimate:
+    """The network's estimate for a keyframe, and the crop that it was made for."""
 
-    estimate: Estimate
+    estimate: DepthEstimate
     crop: Crop
 
 
-def ask(
+def estimate_keyframes(
     network: Network, keyframes: Sequence[Keyframe], longer_side: int, cameras: Sequence[KnownCamera] | None = None
-) -> list[Answer]:
-    """What the network says of these keyframes together; photographs of different shapes are cut to what all have."""
+) -> list[CroppedEstimate]:
+    """Runs the network on these keyframes together; images are cropped to a common size."""
     crops = [crop(keyframe.frame.width, keyframe.frame.height, longer_side, PATCH) for keyframe in keyframes]
     width, height = min(each.width for each in crops), min(each.height for each in crops)
-    crops = [each.cut(width, height) for each in crops]
-    images = [normalised(cropped(keyframe.frame.image, to)) for keyframe, to in zip(keyframes, crops, strict=True)]
-    placed = None if cameras is None else [_placed(camera, to) for camera, to in zip(cameras, crops, strict=True)]
+    crops = [each.crop_centre(width, height) for each in crops]
+    images = [
+        normalize_image(crop_image(keyframe.frame.image, to)) for keyframe, to in zip(keyframes, crops, strict=True)
+    ]
+    placed = None if cameras is None else [_place_camera(camera, to) for camera, to in zip(cameras, crops, strict=True)]
     estimates = network(torch.stack(images), placed)
-    return [Answer(estimate, to) for estimate, to in zip(estimates, crops, strict=True)]
+    return [CroppedEstimate(estimate, to) for estimate, to in zip(estimates, crops, strict=True)]
 
 
-def _placed(camera: KnownCamera, to: Crop) -> PlacedCamera:
-    """With the principal point in the middle, as the network has it."""
+def _place_camera(camera: KnownCamera, to: Crop) -> PlacedCamera:
+    """Makes the cropped image's camera, with a central principal point, as the network assumes."""
     focal = camera.focal * to.scale
     K = np.array([[focal, 0.0, to.width / 2], [0.0, focal, to.height / 2], [0.0, 0.0, 1.0]])
     return PlacedCamera(camera.T_world_camera, K)

@@ -16,8 +16,8 @@ from scipy.spatial import KDTree
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import nearest_neighbours
 from splatnode.recon.matching.features import describe
-from splatnode.recon.networks.crop import cropped
-from splatnode.recon.priors.da3.inference import Answer, Network, ask
+from splatnode.recon.networks.crop import crop_image
+from splatnode.recon.priors.da3.inference import CroppedEstimate, Network, estimate_keyframes
 
 Array = npt.NDArray[np.float64]
 
@@ -34,29 +34,29 @@ class WarpMatcher:
     network: Network
     longer_side: int
 
-    def with_points(self, keyframe: Keyframe) -> Keyframe:
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
         return keyframe
 
     def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
-        first, second = ask(self.network, [keyframe1, keyframe2], self.longer_side)
-        origin = _origin(first, second)
+        first, second = estimate_keyframes(self.network, [keyframe1, keyframe2], self.longer_side)
+        origin = _compute_origins(first, second)
         grey1, grey2 = (
-            (cropped(keyframe.frame.image, answer.crop).mean(-1) * 255).byte().numpy()
+            (crop_image(keyframe.frame.image, answer.crop).mean(-1) * 255).byte().numpy()
             for keyframe, answer in ((keyframe1, first), (keyframe2, second))
         )
         from_u, from_v = np.moveaxis((origin - 0.5).astype(np.float32), -1, 0)
         warped = np.asarray(cv2.remap(grey1, from_u, from_v, cv2.INTER_LINEAR), np.uint8)
-        where1, chosen1 = _warped_at(first.crop.to_network(keyframe1.features.points), origin)
-        where2 = second.crop.to_network(keyframe2.features.points)
+        where1, chosen1 = _find_warped_pixels(first.crop.map_to_network(keyframe1.features.points), origin)
+        where2 = second.crop.map_to_network(keyframe2.features.points)
         (chosen2,) = np.nonzero(((where2 >= 0) & (where2 < [second.crop.width, second.crop.height])).all(1))
         # Upright and of one size: both pictures are from one viewpoint.
         described1 = describe(warped, where1, _KEYPOINT_PX)
         described2 = describe(grey2, where2[chosen2], _KEYPOINT_PX)
-        found = nearest_neighbours.match(described1, described2, nearest_neighbours.Config())
+        found = nearest_neighbours.match(described1, described2, nearest_neighbours.NearestNeighbourConfig())
         return np.stack([chosen1[found[:, 0]], chosen2[found[:, 1]]], 1)
 
 
-def _origin(first: Answer, second: Answer) -> Array:
+def _compute_origins(first: CroppedEstimate, second: CroppedEstimate) -> Array:
     """(H, W, 2): the pixel of the first photograph that shows what each pixel of the second shows; else _NOWHERE."""
     depth, camera2, camera1 = second.estimate.depth, second.estimate.camera, first.estimate.camera
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
@@ -69,7 +69,7 @@ def _origin(first: Answer, second: Answer) -> Array:
     return np.where(inside[..., None], projected, _NOWHERE)
 
 
-def _warped_at(points: Array, origin: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+def _find_warped_pixels(points: Array, origin: Array) -> tuple[Array, npt.NDArray[np.int64]]:
     """(M, 2) pixels of the warped picture that show features `points` (F, 2) of the first photograph; (M,) which."""
     inside = (origin > _NOWHERE).all(-1)
     rows, columns = np.nonzero(inside)

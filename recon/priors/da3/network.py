@@ -39,8 +39,8 @@ class PlacedCamera:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
-    """What the network says about one of its photographs."""
+class DepthEstimate:
+    """The network's estimate for one of its images."""
 
     depth: npt.NDArray[np.float32]  # (H, W) z in the camera frame, in the unit of the cameras' positions
     confidence: npt.NDArray[np.float32]  # (H, W), from 1
@@ -58,19 +58,19 @@ class DepthAnything3(nn.Module):
         self.cam_enc = CameraEncoder(size)
 
     @torch.inference_mode()
-    def forward(self, images: Tensor, cameras: Sequence[PlacedCamera] | None = None) -> list[Estimate]:
-        """Of `recon.networks.dinov2.normalised` images (S, 3, H, W), with their `cameras` where these are known.
+    def forward(self, images: Tensor, cameras: Sequence[PlacedCamera] | None = None) -> list[DepthEstimate]:
+        """Estimates depth of images (S, 3, H, W) of `normalize_image`, with their `cameras` where known.
 
         The world's frame and unit are the network's own.
         """
         height, width = images.shape[2:]
         backbone = self.backbone["pretrained"]
         assert isinstance(backbone, Backbone)
-        known = None if cameras is None else self.cam_enc(_encoded(_brought_near(cameras), height, width))
-        features = backbone.views(images, known)
+        known = None if cameras is None else self.cam_enc(_encode_cameras(_normalize_cameras(cameras), height, width))
+        features = backbone.encode_views(images, known)
         depth, confidence = self.head(features.patches, height, width)
-        placed = _decoded(self.cam_dec(features.cameras), height, width)
-        return [Estimate(*view) for view in zip(depth.numpy(), confidence.numpy(), placed, strict=True)]
+        placed = _decode_cameras(self.cam_dec(features.cameras), height, width)
+        return [DepthEstimate(*view) for view in zip(depth.numpy(), confidence.numpy(), placed, strict=True)]
 
 
 def load_network(path: Path, size: Size = SMALL) -> DepthAnything3:
@@ -80,7 +80,7 @@ def load_network(path: Path, size: Size = SMALL) -> DepthAnything3:
     return weight_loading.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
 
 
-def _brought_near(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:
+def _normalize_cameras(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:
     """In the first camera's frame, at a median distance from it of 1, as the network was trained with."""
     to_first = np.linalg.inv(cameras[0].T_world_camera)
     Ts_first_camera = [to_first @ camera.T_world_camera for camera in cameras]
@@ -91,7 +91,7 @@ def _brought_near(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:
     return [PlacedCamera(T, camera.K) for T, camera in zip(Ts_first_camera, cameras, strict=True)]
 
 
-def _encoded(cameras: Sequence[PlacedCamera], height: int, width: int) -> Tensor:
+def _encode_cameras(cameras: Sequence[PlacedCamera], height: int, width: int) -> Tensor:
     """(S, 9) as the network's heads write cameras."""
     rows = []
     for camera in cameras:
@@ -101,7 +101,7 @@ def _encoded(cameras: Sequence[PlacedCamera], height: int, width: int) -> Tensor
     return torch.from_numpy(np.stack(rows).astype(np.float32))
 
 
-def _decoded(encoded: Tensor, height: int, width: int) -> list[PlacedCamera]:
+def _decode_cameras(encoded: Tensor, height: int, width: int) -> list[PlacedCamera]:
     """The cameras of images (height, width) from (S, 9) as `CameraHead` gives them; principal points are central."""
     cameras = []
     for row in encoded.numpy().astype(np.float64):

@@ -9,10 +9,10 @@ import msgspec
 
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks.weight_folder import find
-from splatnode.recon.priors.da3.inference import KnownCamera, Network, ask
+from splatnode.recon.priors.da3.inference import KnownCamera, Network, estimate_keyframes
 from splatnode.recon.priors.da3.matcher import WarpMatcher
 from splatnode.recon.priors.da3.network import load_network
-from splatnode.recon.priors.network_depth import registered_pointmap
+from splatnode.recon.priors.network_depth import make_registered_pointmap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.registration.register import Registration
@@ -49,10 +49,10 @@ class Da3Prior(Prior):
             keyframes = [graph.keyframes[camera.index] for camera in some]
             known = [KnownCamera(camera.T_world_camera, camera.focal) for camera in some]
             for camera, answer in zip(
-                some, ask(self._network, keyframes, self._config.longer_side, known), strict=True
+                some, estimate_keyframes(self._network, keyframes, self._config.longer_side, known), strict=True
             ):
                 depth, sure = answer.estimate.depth, answer.estimate.confidence
-                found.append(registered_pointmap(graph, registration, camera, answer.crop, depth, sure))
+                found.append(make_registered_pointmap(graph, registration, camera, answer.crop, depth, sure))
             pause()
         return tuple(found)
 

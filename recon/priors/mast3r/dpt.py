@@ -55,7 +55,7 @@ class DensePrediction(nn.Module):
 
 
 class _Scratch(nn.Module):
-    """What brings the four layers to one width, and fuses them. The checkpoint names each `layer_rn` twice."""
+    """Layers that fuse four feature maps at one width. The checkpoint names each `layer_rn` twice."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -37,7 +37,7 @@ _MAX_LOG_SCALE_STEP = 0.5  # of one step of the joint fit
 
 @dataclass(frozen=True, eq=False)
 class PairPoints:
-    """What an ordered pair of views says, in the frame and at the scale of its own first camera."""
+    """The network's points of an ordered pair, in the frame and at the scale of its own first camera."""
 
     first: Map  # (H, W, 3) points of the first image
     first_confidence: Map  # (H, W), from 1
@@ -67,7 +67,7 @@ class _Edge:
     weights: Array  # (S,)
 
 
-def align(pairs: Mapping[tuple[int, int], PairPoints], *, shared_focal: bool = True) -> list[AlignedView]:
+def align_views(pairs: Mapping[tuple[int, int], PairPoints], *, shared_focal: bool = True) -> list[AlignedView]:
     """All views 0 .. N-1 that occur in `pairs`, in the frame of view 0, whose median depth becomes 1.
 
     Raises ValueError where the pairs do not connect all views, or a view is never first.
@@ -82,13 +82,13 @@ def align(pairs: Mapping[tuple[int, int], PairPoints], *, shared_focal: bool = T
     depths, confidences, units = [], [], {}
     for view in range(count):
         named = {pair: points for pair, points in pairs.items() if pair[0] == view}
-        depth, confidence, scales = _own_depth(list(named.values()))
+        depth, confidence, scales = _merge_own_depth(list(named.values()))
         depths.append(depth)
         confidences.append(confidence)
         units |= dict(zip(named, scales, strict=True))
     edges = [_edge(pair, pairs[pair], units[pair], depths[pair[1]], focals[pair[1]]) for pair in pairs]
-    similarities = _refined(_start(edges, count), edges)
-    return _in_first_frame(similarities, edges, focals, depths, confidences)
+    similarities = _refine_similarities(_initialize_similarities(edges, count), edges)
+    return _convert_to_first_frame(similarities, edges, focals, depths, confidences)
 
 
 def _focal(pairs: Sequence[PairPoints]) -> float:
@@ -111,7 +111,7 @@ def _focal(pairs: Sequence[PairPoints]) -> float:
     return focal
 
 
-def _own_depth(pairs: Sequence[PairPoints]) -> tuple[Map, Map, list[float]]:
+def _merge_own_depth(pairs: Sequence[PairPoints]) -> tuple[Map, Map, list[float]]:
     """A view's depth map from all pairs that it is first in, its confidence, and each pair's unit in that map's."""
     depths = np.stack([pair.first[..., 2] for pair in pairs])
     confidence = np.stack([pair.first_confidence for pair in pairs])
@@ -163,7 +163,7 @@ def _procrustes(source: Array, target: Array, weights: Array) -> Similarity:
     return fit
 
 
-def _start(edges: Sequence[_Edge], count: int) -> list[Similarity]:
+def _initialize_similarities(edges: Sequence[_Edge], count: int) -> list[Similarity]:
     """View-to-world similarities by the spanning tree of pairs that most other pairs agree with."""
     relative = [_procrustes(edge.own, edge.seen, edge.weights) for edge in edges]  # second's frame to first's
     errors = np.array([_error(edge, _IDENTITY, fit) for edge, fit in zip(edges, relative, strict=True)])
@@ -171,7 +171,7 @@ def _start(edges: Sequence[_Edge], count: int) -> list[Similarity]:
     best: tuple[float, list[Similarity]] | None = None
     for _ in range(_NUM_TREES):
         order = np.argsort(errors * rng.lognormal(0.0, _TREE_SPREAD, len(edges)), kind="stable")
-        placed = _along_tree(order.tolist(), edges, relative, count)
+        placed = _place_along_tree(order.tolist(), edges, relative, count)
         agreeing = sum(_error(edge, placed[edge.first], placed[edge.second]) < _AGREEMENT for edge in edges)
         spread = sum(min(_error(edge, placed[edge.first], placed[edge.second]), _AGREEMENT) for edge in edges)
         score = agreeing - spread / _AGREEMENT
@@ -181,7 +181,7 @@ def _start(edges: Sequence[_Edge], count: int) -> list[Similarity]:
     return best[1]
 
 
-def _along_tree(
+def _place_along_tree(
     order: Sequence[int], edges: Sequence[_Edge], relative: Sequence[Similarity], count: int
 ) -> list[Similarity]:
     """Every view placed from view 0 along the first edges in `order` that reach a new view."""
@@ -206,7 +206,9 @@ def _error(edge: _Edge, first: Similarity, second: Similarity) -> float:
     return float(np.median(gap / np.maximum(second.scale * np.linalg.norm(edge.own, axis=1), 1e-12)))
 
 
-def _refined(similarities: list[Similarity], edges: Sequence[_Edge], iterations: int = 15) -> list[Similarity]:
+def _refine_similarities(
+    similarities: list[Similarity], edges: Sequence[_Edge], iterations: int = 15
+) -> list[Similarity]:
     """All views together, by Gauss-Newton on the reweighted gaps of all pairs; view 0 stays.
 
     Geman-McClure weights: a wrong pair has hundreds of gaps far out, and Cauchy's would add up their pull to most of
@@ -221,7 +223,10 @@ def _refined(similarities: list[Similarity], edges: Sequence[_Edge], iterations:
             length = np.maximum(second.scale * np.linalg.norm(edge.own, axis=1), 1e-12)
             gap = (there - here) / length[:, None]
             weights = edge.weights / (1.0 + (gap**2).sum(1) / _ROBUST**2) ** 2 / edge.weights.sum()
-            jacobian = np.concatenate([_motion(there, first), -_motion(here, second)], axis=2) / length[:, None, None]
+            jacobian = (
+                np.concatenate([_compute_jacobian(there, first), -_compute_jacobian(here, second)], axis=2)
+                / length[:, None, None]
+            )
             index = np.concatenate([7 * edge.first + np.arange(7), 7 * edge.second + np.arange(7)])
             weighted = weights[:, None, None] * jacobian
             normal[np.ix_(index, index)] += np.einsum("sri,srj->ij", weighted, jacobian)
@@ -229,13 +234,13 @@ def _refined(similarities: list[Similarity], edges: Sequence[_Edge], iterations:
         free = np.arange(7, 7 * count)
         damped = normal[np.ix_(free, free)] + 1e-9 * np.diag(np.diag(normal)[free]) + 1e-12 * np.eye(len(free))
         step = -np.linalg.solve(damped, gradient[free]).reshape(-1, 7)
-        similarities = [similarities[0], *(_moved(s, d) for s, d in zip(similarities[1:], step, strict=True))]
+        similarities = [similarities[0], *(_apply_step(s, d) for s, d in zip(similarities[1:], step, strict=True))]
         if np.abs(step).max() < _CONVERGED:
             break
     return similarities
 
 
-def _motion(points: Array, similarity: Similarity) -> Array:
+def _compute_jacobian(points: Array, similarity: Similarity) -> Array:
     """(S, 3, 7) change of world points (S, 3) with rotation about, translation and log scale from their camera."""
     arm = points - similarity.translation
     change = np.zeros((len(points), 3, 7))
@@ -247,14 +252,14 @@ def _motion(points: Array, similarity: Similarity) -> Array:
     return change
 
 
-def _moved(similarity: Similarity, step: npt.NDArray[np.floating]) -> Similarity:
+def _apply_step(similarity: Similarity, step: npt.NDArray[np.floating]) -> Similarity:
     """The similarity after a `step` (7,) of the joint fit, in the order of `_motion`."""
     rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ similarity.rotation
     growth = float(np.exp(np.clip(step[6], -_MAX_LOG_SCALE_STEP, _MAX_LOG_SCALE_STEP)))
     return Similarity(similarity.scale * growth, rotation, similarity.translation + step[3:6])
 
 
-def _in_first_frame(
+def _convert_to_first_frame(
     similarities: Sequence[Similarity],
     edges: Sequence[_Edge],
     focals: Sequence[float],

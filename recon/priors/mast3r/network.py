@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from splatnode.recon.networks import weight_loading
 from splatnode.recon.networks.rotary import Rotary, grid_positions
-from splatnode.recon.networks.transformer import Attention, Block, Mlp, PatchEmbedding, attend, by_head
+from splatnode.recon.networks.transformer import Attention, Block, Mlp, PatchEmbedding, attend, split_heads
 from splatnode.recon.priors.mast3r.dpt import DensePrediction
 
 
@@ -40,7 +40,7 @@ PUBLISHED = Size()
 
 
 @dataclass(frozen=True, eq=False)
-class Encoded:
+class EncodedImage:
     """An image after the encoder. It serves every pair that the image is part of."""
 
     tokens: Tensor  # (h w, encoder_width) for h x w patches
@@ -51,7 +51,7 @@ class Encoded:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a pair says about one of its images. Points are in the frame of the pair's first camera."""
+    """The prediction for one image of a pair. Points are in the frame of the pair's first camera."""
 
     points: Tensor  # (H, W, 3), up to one scale for the pair
     confidence: Tensor  # (H, W), from 1
@@ -77,7 +77,7 @@ class Mast3r(nn.Module):
         self.downstream_head1 = _Head(size)
         self.downstream_head2 = _Head(size)
 
-    def encode(self, image: Tensor) -> Encoded:
+    def encode(self, image: Tensor) -> EncodedImage:
         """`image` (3, H, W) in [-1, 1], its sides multiples of the patch."""
         _, height, width = image.shape
         patch = self.size.patch
@@ -85,15 +85,18 @@ class Mast3r(nn.Module):
             raise ValueError(f"image must be (3, H, W) with H and W multiples of {patch}, got {tuple(image.shape)}")
         positions = grid_positions(height // patch, width // patch).to(image.device)
         tokens = self.patch_embed(image[None])[0]
-        rotary = Rotary.of(positions, self.size.encoder_width // self.size.encoder_heads)
+        rotary = Rotary.create_from_positions(positions, self.size.encoder_width // self.size.encoder_heads)
         for block in self.enc_blocks:
             tokens = block(tokens, rotary)
-        return Encoded(self.enc_norm(tokens), positions, height, width)
+        return EncodedImage(self.enc_norm(tokens), positions, height, width)
 
-    def decode(self, first: Encoded, second: Encoded) -> tuple[Prediction, Prediction]:
-        """What the pair says about the first and the second image, both in the first camera's frame."""
+    def decode(self, first: EncodedImage, second: EncodedImage) -> tuple[Prediction, Prediction]:
+        """Predicts the first and the second image, both in the first camera's frame."""
         dimension = self.size.decoder_width // self.size.decoder_heads
-        rotary1, rotary2 = Rotary.of(first.positions, dimension), Rotary.of(second.positions, dimension)
+        rotary1, rotary2 = (
+            Rotary.create_from_positions(first.positions, dimension),
+            Rotary.create_from_positions(second.positions, dimension),
+        )
         tokens1, tokens2 = self.decoder_embed(first.tokens), self.decoder_embed(second.tokens)
         layers1, layers2 = [first.tokens], [second.tokens]
         for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
@@ -127,9 +130,9 @@ class _CrossAttention(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor, other: Tensor, rotary: Rotary, rotary_other: Rotary) -> Tensor:
-        query = by_head(self.projq(x), self._heads)
-        key, value = by_head(self.projk(other), self._heads), by_head(self.projv(other), self._heads)
-        return self.proj(attend(rotary.turned(query), rotary_other.turned(key), value))
+        query = split_heads(self.projq(x), self._heads)
+        key, value = split_heads(self.projk(other), self._heads), split_heads(self.projv(other), self._heads)
+        return self.proj(attend(rotary.rotate(query), rotary_other.rotate(key), value))
 
 
 class _DecoderBlock(nn.Module):

@@ -16,10 +16,10 @@ from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks.crop import Crop
 from splatnode.recon.networks.weight_folder import find
-from splatnode.recon.priors.mast3r.global_alignment import align
-from splatnode.recon.priors.mast3r.inference import Asked, Network
+from splatnode.recon.priors.mast3r.global_alignment import align_views
+from splatnode.recon.priors.mast3r.inference import Network, NetworkCache
 from splatnode.recon.priors.mast3r.network import Prediction, load_network
-from splatnode.recon.priors.network_depth import registered_pointmap
+from splatnode.recon.priors.network_depth import make_registered_pointmap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.registration.register import Registration
@@ -49,7 +49,7 @@ class Mast3rPrior(Prior):
 
     def __init__(self, network: Network, config: Config) -> None:
         self._config = config
-        self._asked = Asked(network, config.longer_side)
+        self._asked = NetworkCache(network, config.longer_side)
         self.matcher = DescriptorMatcher(self._asked)
 
     def pointmaps(
@@ -57,11 +57,11 @@ class Mast3rPrior(Prior):
     ) -> tuple[Pointmap, ...]:
         """The aligned depth maps, each brought to the scale of the registered points that its camera sees."""
         keyframes = [graph.keyframes[camera.index] for camera in registration.cameras]
-        views = align(self._asked.points(keyframes, self._config.max_neighbours))
+        views = align_views(self._asked.predict_points(keyframes, self._config.max_neighbours))
         pause()
-        crops = [self._asked.crop_of(keyframe) for keyframe in keyframes]
+        crops = [self._asked.make_crop(keyframe) for keyframe in keyframes]
         return tuple(
-            registered_pointmap(graph, registration, camera, to, view.depth, view.confidence)
+            make_registered_pointmap(graph, registration, camera, to, view.depth, view.confidence)
             for camera, view, to in zip(registration.cameras, views, crops, strict=True)
         )
 
@@ -70,16 +70,16 @@ class Mast3rPrior(Prior):
 class DescriptorMatcher:
     """A `recon.matching.match.Matcher` by the network's descriptors at the features that keyframes have."""
 
-    asked: Asked
+    asked: NetworkCache
 
-    def with_points(self, keyframe: Keyframe) -> Keyframe:
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
         return keyframe
 
     def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
-        first, second = self.asked.pair(keyframe1, keyframe2)
-        found1, inside1 = _at_features(first, self.asked.crop_of(keyframe1), keyframe1)
-        found2, inside2 = _at_features(second, self.asked.crop_of(keyframe2), keyframe2)
-        matches = _mutual(found1, found2)
+        first, second = self.asked.predict_pair(keyframe1, keyframe2)
+        found1, inside1 = _sample_descriptors(first, self.asked.make_crop(keyframe1), keyframe1)
+        found2, inside2 = _sample_descriptors(second, self.asked.make_crop(keyframe2), keyframe2)
+        matches = _match_mutual(found1, found2)
         return np.stack([inside1[matches[:, 0]], inside2[matches[:, 1]]], 1)
 
 
@@ -90,17 +90,19 @@ def load(config: Config) -> Mast3rPrior:
     return Mast3rPrior(network, config)
 
 
-def _at_features(
+def _sample_descriptors(
     prediction: Prediction, crop: Crop, keyframe: Keyframe
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
     """(F, D) descriptors at those features that the crop shows, and which they are (F,)."""
-    pixels = np.floor(crop.to_network(keyframe.features.points)).astype(np.int64)
+    pixels = np.floor(crop.map_to_network(keyframe.features.points)).astype(np.int64)
     (inside,) = np.nonzero(((pixels >= 0) & (pixels < [crop.width, crop.height])).all(1))
     descriptors = prediction.descriptors.numpy()[pixels[inside, 1], pixels[inside, 0]]
     return descriptors, inside
 
 
-def _mutual(descriptors1: npt.NDArray[np.float32], descriptors2: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+def _match_mutual(
+    descriptors1: npt.NDArray[np.float32], descriptors2: npt.NDArray[np.float32]
+) -> npt.NDArray[np.int64]:
     """(M, 2) mutual nearest neighbours, the most alike first."""
     if not len(descriptors1) or not len(descriptors2):
         return np.zeros((0, 2), np.int64)

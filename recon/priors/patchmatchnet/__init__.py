@@ -20,7 +20,7 @@ class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
 
 def load(config: Config) -> ClassicalPrior:
     """Raises WeightsError or FileNotFoundError without weights, ValueError where they are not PatchmatchNet's."""
-    return ClassicalPrior(config, NetworkStereo(load_network(config.weights or find(*WEIGHTS))).depth_maps)
+    return ClassicalPrior(config, NetworkStereo(load_network(config.weights or find(*WEIGHTS))).estimate_depth_maps)
 
 
 def load_network(path: Path) -> PatchmatchNet:

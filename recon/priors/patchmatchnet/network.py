@@ -19,18 +19,18 @@ from torch.nn import functional
 from splatnode.recon.priors.patchmatchnet.pyramid import FeaturePyramid, Refinement
 from splatnode.recon.priors.patchmatchnet.sampling import (
     Source,
-    sampled_at,
-    sampling_grid,
-    square_of_steps,
-    warp_between,
+    compute_warp,
+    make_sampling_grid,
+    make_square_steps,
+    sample_neighbours,
 )
-from splatnode.recon.priors.patchmatchnet.scoring import Evaluation, Similarity
+from splatnode.recon.priors.patchmatchnet.scoring import Evaluation, SimilarityNet
 
 _FIRST_SAMPLES = 48  # depths over the whole range, before there is an estimate
 
 
 @dataclass(frozen=True)
-class Stage:
+class PatchmatchStage:
     """The settings that the checkpoint was trained with, for features at 2^-level of the image."""
 
     level: int
@@ -44,9 +44,9 @@ class Stage:
 
 
 STAGES = (
-    Stage(3, 64, 8, 2, 16, 16, 2, 0.025),
-    Stage(2, 32, 8, 2, 8, 8, 4, 0.0125),
-    Stage(1, 16, 4, 1, 8, 0, 6, 0.005),
+    PatchmatchStage(3, 64, 8, 2, 16, 16, 2, 0.025),
+    PatchmatchStage(2, 32, 8, 2, 8, 8, 4, 0.0125),
+    PatchmatchStage(1, 16, 4, 1, 8, 0, 6, 0.005),
 )
 
 
@@ -70,9 +70,9 @@ class PatchmatchNet(nn.Module):
         estimate: _Estimate | None = None
         for patchmatch in (self.patchmatch_3, self.patchmatch_2, self.patchmatch_1):
             level = patchmatch.stage.level
-            warps = [warp_between(reference, source, level) for source in sources]
+            warps = [compute_warp(reference, source, level) for source in sources]
             own, *others = (layers[level] for layers in features)
-            finer = None if estimate is None else estimate.doubled()
+            finer = None if estimate is None else estimate.upsample()
             estimate = patchmatch(own, others, warps, near_far, finer, generator)
         assert estimate is not None
         depth = self.upsample_net(reference.image, estimate.depth, near_far)
@@ -82,13 +82,13 @@ class PatchmatchNet(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """What a stage knows of every pixel of the reference, at the stage's size."""
+    """A stage's estimate for every pixel of the reference, at the stage's size."""
 
     depth: Tensor  # (h, w)
     probability: Tensor  # (D, h, w) of the samples that the depth was made of
     weights: Tensor  # (S, h, w) how far each source is to be believed
 
-    def doubled(self) -> _Estimate:
+    def upsample(self) -> _Estimate:
         """Depth and weights at twice the size, for the next stage."""
         depth = functional.interpolate(self.depth[None, None], scale_factor=2.0, mode="nearest")[0, 0]
         weights = functional.interpolate(self.weights[None], scale_factor=2.0, mode="nearest")[0]
@@ -98,13 +98,13 @@ class _Estimate:
 class _Patchmatch(nn.Module):
     """One stage: proposes depths around the last estimate, scores them, and takes their mean by score."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: PatchmatchStage) -> None:
         super().__init__()
         self.stage = stage
         # The finest stage proposes nothing from neighbours; the checkpoint holds a convolution for one all the same.
-        self.propa_conv = _offsets(stage, max(2 * stage.neighbours, 1))
-        self.eval_conv = _offsets(stage, 2 * 9)
-        self.feature_weight_net = Similarity(stage.groups)
+        self.propa_conv = _make_offset_conv(stage, max(2 * stage.neighbours, 1))
+        self.eval_conv = _make_offset_conv(stage, 2 * 9)
+        self.feature_weight_net = SimilarityNet(stage.groups)
         self.evaluation = Evaluation(stage.groups)
 
     def forward(
@@ -118,28 +118,30 @@ class _Patchmatch(nn.Module):
     ) -> _Estimate:
         """The estimate from the reference's features `own` (C, h, w), the sources' `others`, and the last estimate."""
         stage = self.stage
-        around = sampling_grid(self.eval_conv(own[None])[0], square_of_steps(stage.dilation - 1, centre=True))
-        ring = square_of_steps(stage.dilation)
+        around = make_sampling_grid(self.eval_conv(own[None])[0], make_square_steps(stage.dilation - 1, centre=True))
+        ring = make_square_steps(stage.dilation)
         ring = ring + [(2 * down, 2 * right) for down, right in ring] if stage.neighbours == 16 else ring
-        propagated = sampling_grid(self.propa_conv(own[None])[0], ring) if stage.neighbours else None
-        alike = self._alike(own, around)
+        propagated = make_sampling_grid(self.propa_conv(own[None])[0], ring) if stage.neighbours else None
+        alike = self._compute_similarity(own, around)
         for iteration in range(stage.iterations):
-            samples = self._samples(None if estimate is None else estimate.depth, own.shape[1:], near_far, generator)
+            samples = self._propose_depths(
+                None if estimate is None else estimate.depth, own.shape[1:], near_far, generator
+            )
             if propagated is not None:
                 middle = samples[samples.shape[0] // 2]
-                samples = torch.cat([samples, sampled_at(middle[None], propagated)[0]]).sort(0).values
-            support = self._near(samples, around, near_far) * alike
+                samples = torch.cat([samples, sample_neighbours(middle[None], propagated)[0]]).sort(0).values
+            support = self._compute_nearness(samples, around, near_far) * alike
             support = support / support.sum(1, keepdim=True)
             known = None if estimate is None else estimate.weights
             scores, weights = self.evaluation(own, others, warps, samples, around, support, known)
             probability = scores.softmax(0)
             last_of_all = stage.level == 1 and iteration == stage.iterations - 1
-            depth = _expected_inverse(samples, probability) if last_of_all else (samples * probability).sum(0)
+            depth = _compute_expected_depth(samples, probability) if last_of_all else (samples * probability).sum(0)
             estimate = _Estimate(depth, probability, weights)
         assert estimate is not None  # every stage has an iteration
         return estimate
 
-    def _samples(
+    def _propose_depths(
         self, depth: Tensor | None, size: torch.Size, near_far: tuple[float, float], generator: torch.Generator
     ) -> Tensor:
         """(D, h, w) depths: evenly in inverse depth, over the range or around the last estimate."""
@@ -153,26 +155,26 @@ class _Patchmatch(nn.Module):
         around = 1.0 / depth[None] + (nearest - farthest) * self.stage.interval * steps
         return 1.0 / around.clamp(farthest, nearest)
 
-    def _alike(self, own: Tensor, around: Tensor) -> Tensor:
+    def _compute_similarity(self, own: Tensor, around: Tensor) -> Tensor:
         """(9, h, w) how much each neighbour looks like the pixel itself: one that does lies on the same surface."""
         groups = self.stage.groups
-        neighbours = sampled_at(own, around).unflatten(0, (groups, -1))  # (G, C / G, 9, h, w)
+        neighbours = sample_neighbours(own, around).unflatten(0, (groups, -1))  # (G, C / G, 9, h, w)
         product = (neighbours * own.unflatten(0, (groups, -1))[:, :, None]).mean(1)
         return self.feature_weight_net(product).sigmoid()
 
-    def _near(self, samples: Tensor, around: Tensor, near_far: tuple[float, float]) -> Tensor:
+    def _compute_nearness(self, samples: Tensor, around: Tensor, near_far: tuple[float, float]) -> Tensor:
         """(D, 9, h, w) how near each neighbour's depths are to the pixel's own."""
         farthest, nearest = 1.0 / near_far[1], 1.0 / near_far[0]
         place = (1.0 / samples - farthest) / (nearest - farthest)
-        gap = (sampled_at(place, around) - place[:, None]).abs() / self.stage.interval
+        gap = (sample_neighbours(place, around) - place[:, None]).abs() / self.stage.interval
         return torch.sigmoid(4.0 - 2.0 * gap.clamp(0, 4))
 
 
-def _offsets(stage: Stage, out: int) -> nn.Conv2d:
+def _make_offset_conv(stage: PatchmatchStage, out: int) -> nn.Conv2d:
     return nn.Conv2d(stage.channels, out, 3, padding=stage.dilation, dilation=stage.dilation)
 
 
-def _expected_inverse(samples: Tensor, probability: Tensor) -> Tensor:
+def _compute_expected_depth(samples: Tensor, probability: Tensor) -> Tensor:
     """(h, w) depth at the expected place among samples (D, h, w) that are even in inverse depth."""
     last = samples.shape[0] - 1
     place = (torch.arange(last + 1.0).view(-1, 1, 1) * probability).sum(0) / last

@@ -25,9 +25,9 @@ class FeaturePyramid(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.conv0, self.conv1 = _ConvNormRelu(3, 8), _ConvNormRelu(8, 8)
-        self.conv2, self.conv3, self.conv4 = _halving(8, 16)
-        self.conv5, self.conv6, self.conv7 = _halving(16, 32)
-        self.conv8, self.conv9, self.conv10 = _halving(32, 64)
+        self.conv2, self.conv3, self.conv4 = _make_halving_layers(8, 16)
+        self.conv5, self.conv6, self.conv7 = _make_halving_layers(16, 32)
+        self.conv8, self.conv9, self.conv10 = _make_halving_layers(32, 64)
         self.output1 = nn.Conv2d(64, 64, 1, bias=False)
         self.inner1, self.inner2 = nn.Conv2d(32, 64, 1), nn.Conv2d(16, 64, 1)
         self.output2, self.output3 = nn.Conv2d(64, 32, 1, bias=False), nn.Conv2d(64, 16, 1, bias=False)
@@ -37,16 +37,16 @@ class FeaturePyramid(nn.Module):
         half = self.conv4(self.conv3(self.conv2(self.conv1(self.conv0(image[None])))))
         quarter = self.conv7(self.conv6(self.conv5(half)))
         eighth = self.conv10(self.conv9(self.conv8(quarter)))
-        quarter = _doubled(eighth) + self.inner1(quarter)
-        half = _doubled(quarter) + self.inner2(half)
+        quarter = _upsample(eighth) + self.inner1(quarter)
+        half = _upsample(quarter) + self.inner2(half)
         return {3: self.output1(eighth)[0], 2: self.output2(quarter)[0], 1: self.output3(half)[0]}
 
 
-def _halving(channels: int, out: int) -> tuple[_ConvNormRelu, _ConvNormRelu, _ConvNormRelu]:
+def _make_halving_layers(channels: int, out: int) -> tuple[_ConvNormRelu, _ConvNormRelu, _ConvNormRelu]:
     return _ConvNormRelu(channels, out, size=5, stride=2), _ConvNormRelu(out, out), _ConvNormRelu(out, out)
 
 
-def _doubled(x: Tensor) -> Tensor:
+def _upsample(x: Tensor) -> Tensor:
     return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
 
 

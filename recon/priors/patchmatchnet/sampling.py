@@ -22,13 +22,13 @@ class Source:
     T_camera_world: Tensor  # (4, 4)
 
 
-def square_of_steps(reach: int, centre: bool = False) -> list[tuple[int, int]]:
+def make_square_steps(reach: int, centre: bool = False) -> list[tuple[int, int]]:
     """(down, right) steps to the eight neighbours `reach` pixels away, row by row, with the middle or without."""
     steps = [(down, right) for down in (-reach, 0, reach) for right in (-reach, 0, reach)]
     return [step for step in steps if centre or step != (0, 0)]
 
 
-def sampling_grid(learnt: Tensor, steps: Sequence[tuple[int, int]]) -> Tensor:
+def make_sampling_grid(learnt: Tensor, steps: Sequence[tuple[int, int]]) -> Tensor:
     """(M, h, w, 2) where to sample for M neighbours: a fixed step and a `learnt` one (2 M, h, w; x then y)."""
     height, width = learnt.shape[1:]
     rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
@@ -37,7 +37,7 @@ def sampling_grid(learnt: Tensor, steps: Sequence[tuple[int, int]]) -> Tensor:
     return torch.stack([x / ((width - 1) / 2) - 1, y / ((height - 1) / 2) - 1], -1)
 
 
-def sampled_at(images: Tensor, grid: Tensor) -> Tensor:
+def sample_neighbours(images: Tensor, grid: Tensor) -> Tensor:
     """(C, M, h, w) of images (C, h, w) at the M neighbours of every pixel."""
     count, height, width, _ = grid.shape
     flat = grid.reshape(1, count * height, width, 2)
@@ -45,7 +45,7 @@ def sampled_at(images: Tensor, grid: Tensor) -> Tensor:
     return sampled[0].unflatten(1, (count, height))
 
 
-def warp_between(reference: Source, source: Source, level: int) -> tuple[Tensor, Tensor]:
+def compute_warp(reference: Source, source: Source, level: int) -> tuple[Tensor, Tensor]:
     """Rotation-like (3, 3) and translation (3,) that carry (x, y, 1) * depth of the reference into the source."""
     scale = torch.diag(torch.tensor([0.5**level, 0.5**level, 1.0], dtype=torch.float64))
     K_reference, K_source = scale @ reference.K.double(), scale @ source.K.double()
@@ -56,7 +56,7 @@ def warp_between(reference: Source, source: Source, level: int) -> tuple[Tensor,
     )
 
 
-def warped_to(features: Tensor, warp: tuple[Tensor, Tensor], depths: Tensor) -> Tensor:
+def warp_features(features: Tensor, warp: tuple[Tensor, Tensor], depths: Tensor) -> Tensor:
     """(C, D, h, w): the source's features (C, h', w') where the reference's pixels lie at `depths` (D, h, w)."""
     count, height, width = depths.shape
     rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from splatnode.recon.priors.patchmatchnet.sampling import sampled_at, warped_to
+from splatnode.recon.priors.patchmatchnet.sampling import sample_neighbours, warp_features
 
 _MIN_WEIGHT = 1e-5  # of all sources together: a pixel that none is believed at is divided by it
 
@@ -19,7 +19,7 @@ class Evaluation(nn.Module):
         super().__init__()
         self._groups = groups
         self.pixel_wise_net = _ViewWeight(groups)
-        self.similarity_net = Similarity(groups)
+        self.similarity_net = SimilarityNet(groups)
 
     def forward(
         self,
@@ -43,18 +43,18 @@ class Evaluation(nn.Module):
         reference = own.unflatten(0, (groups, -1))[:, :, None]
         found = []
         for index, (other, warp) in enumerate(zip(others, warps, strict=True)):
-            warped = warped_to(other, warp, samples).unflatten(0, (groups, -1))
+            warped = warp_features(other, warp, samples).unflatten(0, (groups, -1))
             similarity = (warped * reference).mean(1)  # (G, D, h, w)
             weight = self.pixel_wise_net(similarity) if weights is None else weights[index]
             found.append(weight)
             summed = summed + similarity * weight
             total = total + weight
         scores = self.similarity_net(summed / total)
-        scores = (sampled_at(scores, around) * support).sum(1)
+        scores = (sample_neighbours(scores, around) * support).sum(1)
         return scores, torch.stack(found)
 
 
-class Similarity(nn.Module):
+class SimilarityNet(nn.Module):
     """A score from the correlations of each group of channels."""
 
     def __init__(self, groups: int) -> None:

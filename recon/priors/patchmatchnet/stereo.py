@@ -30,10 +30,10 @@ class NetworkStereo:
     network: PatchmatchNet
 
     @torch.inference_mode()
-    def depth_maps(
+    def estimate_depth_maps(
         self,
         views: Sequence[StereoView],
-        config: stereo.Config,
+        config: stereo.StereoConfig,
         *,
         seed: int = 0,
         sparse: Sequence[SparsePoints | None] | None = None,
@@ -44,26 +44,26 @@ class NetworkStereo:
         The cross-check gives confidence and normals, and leaves out what no other view confirms.
         """
         levels = [make_level(view.image, view.K, view.T_world_camera, view.depth_range, 0) for view in views]
-        images = [_source(view) for view in views]
+        images = [_make_source(view) for view in views]
         planes, checked = [], []
         for index, view in enumerate(views):
             pause()
             points = None if sparse is None else sparse[index]
             partners = stereo.rank_partners(views, index, config, points)
-            checked.append(stereo.checked_against(partners, config))
-            chosen = stereo.compared_with(partners, config)
+            checked.append(stereo.select_check_views(partners, config))
+            chosen = stereo.select_sources(partners, config)
             inverse_depth = np.zeros(view.image.shape[:2], np.float32)
             if chosen:
                 generator = torch.Generator().manual_seed(seed)
                 others = [images[other] for other in chosen]
                 depth, _ = self.network(images[index], others, view.depth_range, generator)
-                found = _resized(depth.clamp(*view.depth_range).numpy(), view.image)
+                found = _resize_depth(depth.clamp(*view.depth_range).numpy(), view.image)
                 inverse_depth = np.reciprocal(found, dtype=np.float32)
-            planes.append(_planes(inverse_depth))
+            planes.append(_make_planes(inverse_depth))
         return consistency.cross_check(levels, planes, checked, config.matching, config.consistency)
 
 
-def _source(view: StereoView) -> Source:
+def _make_source(view: StereoView) -> Source:
     """The view at a size that fits the network, pixel centres at whole numbers."""
     height, width = (max(1, round(side / _STRIDE)) * _STRIDE for side in view.image.shape[:2])
     image = view.image
@@ -78,14 +78,14 @@ def _source(view: StereoView) -> Source:
     )
 
 
-def _resized(depth: Float32, image: npt.NDArray[np.uint8]) -> Float32:
+def _resize_depth(depth: Float32, image: npt.NDArray[np.uint8]) -> Float32:
     height, width = image.shape[:2]
     if depth.shape == (height, width):
         return depth
     return np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
 
 
-def _planes(inverse_depth: Float32) -> Planes:
+def _make_planes(inverse_depth: Float32) -> Planes:
     """The depth map as planes: each pixel's slope is that to its nearer neighbour on either side."""
     slopes = [_slope(inverse_depth, axis) for axis in (1, 0)]
     return Planes(np.stack([inverse_depth, *slopes], -1), np.zeros_like(inverse_depth))

@@ -14,7 +14,7 @@ _REMEMBERED = 64  # keyframes whose keypoints are kept: half a megabyte each
 
 
 @dataclass(frozen=True, eq=False)
-class _Added:
+class _AddedKeypoints:
     """The keypoints that were added to a keyframe's points."""
 
     first: int  # number of the keyframe's first point that is one of these
@@ -31,15 +31,15 @@ class XfeatMatcher:
 
     def __init__(self, network: Xfeat, num_keypoints: int) -> None:
         self._network, self._count = network, num_keypoints
-        self._added: dict[str, _Added] = {}  # by keyframe, the last ones that were asked about
+        self._added: dict[str, _AddedKeypoints] = {}  # by keyframe, the last ones that were asked about
 
-    def with_points(self, keyframe: Keyframe) -> Keyframe:
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
         known = self._added.get(keyframe.name)
         if known is not None and known.is_in(keyframe):
             return keyframe
         keypoints = self._network.extract(keyframe.frame.image, self._count)
         features = keyframe.features
-        self._added[keyframe.name] = _Added(len(features.points), keypoints)
+        self._added[keyframe.name] = _AddedKeypoints(len(features.points), keypoints)
         while len(self._added) > _REMEMBERED:
             del self._added[next(iter(self._added))]
         points = np.concatenate([features.points, keypoints.points])

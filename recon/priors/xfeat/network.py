@@ -44,14 +44,14 @@ class Xfeat:
         height, width = image.shape[:2]
         square = cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         descriptors, logits, reliability = self.features.run(None, {"input": square.transpose(2, 0, 1)[None]})
-        probability = _heat(np.asarray(logits)[0])
+        probability = _compute_heatmap(np.asarray(logits)[0])
         highest = cv2.dilate(probability, np.ones((2 * _REACH + 1,) * 2))
         peaks = (probability == highest) & (probability > _MIN_PROBABILITY)
         row, column = np.nonzero(peaks)
         at = (np.stack([column, row], 1) + 0.5).astype(np.float32)
-        score = probability[row, column] * _sampled(np.asarray(reliability)[0], at)[:, 0]
+        score = probability[row, column] * _sample_maps(np.asarray(reliability)[0], at)[:, 0]
         chosen = np.argsort(-score, kind="stable")[:count]
-        found = _sampled(np.asarray(descriptors)[0], at[chosen])
+        found = _sample_maps(np.asarray(descriptors)[0], at[chosen])
         found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
         return Keypoints(at[chosen].astype(np.float64) * [width / _SIDE, height / _SIDE], found)
 
@@ -62,8 +62,8 @@ class Xfeat:
         if min(len(first.points), len(second.points)) < 2:
             return np.zeros((0, 2), np.int64)
         inputs = {
-            "kpts0": _normalised(first.points, first_size)[None],
-            "kpts1": _normalised(second.points, second_size)[None],
+            "kpts0": _normalize_points(first.points, first_size)[None],
+            "kpts1": _normalize_points(second.points, second_size)[None],
             "desc0": first.descriptors[None],
             "desc1": second.descriptors[None],
         }
@@ -88,7 +88,7 @@ def load_network(features: Path, matcher: Path, threads: int = 2) -> Xfeat:
     return Xfeat(*sessions)
 
 
-def _heat(logits: Float32) -> Float32:
+def _compute_heatmap(logits: Float32) -> Float32:
     """(640, 640) probability of a keypoint at each pixel, from logits (65, 80, 80); the last one says "none here"."""
     odds = np.exp(logits - logits.max(0))
     share = (odds / odds.sum(0))[:-1]
@@ -96,7 +96,7 @@ def _heat(logits: Float32) -> Float32:
     return np.ascontiguousarray(cells.reshape(_SIDE, _SIDE), np.float32)
 
 
-def _sampled(maps: Float32, at: Float32) -> Float32:
+def _sample_maps(maps: Float32, at: Float32) -> Float32:
     """(M, C): maps (C, 80, 80) of cells at pixels (M, 2) of the square."""
     if not len(at):
         return np.zeros((0, len(maps)), np.float32)
@@ -107,6 +107,6 @@ def _sampled(maps: Float32, at: Float32) -> Float32:
     return np.asarray(layers, np.float32).reshape(len(maps), -1).T
 
 
-def _normalised(points: Float64, size: tuple[int, int]) -> Float32:
+def _normalize_points(points: Float64, size: tuple[int, int]) -> Float32:
     """Pixels as LighterGlue takes them: from the middle, in halves of the longer side."""
     return ((points - np.array(size) / 2) / (max(size) / 2)).astype(np.float32)

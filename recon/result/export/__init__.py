@@ -2,7 +2,7 @@
 
 from splatnode.recon.result.export.convert import export_scene
 from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.result import remove_result, write_beside, write_result
 from splatnode.recon.result.export.staged import ResultWriteError, write_file, write_files
 from splatnode.recon.result.export.stored import read_cameras, read_gaussians
@@ -14,7 +14,7 @@ __all__ = [
     "read_cameras",
     "read_gaussians",
     "remove_result",
-    "viewer_safe",
+    "sanitize_gaussians",
     "write_beside",
     "write_file",
     "write_files",

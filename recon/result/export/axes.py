@@ -14,7 +14,7 @@ _SIGNED = [np.diag(signs)[list(order)] for order in permutations(range(3)) for s
 _NAMINGS = np.stack([matrix for matrix in _SIGNED if np.linalg.det(matrix) > 0])  # (24, 3, 3) turns of a cube
 
 
-def least_turned(gaussians: GaussianArrays) -> GaussianArrays:
+def minimize_rotations(gaussians: GaussianArrays) -> GaussianArrays:
     """The Gaussians, each with that order and sense of its axes for which it is turned least: by at most 62.8 degrees.
 
     Its quaternion has w of at least .85, and each other component within .39 of 0.

@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.process.foreign import foreign
-from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, printable
+from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, sanitize_text
 from splatnode.capture.process.records import record_in
 from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
+from splatnode.recon.result.camera_check import MAX_COORDINATE, find_camera_problem
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES
 from splatnode.recon.result.export.staged import json_bytes
@@ -54,12 +54,12 @@ CONSISTENT_DEPTH_MEANING = (
 )
 
 
-def camera_record(camera: CameraEstimate) -> dict[str, object]:
+def make_camera_dict(camera: CameraEstimate) -> dict[str, object]:
     """A camera as cameras.json and report.json hold it."""
     return {
         "name": camera.name,
         "frame_id": camera.frame_id,
-        **stamp_record(camera.captured_at),
+        **make_stamp_dict(camera.captured_at),
         "T_world_camera": camera.T_world_camera.tolist(),
         "K": camera.K.tolist(),
         "width": camera.width,
@@ -70,7 +70,7 @@ def camera_record(camera: CameraEstimate) -> dict[str, object]:
     }
 
 
-def stamp_record(stamp: Stamp | None) -> dict[str, object]:
+def make_stamp_dict(stamp: Stamp | None) -> dict[str, object]:
     """A time of capture as the files hold it."""
     return {"stamp_ns": stamp and stamp.ns, "clock": stamp and stamp.clock.value}
 
@@ -87,7 +87,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             "bounds": BOUNDS_MEANING,
             "consistent_depth": CONSISTENT_DEPTH_MEANING,
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
-            "cameras": [camera_record(camera) for camera in cameras],
+            "cameras": [make_camera_dict(camera) for camera in cameras],
         }
     )
 
@@ -126,8 +126,8 @@ def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstim
 
     Raises SceneFileError, which names the file as `name`, where it is something else.
     """
-    with foreign(SceneFileError, name):
-        cameras = tuple(_camera(record, name) for record in _parsed(data, name).cameras)
+    with guard_untrusted(SceneFileError, name):
+        cameras = tuple(_make_camera(record, name) for record in _parse_file(data, name).cameras)
         if len({camera.name for camera in cameras}) < len(cameras):
             raise SceneFileError(f"{name} has two cameras of one name")
         return cameras
@@ -135,13 +135,13 @@ def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstim
 
 def decode_scale(data: bytes, name: str = "cameras.json") -> Scale:
     """The scale that a cameras.json of ours states. Raises SceneFileError."""
-    with foreign(SceneFileError, name):
-        parsed = _parsed(data, name)
-        source = parsed.scale_source and printable(parsed.scale_source)
+    with guard_untrusted(SceneFileError, name):
+        parsed = _parse_file(data, name)
+        source = parsed.scale_source and sanitize_text(parsed.scale_source)
         return Scale(parsed.scale == "metric", source, parsed.scale_interval_95)
 
 
-def _parsed(data: bytes, name: str) -> _File:
+def _parse_file(data: bytes, name: str) -> _File:
     if len(data) > MAX_JSON_BYTES:
         raise SceneFileError(f"{name} has {len(data)} bytes; at most {MAX_JSON_BYTES} are read")
     try:
@@ -157,9 +157,9 @@ def _numbers_of(bounds: _Bounds) -> tuple[float, ...]:
     return bounds.rotation_deg, bounds.centre, bounds.centre_percent, bounds.focal_percent
 
 
-def _camera(record: _Camera, name: str) -> CameraEstimate:
+def _make_camera(record: _Camera, name: str) -> CameraEstimate:
     T_world_camera, K = np.array(record.T_world_camera), np.array(record.K)
-    problem = camera_problem(T_world_camera, K, record.width, record.height)
+    problem = find_camera_problem(T_world_camera, K, record.width, record.height)
     if not is_printable(record.name) or record.name in ("", ".", "..") or "/" in record.name:
         problem = "a name must be that of a file, in printable letters"
     if (record.stamp_ns is None) != (record.clock is None):
@@ -167,7 +167,7 @@ def _camera(record: _Camera, name: str) -> CameraEstimate:
     if record.bounds is not None and min(_numbers_of(record.bounds)) < 0:
         problem = f"bounds must not be below 0, got {min(_numbers_of(record.bounds)):g}"
     if problem:
-        raise SceneFileError(f"{name}, camera {printable(record.name, 100)!r}: {problem}")
+        raise SceneFileError(f"{name}, camera {sanitize_text(record.name, 100)!r}: {problem}")
     bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))
     captured_at = None if record.stamp_ns is None or record.clock is None else Stamp(record.stamp_ns, record.clock)
     size = record.width, record.height

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from splatnode.capture.process.progress import waiting
+from splatnode.capture.process.progress import show_waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.result.export.convert import export_scene
 from splatnode.recon.result.export.selection import Box, Selection
@@ -12,7 +12,7 @@ from splatnode.recon.result.export.selection import Box, Selection
 
 def export(args: argparse.Namespace) -> int:
     within = None if args.crop is None else Box(args.crop[:3], args.crop[3:])
-    with waiting(f"writing the scene as {args.to}"):
+    with show_waiting(f"writing the scene as {args.to}"):
         written = export_scene(args.scene, args.to, args.out, Selection(args.only_seen, within, args.no_background))
     say(written)
     return 0

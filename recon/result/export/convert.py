@@ -22,11 +22,11 @@ def export_scene(source: Path, to: str, destination: Path | None = None, selecti
     the output cannot be written.
     """
     format_ = load_format(to)
-    if not selection.everything and not getattr(format_, "GAUSSIANS", True):
+    if not selection.is_everything and not getattr(format_, "GAUSSIANS", True):
         raise ValueError(
             f"{to} holds cameras and no Gaussians: --only-seen, --no-background and --crop have nothing to leave out"
         )
-    result = StoredResult.at(source, selection)
+    result = StoredResult.create_from_path(source, selection)
     if destination is None:
         destination = result.scene.with_name(format_.DEFAULT_NAME)
         if destination.exists():

@@ -12,7 +12,7 @@ from splatnode.recon.result.export.stored import StoredResult
 
 
 class Format(Protocol):
-    """What a module of recon.result.export.formats has.
+    """The interface of a module of recon.result.export.formats.
 
     A module that also has `decode(data: bytes, name: str) -> GaussianArrays` can be read: the files whose suffix is
     the module's name. `decode` raises SceneFileError, which names the file as `name`, where the data are not such a
@@ -29,13 +29,13 @@ class Format(Protocol):
         ...
 
 
-def format_names() -> list[str]:
+def list_format_names() -> list[str]:
     """The formats that there are, in the order of the alphabet. None of them is imported."""
     return sorted(module.name for module in iter_modules(formats.__path__))
 
 
 def load_format(name: str) -> Format:
     """The format called `name`. Raises ValueError where there is none."""
-    if name not in format_names():
-        raise ValueError(f"the format must be one of {', '.join(format_names())}; got {name!r}")
+    if name not in list_format_names():
+        raise ValueError(f"the format must be one of {', '.join(list_format_names())}; got {name!r}")
     return cast(Format, import_module(f"{formats.__name__}.{name}"))

@@ -25,27 +25,27 @@ _INTEGER, _BYTES = {"type": "integer"}, {"type": "string", "contentEncoding": "b
 _NUMBERS = {"type": "array", "items": _NUMBER}
 
 
-def _object(**properties: object) -> dict[str, object]:
+def _make_object_schema(**properties: object) -> dict[str, object]:
     return {"type": "object", "properties": properties}
 
 
-def _array(items: object) -> dict[str, object]:
+def _make_array_schema(items: object) -> dict[str, object]:
     return {"type": "array", "items": items}
 
 
-_TIME = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object(position=_VECTOR, orientation=_QUATERNION)
-_TRANSFORM = _object(
+_TIME = _make_object_schema(sec=_INTEGER, nsec=_INTEGER)
+_VECTOR = _make_object_schema(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_QUATERNION = _make_object_schema(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_POSE = _make_object_schema(position=_VECTOR, orientation=_QUATERNION)
+_TRANSFORM = _make_object_schema(
     timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_QUATERNION
 )
-_FIELD = _object(name=_TEXT, offset=_INTEGER, type=_INTEGER)
+_FIELD = _make_object_schema(name=_TEXT, offset=_INTEGER, type=_INTEGER)
 
 SCHEMAS = {
-    "FrameTransforms": _object(transforms=_array(_TRANSFORM)),
-    "PoseInFrame": _object(timestamp=_TIME, frame_id=_TEXT, pose=_POSE),
-    "CameraCalibration": _object(
+    "FrameTransforms": _make_object_schema(transforms=_make_array_schema(_TRANSFORM)),
+    "PoseInFrame": _make_object_schema(timestamp=_TIME, frame_id=_TEXT, pose=_POSE),
+    "CameraCalibration": _make_object_schema(
         timestamp=_TIME,
         frame_id=_TEXT,
         width=_INTEGER,
@@ -56,17 +56,22 @@ SCHEMAS = {
         R=_NUMBERS,
         P=_NUMBERS,
     ),
-    "CompressedImage": _object(timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT),
-    "PointCloud": _object(
-        timestamp=_TIME, frame_id=_TEXT, pose=_POSE, point_stride=_INTEGER, fields=_array(_FIELD), data=_BYTES
+    "CompressedImage": _make_object_schema(timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT),
+    "PointCloud": _make_object_schema(
+        timestamp=_TIME,
+        frame_id=_TEXT,
+        pose=_POSE,
+        point_stride=_INTEGER,
+        fields=_make_array_schema(_FIELD),
+        data=_BYTES,
     ),
-    "Log": _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
+    "Log": _make_object_schema(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
 }
 
 Message = tuple[str, int, dict[str, object]]  # topic, nanoseconds, content
 
 
-def written(make_writer: Callable, messages: Sequence[Message], schemas: Mapping[str, str]) -> bytes:
+def encode_mcap(make_writer: Callable, messages: Sequence[Message], schemas: Mapping[str, str]) -> bytes:
     """An MCAP file of the messages, by a Writer of mcap; `schemas` names that of each topic."""
     file = io.BytesIO()
     writer = make_writer(file)
@@ -88,11 +93,11 @@ def add_messages(writer: Any, messages: Sequence[Message], schemas: Mapping[str,
         writer.add_message(channels[topic], log_time=ns, publish_time=ns, data=json.dumps(content).encode())
 
 
-def calibration(camera: CameraEstimate, ns: int, frame: str) -> dict[str, object]:
+def make_calibration(camera: CameraEstimate, ns: int, frame: str) -> dict[str, object]:
     """A CameraCalibration: a pinhole, for the image at modelled size."""
     K = camera.K - _HALF_PIXEL
     return {
-        "timestamp": time(ns),
+        "timestamp": make_time(ns),
         "frame_id": frame,
         "width": camera.width,
         "height": camera.height,
@@ -104,15 +109,15 @@ def calibration(camera: CameraEstimate, ns: int, frame: str) -> dict[str, object
     }
 
 
-def pose(T_world_camera: npt.NDArray[np.float64]) -> dict[str, dict[str, float]]:
+def make_pose(T_world_camera: npt.NDArray[np.float64]) -> dict[str, dict[str, float]]:
     w, x, y, z = (float(value) for value in quats_from_matrices(T_world_camera[:3, :3]))
     position = dict(zip("xyz", T_world_camera[:3, 3].tolist(), strict=True))
     return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
-def time(ns: int) -> dict[str, int]:
+def make_time(ns: int) -> dict[str, int]:
     return {"sec": ns // _NS, "nsec": ns % _NS}
 
 
-def in_base64(data: bytes) -> str:
+def encode_base64(data: bytes) -> str:
     return base64.b64encode(data).decode()

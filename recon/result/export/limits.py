@@ -18,7 +18,7 @@ _OTHER_VALUES = 12  # of a Gaussian beside its colour: centre, rotation, extents
 
 def check_count(num_gaussians: int, num_bases: int, name: str) -> None:
     """Raises SceneFileError, which names the file as `name`, where these are more Gaussians than can be read."""
-    most = min(MAX_GAUSSIANS, MAX_VALUES // values_of_one(num_bases))
+    most = min(MAX_GAUSSIANS, MAX_VALUES // count_values(num_bases))
     if num_gaussians > most:
         raise SceneFileError(
             f"{name} promises {num_gaussians} Gaussians; at most {most} with {num_bases} coefficients a colour can be "
@@ -26,7 +26,7 @@ def check_count(num_gaussians: int, num_bases: int, name: str) -> None:
         )
 
 
-def values_of_one(num_bases: int) -> int:
+def count_values(num_bases: int) -> int:
     """How many numbers one Gaussian has."""
     return _OTHER_VALUES + 3 * num_bases
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
@@ -32,18 +32,18 @@ class _Manifest(msgspec.Struct, frozen=True):
     files: dict[str, _Entry]
 
 
-def entries(files: Mapping[str, bytes]) -> dict[str, dict[str, object]]:
-    """What a manifest says of each of the files."""
+def make_entries(files: Mapping[str, bytes]) -> dict[str, dict[str, object]]:
+    """Makes the manifest's entry for each of the files."""
     return {name: {"bytes": len(data), "sha256": sha256(data)} for name, data in files.items()}
 
 
-def digests(path: Path) -> dict[str, str]:
+def read_digests(path: Path) -> dict[str, str]:
     """SHA-256 by file of what the manifest `path` lists; empty where there is none that can be read.
 
     Raises what is_shortage tells.
     """
     try:
-        with foreign(SceneFileError):
+        with guard_untrusted(SceneFileError):
             manifest = record_in(read_json_file(path), _Manifest)
     except (OSError, SceneFileError) as error:
         raise_shortage(error)
@@ -51,12 +51,12 @@ def digests(path: Path) -> dict[str, str]:
     return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
 
 
-def made_of(folder: Path) -> dict[str, str]:
+def read_derived_digests(folder: Path) -> dict[str, str]:
     """SHA-256 by file of what was made of the result in `folder`, and of the manifests: maps, exports and pictures."""
     found = {}
     for manifest in (OF_A_MAP, f"{MAPS}/{OF_A_MAP}", EXPORTS):
         within = manifest.removesuffix(OF_A_MAP).removesuffix(EXPORTS)
-        listed = {f"{within}{name}": digest for name, digest in digests(folder / manifest).items()}
+        listed = {f"{within}{name}": digest for name, digest in read_digests(folder / manifest).items()}
         try:
             listed |= {manifest: sha256((folder / manifest).read_bytes())} if listed else {}
         except OSError as error:

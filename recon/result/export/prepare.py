@@ -15,7 +15,7 @@ _SCALE_LIMITS = (1e-7, 10.0)  # times the same distance
 _OPACITY_LIMITS = (1e-6, 1.0 - 1e-6)  # a logit of 0 or 1 is infinite
 
 
-def viewer_safe(gaussians: GaussianArrays) -> GaussianArrays:
+def sanitize_gaussians(gaussians: GaussianArrays) -> GaussianArrays:
     """The Gaussians with finite values and bounded extents: what every file of a result holds.
 
     A Gaussian with a value that is not finite, or whose centre is absurdly far away, is left out; extents and opacities
@@ -26,12 +26,12 @@ def viewer_safe(gaussians: GaussianArrays) -> GaussianArrays:
         finite &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     finite &= (np.abs(gaussians.means) <= MAX_COORDINATE).all(axis=1)
     if not finite.any():
-        return take(gaussians, finite)
+        return select_gaussians(gaussians, finite)
     middle = np.median(gaussians.means[finite], axis=0)
     with np.errstate(invalid="ignore", over="ignore"):
         distance = np.linalg.norm((gaussians.means - middle).astype(np.float64), axis=1)
     reach = float(np.median(distance[finite])) or 1.0
-    kept = take(gaussians, finite & (distance <= _FARTHEST * reach))
+    kept = select_gaussians(gaussians, finite & (distance <= _FARTHEST * reach))
     with np.errstate(over="ignore"):
         length = np.linalg.norm(kept.quats, axis=1, keepdims=True)
     is_rotation = (length > 1e-12) & np.isfinite(length)
@@ -46,7 +46,7 @@ def viewer_safe(gaussians: GaussianArrays) -> GaussianArrays:
     )
 
 
-def take(gaussians: GaussianArrays, index: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> GaussianArrays:
+def select_gaussians(gaussians: GaussianArrays, index: npt.NDArray[np.bool_] | npt.NDArray[np.intp]) -> GaussianArrays:
     """The Gaussians at `index` (integers or a mask)."""
     return GaussianArrays(
         gaussians.means[index],
@@ -58,11 +58,11 @@ def take(gaussians: GaussianArrays, index: npt.NDArray[np.bool_] | npt.NDArray[n
     )
 
 
-def base_rgb(gaussians: GaussianArrays) -> npt.NDArray[np.uint8]:
+def compute_base_rgb(gaussians: GaussianArrays) -> npt.NDArray[np.uint8]:
     """(N, 3) colour without its view-dependent part."""
     return np.rint(np.clip(gaussians.sh[:, 0] * SH_C0 + 0.5, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def unknown_source(num_gaussians: int) -> npt.NDArray[np.int32]:
+def make_unknown_source(num_gaussians: int) -> npt.NDArray[np.int32]:
     """(N,) -1: no scene format keeps the frame that a Gaussian came from."""
     return np.full(num_gaussians, -1, np.int32)

@@ -11,11 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from splatnode.capture.process.printable import escaped
-from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.capture.process.printable import escape_text
+from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.recon.result.stored_snapshot import photograph_of
+from splatnode.recon.result.stored_snapshot import encode_image
 
 rr: Any = importlib.import_module("rerun")  # by its name: where it is not installed, pyright takes this file for it
 
@@ -28,8 +28,8 @@ _IMAGE_PLANE = 0.1  # how far before its camera a photograph is drawn, in the sc
 _LANDMARK_RGB = (255, 170, 0)
 
 
-class Recording(Protocol):
-    """What is used of rerun's RecordingStream."""
+class RerunRecording(Protocol):
+    """The methods of rerun's RecordingStream that are used."""
 
     def log(self, entity_path: str, entity: object, *, static: bool = False) -> None: ...
 
@@ -38,7 +38,7 @@ class Recording(Protocol):
     def flush(self) -> None: ...
 
 
-def recorded(snapshot: Snapshot) -> bytes:
+def encode_recording(snapshot: Snapshot) -> bytes:
     """The content of an .rrd file."""
     recording = rr.RecordingStream(_APPLICATION)
     stream = recording.binary_stream()
@@ -46,7 +46,7 @@ def recorded(snapshot: Snapshot) -> bytes:
     return stream.read() or b""
 
 
-def connected(url: str) -> Recording:
+def connect_viewer(url: str) -> RerunRecording:
     """A recording whose content goes to the rerun viewer at `url`."""
     recording = rr.RecordingStream(_APPLICATION)
     recording.connect_grpc(url)
@@ -54,7 +54,7 @@ def connected(url: str) -> Recording:
 
 
 def draw(
-    recording: Recording,
+    recording: RerunRecording,
     snapshot: Snapshot,
     step: int | None = None,
     before: frozenset[str] = frozenset(),
@@ -67,7 +67,7 @@ def draw(
     if step is not None:
         recording.set_time(STEP, sequence=step)
     recording.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
-    drawn = list(_contents(snapshot))
+    drawn = list(_list_contents(snapshot))
     for path, content in drawn:
         recording.log(path, content, static=static)
     now = frozenset(path for path, _ in drawn)
@@ -76,34 +76,34 @@ def draw(
     return now
 
 
-def draw_tracked(recording: Recording, camera: CameraEstimate | None, step: int) -> None:
+def draw_tracked(recording: RerunRecording, camera: CameraEstimate | None, step: int) -> None:
     """The live camera from `step` on; None: it is not known where it is."""
     recording.set_time(STEP, sequence=step)
     if camera is None:
         recording.log(LIVE, rr.Clear(recursive=True))
         return
-    for content in _camera(camera, _IMAGE_PLANE):
+    for content in _make_camera(camera, _IMAGE_PLANE):
         recording.log(LIVE, content)
 
 
-def _contents(snapshot: Snapshot) -> Iterator[tuple[str, object]]:
-    """What is drawn, each with its path."""
+def _list_contents(snapshot: Snapshot) -> Iterator[tuple[str, object]]:
+    """Lists what is drawn, each with its path."""
     plane = _IMAGE_PLANE * (snapshot.landmarks.unit if snapshot.landmarks is not None else 1.0)
     for camera in snapshot.cameras:
         path = f"{WORLD}/cameras/{rr.escape_entity_path_part(camera.name)}"
-        for content in _camera(camera, plane):
+        for content in _make_camera(camera, plane):
             yield path, content
-        photograph = photograph_of(camera, snapshot.images)
+        photograph = encode_image(camera, snapshot.images)
         if photograph is not None:
             yield path, rr.EncodedImage(contents=photograph, media_type="image/jpeg")
     if len(snapshot.gaussians):
-        yield f"{WORLD}/gaussians", _gaussians(snapshot.gaussians)
+        yield f"{WORLD}/gaussians", _make_splats(snapshot.gaussians)
     if snapshot.landmarks is not None:
-        yield f"{WORLD}/landmarks", _landmarks(snapshot.landmarks)
-    yield "verdict", rr.TextDocument(_text(snapshot), media_type="text/markdown")
+        yield f"{WORLD}/landmarks", _make_points(snapshot.landmarks)
+    yield "verdict", rr.TextDocument(_format_text(snapshot), media_type="text/markdown")
 
 
-def _camera(camera: CameraEstimate, plane: float) -> tuple[object, object]:
+def _make_camera(camera: CameraEstimate, plane: float) -> tuple[object, object]:
     pose = rr.Transform3D(translation=camera.T_world_camera[:3, 3], mat3x3=camera.T_world_camera[:3, :3])
     lens = rr.Pinhole(
         image_from_camera=camera.K,
@@ -114,9 +114,9 @@ def _camera(camera: CameraEstimate, plane: float) -> tuple[object, object]:
     return pose, lens
 
 
-def _gaussians(gaussians: GaussianArrays) -> object:
+def _make_splats(gaussians: GaussianArrays) -> object:
     alpha = np.rint(255 * gaussians.opacities).astype(np.uint8)
-    colours = np.column_stack([base_rgb(gaussians), alpha])
+    colours = np.column_stack([compute_base_rgb(gaussians), alpha])
     higher = np.zeros((len(gaussians), _HIGHER_BASES, 3), np.float32)
     higher[:, : gaussians.sh.shape[1] - 1] = gaussians.sh[:, 1:]
     return rr.GaussianSplats3D(
@@ -129,14 +129,14 @@ def _gaussians(gaussians: GaussianArrays) -> object:
     )
 
 
-def _landmarks(landmarks: Landmarks) -> object:
+def _make_points(landmarks: Landmarks) -> object:
     return rr.Points3D(landmarks.points, radii=[-2.0], colors=_LANDMARK_RGB)  # below 0: of so many pixels
 
 
-def _text(snapshot: Snapshot) -> str:
+def _format_text(snapshot: Snapshot) -> str:
     verdict = snapshot.verdict
     counts = f"{len(snapshot.cameras)} cameras, {len(snapshot.gaussians)} Gaussians; lengths {snapshot.scale.sentence}"
-    dropped = [f"- {escaped(frame.name)}: {frame.reason}" for frame in snapshot.dropped]
+    dropped = [f"- {escape_text(frame.name)}: {frame.reason}" for frame in snapshot.dropped]
     left_out = ["Left out:", "\n".join(dropped)] if dropped else []
     lines = [f"# {verdict.code.value}", verdict.message, verdict.advice, counts, *left_out]
     return "\n\n".join(line for line in lines if line)

@@ -14,9 +14,17 @@ from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.formats.tum import encode_tum
-from splatnode.recon.result.export.manifest import EXPORTS, MANIFEST, MAPS, digests, entries, made_of, sha256
-from splatnode.recon.result.export.prepare import viewer_safe
-from splatnode.recon.result.export.staged import ResultWriteError, explanation, json_bytes, write_files
+from splatnode.recon.result.export.manifest import (
+    EXPORTS,
+    MANIFEST,
+    MAPS,
+    make_entries,
+    read_derived_digests,
+    read_digests,
+    sha256,
+)
+from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.staged import ResultWriteError, explain_error, json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot
 
 
@@ -40,9 +48,9 @@ def write_result(
     files = {"report.json": json_bytes(report)}
     if snapshot.verdict.publishable:
         files = _scene_files(snapshot, preview) | dict(further) | files
-    previous = digests(out_dir / MANIFEST)
-    manifest = {**snapshot.scale.record(), "verdict": snapshot.verdict.code.value, "files": entries(files)}
-    gone = made_of(out_dir) | previous
+    previous = read_digests(out_dir / MANIFEST)
+    manifest = {**snapshot.scale.record(), "verdict": snapshot.verdict.code.value, "files": make_entries(files)}
+    gone = read_derived_digests(out_dir) | previous
     superseded = {name: digest for name, digest in gone.items() if name not in files and name != MANIFEST}
     write_files(out_dir, files | {MANIFEST: json_bytes(manifest)}, superseded)
     return out_dir / MANIFEST
@@ -53,7 +61,7 @@ def copy_result(folder: Path, out_dir: Path) -> Path:
 
     Raises SceneFileError where the files are not those of its manifest any more, and ResultWriteError.
     """
-    listed, files = digests(folder / MANIFEST), {}
+    listed, files = read_digests(folder / MANIFEST), {}
     for name, digest in listed.items():
         path = folder / name
         if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
@@ -64,7 +72,7 @@ def copy_result(folder: Path, out_dir: Path) -> Path:
     if not files:
         raise SceneFileError(f"{folder} has no {MANIFEST} that can be read: it is no result that was written whole")
     files[MANIFEST] = (folder / MANIFEST).read_bytes()
-    gone = made_of(out_dir) | digests(out_dir / MANIFEST)
+    gone = read_derived_digests(out_dir) | read_digests(out_dir / MANIFEST)
     superseded = {name: digest for name, digest in gone.items() if name not in files}
     write_files(out_dir, files, superseded)
     return out_dir / MANIFEST
@@ -81,13 +89,13 @@ def write_beside(path: Path, contents: Mapping[str, bytes], of: Path) -> None:
     if path.is_dir():
         path = Path(os.path.realpath(path))  # the user's own link
     target = Path(os.path.realpath(path.parent)) / path.name
-    if not (target.is_relative_to(folder) and digests(folder / MANIFEST)):
+    if not (target.is_relative_to(folder) and read_digests(folder / MANIFEST)):
         write_files(path.parent, {os.path.normpath(f"{path.name}/{name}"): data for name, data in contents.items()})
         return
     place = target.relative_to(folder)
     files = {os.path.normpath(place / name): data for name, data in contents.items()}
-    known = {name: {"sha256": digest} for name, digest in digests(folder / EXPORTS).items()}
-    write_files(folder, files | {EXPORTS: json_bytes({"files": known | entries(files)})})
+    known = {name: {"sha256": digest} for name, digest in read_digests(folder / EXPORTS).items()}
+    write_files(folder, files | {EXPORTS: json_bytes({"files": known | make_entries(files)})})
 
 
 def remove_result(out_dir: Path) -> None:
@@ -95,21 +103,21 @@ def remove_result(out_dir: Path) -> None:
 
     Raises ResultWriteError.
     """
-    previous = digests(out_dir / MANIFEST)
+    previous = read_digests(out_dir / MANIFEST)
     if not previous:
         return
     try:
         own = {MANIFEST: sha256((out_dir / MANIFEST).read_bytes())}
     except OSError as error:
-        raise ResultWriteError(error.errno, explanation(error, out_dir)) from error
-    write_files(out_dir, {}, made_of(out_dir) | previous | own)
+        raise ResultWriteError(error.errno, explain_error(error, out_dir)) from error
+    write_files(out_dir, {}, read_derived_digests(out_dir) | previous | own)
     for folder in (out_dir / MAPS, out_dir):
         with contextlib.suppress(OSError):  # others' files may be in it
             folder.rmdir()
 
 
 def _scene_files(snapshot: Snapshot, preview: bytes | None) -> dict[str, bytes]:
-    gaussians = viewer_safe(snapshot.gaussians)
+    gaussians = sanitize_gaussians(snapshot.gaussians)
     cameras, scale = snapshot.cameras, snapshot.scale
     colmap = encode_colmap(cameras, gaussians, scale)
     return {

@@ -23,7 +23,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.folders import made
+from splatnode.capture.process.folders import make_folder
 from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.records import record_in
 
@@ -41,14 +41,14 @@ class ResultWriteError(OSError):
 
 
 class _Note(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is to be done in a folder once all new files are on the disk, in this order."""
+    """The steps that remain in a folder once all new files are on the disk, in this order."""
 
     files: list[str]  # that are renamed to these names
     superseded: dict[str, str]  # files that are removed, by their SHA-256: one that changed meanwhile is its owner's
 
 
 @dataclass(frozen=True)
-class _Staged:
+class _StagedFile:
     """A file on its way: on the disk under a temporary name, which is locked as long as its writer lives."""
 
     name: str
@@ -57,7 +57,7 @@ class _Staged:
     linked: bool  # whether `target` is elsewhere than its name says
 
 
-_Place = Callable[[str, str], _Staged]  # of a name, and of the mark of what is being written
+_Place = Callable[[str, str], _StagedFile]  # of a name, and of the mark of what is being written
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str] | None = None) -> None:
@@ -69,36 +69,36 @@ def write_files(folder: Path, contents: Mapping[str, bytes], superseded: Mapping
     ResultWriteError when one cannot be written (no space, no permission); the temporary files are gone then and every
     file that was there before is as it was.
     """
-    _write(folder, contents, superseded or {}, partial(_placed, folder))
+    _write(folder, contents, superseded or {}, partial(_stage_file, folder))
 
 
 def write_file(path: Path, content: bytes) -> None:
     """One file that the user named, whole or not at all; a link of that name is followed. Raises ResultWriteError."""
-    _write(path.parent, {path.name: content}, {}, partial(_led_to, path.parent))
+    _write(path.parent, {path.name: content}, {}, partial(_follow_link, path.parent))
 
 
 def _write(folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str], place: _Place) -> None:
     with contextlib.ExitStack() as resources:  # folders that it makes and that stay empty are removed at the end
         try:
-            completed(folder, {(folder / name).parent for name in contents})
+            finish_interrupted_write(folder, {(folder / name).parent for name in contents})
             _write_files(folder, contents, superseded, place, resources)
         except ResultWriteError:
             raise
         except OSError as error:
-            raise ResultWriteError(error.errno, explanation(error, folder, contents)) from error
+            raise ResultWriteError(error.errno, explain_error(error, folder, contents)) from error
 
 
-def completed(folder: Path, parents: Iterable[Path] = ()) -> None:
+def finish_interrupted_write(folder: Path, parents: Iterable[Path] = ()) -> None:
     """Finishes what a killed process had begun in `folder`: the result is the new one then, or the one before.
 
     Temporary files in it and in `parents` are removed; what a living process writes is left alone. Raises OSError.
     """
-    for path in _entries(folder, _NOTE):
-        with _held(path) as free:
+    for path in _list_entries(folder, _NOTE):
+        with _hold_file(path) as free:
             if free:
-                _follow(path)
-    for path in (path for each in {folder, *parents} for path in _entries(each, _TEMPORARY)):
-        with contextlib.suppress(OSError), _held(path) as free:  # another user's is none of ours
+                _complete_note(path)
+    for path in (path for each in {folder, *parents} for path in _list_entries(each, _TEMPORARY)):
+        with contextlib.suppress(OSError), _hold_file(path) as free:  # another user's is none of ours
             if free:
                 path.unlink(missing_ok=True)
 
@@ -108,7 +108,7 @@ def json_bytes(value: object) -> bytes:
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
-def explanation(error: OSError, folder: Path, contents: Mapping[str, bytes] | None = None) -> str:
+def explain_error(error: OSError, folder: Path, contents: Mapping[str, bytes] | None = None) -> str:
     """Why `contents` could not be written into `folder`, and what to do."""
     contents = contents or {}
     megabytes = sum(map(len, contents.values())) / 1e6
@@ -136,14 +136,16 @@ def _write_files(
     temporary = [each.temporary for each in staged]
     try:
         for each, content in zip(staged, contents.values(), strict=True):
-            resources.enter_context(made(each.target.parent))
+            resources.enter_context(make_folder(each.target.parent))
             _write_through(each.temporary, content, resources)
         if noted:
-            temporary += [_temporary(note, mark), note]
+            temporary += [_make_temporary_path(note, mark), note]
             here = [each.name for each in staged if not each.linked]
-            _write_through(_temporary(note, mark), msgspec.json.encode(_Note(here, dict(superseded))), resources)
+            _write_through(
+                _make_temporary_path(note, mark), msgspec.json.encode(_Note(here, dict(superseded))), resources
+            )
             _sync_parents(staged)
-            os.replace(_temporary(note, mark), note)
+            os.replace(_make_temporary_path(note, mark), note)
             sync_folder(folder)
             temporary = []
         try:
@@ -151,7 +153,7 @@ def _write_files(
             note.unlink(missing_ok=True)
         except OSError as error:
             if noted:
-                raise ResultWriteError(error.errno, _unfinished(error, folder)) from error
+                raise ResultWriteError(error.errno, _explain_unfinished(error, folder)) from error
             raise
     finally:
         for leftover in temporary:
@@ -159,26 +161,28 @@ def _write_files(
                 leftover.unlink(missing_ok=True)
 
 
-def _unfinished(error: OSError, folder: Path) -> str:
+def _explain_unfinished(error: OSError, folder: Path) -> str:
     why = error.strerror or error
     return f"cannot rename all files in {folder}: {why}. Run the command again: what writes there next finishes it"
 
 
-def _placed(folder: Path, name: str, mark: str) -> _Staged:
-    """Where `name` says, whatever link is there."""
+def _stage_file(folder: Path, name: str, mark: str) -> _StagedFile:
+    """Returns the place that `name` says, whatever link is there."""
     if not _is_inside(folder, name):
         raise OSError(errno.ELOOP, f"{name} would be reached by a link, or lie outside; remove the link")
     target = Path(os.path.realpath((folder / name).parent), os.path.basename(name))
     if not target.is_symlink():
         _check_replaceable(target, name)
-    return _Staged(name, target, _temporary(target, mark), linked=False)
+    return _StagedFile(name, target, _make_temporary_path(target, mark), linked=False)
 
 
-def _led_to(folder: Path, name: str, mark: str) -> _Staged:
-    """Where `name` leads, as if it were opened."""
+def _follow_link(folder: Path, name: str, mark: str) -> _StagedFile:
+    """Returns the place that `name` leads to, as if it were opened."""
     target = Path(os.path.realpath(folder / name))
     _check_replaceable(target, name)
-    return _Staged(name, target, _temporary(target, mark), linked=target != Path(os.path.realpath(folder), name))
+    return _StagedFile(
+        name, target, _make_temporary_path(target, mark), linked=target != Path(os.path.realpath(folder), name)
+    )
 
 
 def _check_replaceable(target: Path, name: str) -> None:
@@ -188,7 +192,7 @@ def _check_replaceable(target: Path, name: str) -> None:
         raise FileExistsError(errno.EEXIST, f"{name} is a device or a pipe, not a file")
 
 
-def _temporary(target: Path, mark: str) -> Path:
+def _make_temporary_path(target: Path, mark: str) -> Path:
     return target.with_name(f".{target.name}.{mark}.tmp")
 
 
@@ -203,7 +207,7 @@ def _write_through(path: Path, content: bytes, resources: contextlib.ExitStack) 
     os.fsync(file.fileno())
 
 
-def _finish(folder: Path, staged: list[_Staged], superseded: Mapping[str, str]) -> None:
+def _finish(folder: Path, staged: list[_StagedFile], superseded: Mapping[str, str]) -> None:
     for each in staged:
         os.replace(each.temporary, each.target)
     _sync_parents(staged)
@@ -211,17 +215,17 @@ def _finish(folder: Path, staged: list[_Staged], superseded: Mapping[str, str]) 
         _remove(folder, name, digest)
 
 
-def _sync_parents(staged: list[_Staged]) -> None:
+def _sync_parents(staged: list[_StagedFile]) -> None:
     for parent in {each.target.parent for each in staged}:
         sync_folder(parent)
 
 
-def _follow(path: Path) -> None:
+def _complete_note(path: Path) -> None:
     """Does what is left to do of a note. It says nothing of files outside its folder: it may be a stranger's."""
     folder, mark, note = path.parent, path.name.split(".")[1], _read_note(path)
     for name in filter(lambda name: _is_inside(folder, name), note.files):
         with contextlib.suppress(FileNotFoundError):  # it has its name already
-            os.replace(_temporary(folder / name, mark), folder / name)
+            os.replace(_make_temporary_path(folder / name, mark), folder / name)
             sync_folder((folder / name).parent)
     for name, digest in note.superseded.items():
         _remove(folder, name, digest)
@@ -258,7 +262,7 @@ def _read_note(path: Path) -> _Note:
 
 
 @contextlib.contextmanager
-def _held(path: Path) -> Iterator[bool]:
+def _hold_file(path: Path) -> Iterator[bool]:
     """Holds a file that no living process holds; False where one does, or where the file has gone."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -266,12 +270,12 @@ def _held(path: Path) -> Iterator[bool]:
         yield False
         return
     try:
-        yield _locked(descriptor)
+        yield _try_lock(descriptor)
     finally:
         os.close(descriptor)
 
 
-def _locked(descriptor: int) -> bool:
+def _try_lock(descriptor: int) -> bool:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -279,7 +283,7 @@ def _locked(descriptor: int) -> bool:
     return True
 
 
-def _entries(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+def _list_entries(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
     """The folder's entries with such names; none where there is no such folder or it cannot be listed.
 
     Raises what is_shortage tells.

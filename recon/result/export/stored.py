@@ -8,12 +8,12 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.recon.result.export import formats
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import read_json_file, read_scene_file
-from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.selection import EVERYTHING, Selection
 from splatnode.recon.result.export.sources import SOURCES, decode_sources
 from splatnode.recon.result.scale import RELATIVE, Scale
@@ -32,24 +32,24 @@ class StoredResult:
     selection: Selection = EVERYTHING  # of its Gaussians
 
     @classmethod
-    def at(cls, path: Path, selection: Selection = EVERYTHING) -> StoredResult:
+    def create_from_path(cls, path: Path, selection: Selection = EVERYTHING) -> StoredResult:
         """The result in a folder, or that of a scene file."""
         return cls(path / "scene.ply" if path.is_dir() else path, selection)
 
     def gaussians(self) -> GaussianArrays:
         """Those that are selected, with finite values and bounded extents."""
-        sources = self._sources() if self.selection.by_source else None
-        return self.selection.of(read_gaussians(_existing(self.scene), sources), self.scene.name)
+        sources = self._find_sources() if self.selection.needs_sources else None
+        return self.selection.apply(read_gaussians(_check_exists(self.scene), sources), self.scene.name)
 
     def cameras(self) -> tuple[CameraEstimate, ...]:
-        return read_cameras(_existing(self._cameras))
+        return read_cameras(_check_exists(self._cameras))
 
     def scale(self) -> Scale:
         """The unit of the lengths, as cameras.json states it; relative where there is no such file."""
         return decode_scale(read_json_file(self._cameras), self._cameras.name) if self._cameras.is_file() else RELATIVE
 
-    def _sources(self) -> Path:
-        """Where it is told what each Gaussian began from. Raises SceneFileError where it is not."""
+    def _find_sources(self) -> Path:
+        """Finds the file of the Gaussians' source frames. Raises SceneFileError where there is none."""
         path = self.scene.with_name(SOURCES)
         if self.scene.suffix.lower() != ".ply" or not path.is_file():
             raise SceneFileError(
@@ -71,15 +71,15 @@ def read_gaussians(path: Path, sources: Path | None = None) -> GaussianArrays:
     Their source frames are unknown but where `sources` has them.
     Raises SceneFileError where the file is truncated or is something else, OSError where it cannot be read.
     """
-    decode = _decoders().get(path.suffix.lower())
+    decode = _load_decoders().get(path.suffix.lower())
     if decode is None:
-        raise SceneFileError(f"{path.name} must end with {', '.join(_decoders())}")
-    with foreign(SceneFileError, path.name):
+        raise SceneFileError(f"{path.name} must end with {', '.join(_load_decoders())}")
+    with guard_untrusted(SceneFileError, path.name):
         gaussians = decode(read_scene_file(path), path.name)
         if sources is not None:
             source_frame = decode_sources(read_scene_file(sources), len(gaussians))
             gaussians = replace(gaussians, source_frame=source_frame)
-        safe = viewer_safe(gaussians)
+        safe = sanitize_gaussians(gaussians)
         if len(gaussians) and not len(safe):
             raise SceneFileError(f"{path.name} holds {len(gaussians)} Gaussians, none of them with finite values")
         return safe
@@ -90,13 +90,13 @@ def read_cameras(path: Path) -> tuple[CameraEstimate, ...]:
     return decode_cameras(read_json_file(path), path.name)
 
 
-def _decoders() -> dict[str, Callable[[bytes, str], GaussianArrays]]:
-    """By suffix. Those formats can be read whose module has `decode`."""
+def _load_decoders() -> dict[str, Callable[[bytes, str], GaussianArrays]]:
+    """Loads the decoders by suffix. A format can be read if its module has `decode`."""
     modules = {name: import_module(f"{formats.__name__}.{name}") for _, name, _ in iter_modules(formats.__path__)}
     return {f".{name}": module.decode for name, module in sorted(modules.items()) if hasattr(module, "decode")}
 
 
-def _existing(path: Path) -> Path:
+def _check_exists(path: Path) -> Path:
     if not path.is_file():
         raise FileNotFoundError(
             f"{path} is not there. Give the folder of a result (splatnode replay FOLDER --out DIR), or a scene file; "

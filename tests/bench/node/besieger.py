@@ -27,7 +27,7 @@ from splatnode.capture.messaging.services import (
     RECON_SCENE,
     RECON_STATUS,
 )
-from splatnode.capture.process.config import typed
+from splatnode.capture.process.config import parse_config
 from tests.bench.node.attacked import shout
 from tests.support.adversary.boundaries import BOUNDARIES
 
@@ -38,7 +38,7 @@ OPEN = 200  # connections that are left open at once
 
 
 def main() -> None:
-    network = typed(yaml.safe_load(Path(sys.argv[1]).read_text()), Network)
+    network = parse_config(yaml.safe_load(Path(sys.argv[1]).read_text()), Network)
     per_second, rng = float(sys.argv[2]), random.Random(sys.argv[3])
     deeds = over_tcp(rng, network) if network.tcp else over_ipc(rng, network)
     started = time.monotonic()

@@ -57,7 +57,7 @@ def filmed(walk: building.Config, path: Path) -> None:
     size = walk.width, walk.height
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), walk.frames_per_second, size)
     for number in range(walk.keyframes):
-        writer.write(cv2.cvtColor(building.photograph(walk, number), cv2.COLOR_RGB2BGR))
+        writer.write(cv2.cvtColor(building.render_image(walk, number), cv2.COLOR_RGB2BGR))
     writer.release()
 
 

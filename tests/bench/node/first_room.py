@@ -8,7 +8,7 @@ from pathlib import Path
 from splatnode.capture.cameras import building
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.true_cameras import TrueCamera
 from splatnode.recon.evaluate.truth import EvaluationScene
@@ -45,8 +45,8 @@ def first_room(
     for keyframe in chosen:
         name = f"held_out_{keyframe:05d}.png"
         paths[name] = folder / name
-        paths[name].write_bytes(encode_png(building.photograph(config, keyframe + 0.5)))
-        true[name] = TrueCamera(*building.held_out_camera(config, keyframe), config.width, config.height)
+        paths[name].write_bytes(encode_png(building.render_image(config, keyframe + 0.5)))
+        true[name] = TrueCamera(*building.evaluation_camera(config, keyframe), config.width, config.height)
     cameras = read_cameras(folders[scene] / "cameras.json")
     for camera in cameras:
         known = building.scene_camera(config, building.frame_index(camera.name))
@@ -65,9 +65,9 @@ def first_room(
 
 def _alone(config: building.Config, names: Sequence[str]) -> Snapshot:
     """Of these photographs of the walk, offline."""
-    images = [building.photograph(config, building.frame_index(name)) for name in names]
+    images = [building.render_image(config, building.frame_index(name)) for name in names]
     frames = [
         Frame(index, *named, None) for index, named in enumerate(zip(names, range(len(names)), images, strict=True))
     ]
-    *_, last = reconstruct(frames, Config(max_gaussians=300_000))
+    *_, last = reconstruct(frames, ReconstructionConfig(max_gaussians=300_000))
     return last

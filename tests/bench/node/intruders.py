@@ -10,7 +10,7 @@ from splatnode.capture.messaging.keys import allow, create_keys, expect_server
 from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateClient
-from splatnode.capture.process.config import typed
+from splatnode.capture.process.config import parse_config
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.trial import RECON, Trial, expect, expect_whole, wait_for
 from tests.support.node import Node, running
@@ -23,7 +23,7 @@ def unauthorised(trial: Trial) -> None:
         node.start("recon")
         node.start("capture")
         wait_for(lambda: "event=ready" in node.log("recon"), "recon that runs")
-        outsider = StateClient(RECON_SCENE, typed(network | {"keys": str(stranger)}, Network), SceneHeader)
+        outsider = StateClient(RECON_SCENE, parse_config(network | {"keys": str(stranger)}, Network), SceneHeader)
         refused = False
         deadline = time.monotonic() + 15
         while not refused and time.monotonic() < deadline:
@@ -63,7 +63,7 @@ def revoked_key(trial: Trial) -> None:
     """A key that is taken back: who is connected stays so until it connects anew, and is then told what to do."""
     network, stranger = _over_tcp(trial)
     allow(Path(network["keys"]), "stranger", (stranger / "public.key").read_bytes())
-    theirs = typed(network | {"keys": str(stranger)}, Network)
+    theirs = parse_config(network | {"keys": str(stranger)}, Network)
     with running(trial.node(network=network)) as node:
         node.start("recon")
         node.start("capture")
@@ -84,7 +84,7 @@ def rotated_keys(trial: Trial) -> None:
     network, other = _over_tcp(trial)
     own = Path(network["keys"])
     allow(own, "other", (other / "public.key").read_bytes())
-    theirs = typed(network | {"keys": str(other)}, Network)
+    theirs = parse_config(network | {"keys": str(other)}, Network)
     with running(trial.node(network=network)) as node:
         node.start("capture")
         node.start("recon")

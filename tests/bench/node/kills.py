@@ -91,7 +91,7 @@ class Walk:
     def show(self, count: int) -> None:
         for _ in range(count):
             path = self._folder / building.frame_name(self.shown)
-            cv2.imwrite(str(path), cv2.cvtColor(building.photograph(self._config, self.shown), cv2.COLOR_RGB2BGR))
+            cv2.imwrite(str(path), cv2.cvtColor(building.render_image(self._config, self.shown), cv2.COLOR_RGB2BGR))
             for images in sorted(self._folder.glob("*_images")):
                 shutil.copy(path, images / f"{path.name}.part")
                 (images / f"{path.name}.part").rename(images / path.name)

@@ -22,8 +22,8 @@ import numpy as np
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.preview import PreviewHeader
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
@@ -52,7 +52,7 @@ def main() -> None:
         row, live = replay(scene, split, args.folder / name / "images", args.per_second)
         row |= {"scene": name, "live_psnr": psnr(live, scene, split)}
         if not args.no_offline:
-            *_, offline = reconstruct(list(scene.frames(split.train)), Config())
+            *_, offline = reconstruct(list(scene.frames(split.train)), ReconstructionConfig())
             row |= {"offline_psnr": psnr(offline, scene, split), "offline_gaussians": len(offline.gaussians)}
         rows.append(row)
         print(json.dumps(row), flush=True)
@@ -128,5 +128,5 @@ def psnr(snapshot: Snapshot | None, scene: EvaluationScene, split: Split) -> flo
     if snapshot is None:
         return None
     nowhere = Run("live", 0, None, {}, None)
-    networks = Networks(alex=None, vgg=None)
+    networks = PerceptualNetworks(alex=None, vgg=None)
     return evaluate(snapshot, scene, split, nowhere, rasterize=rasterize, networks=networks, settings=SETTINGS).psnr

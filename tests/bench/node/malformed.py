@@ -10,13 +10,13 @@ import numpy as np
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import (
     Acknowledge,
+    ConsumerStatus,
     Delivery,
     DroppedHeader,
     FrameHeader,
     Ready,
     Refuse,
     Request,
-    Served,
 )
 from splatnode.capture.messaging.state import Want
 from splatnode.capture.messaging.wire import Numbering, encode
@@ -45,7 +45,7 @@ def good_messages() -> list[tuple[Parts, Any]]:
         (encode(Ready(session, session, 4, [(session, 1), (session, 2)], 1 << 20)), Request),
         (encode(Acknowledge(session, 7)), Request),
         (encode(Refuse(session, 7, "its stamp")), Request),
-        (encode(Served(True, 1 << 20)), Delivery | Served),
+        (encode(ConsumerStatus(True, 1 << 20)), Delivery | ConsumerStatus),
         (encode(Want(session, 7)), Want),
     ]
     return [([bytes(part) for part in parts], schema) for parts, schema in messages]

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
@@ -31,7 +31,7 @@ from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.result.whole import read_whole
+from splatnode.recon.result.whole import read_map_set
 from tests.bench.node.stream import _split, _streamed
 
 SETTINGS = Settings(alignment_steps=80, alignment_levels=2)
@@ -71,7 +71,7 @@ def main() -> None:
 def _rows(
     out: Path, scratch: Path, scene: EvaluationScene, split: Split, limits: list[int], renders: Path | None
 ) -> list[dict]:
-    whole = read_whole(out)
+    whole = read_map_set(out)
     rows = []
     for each in whole.maps:
         found = load_submaps(whole, each)
@@ -126,6 +126,6 @@ def _score(
 
     evaluate(
         snapshot, scene, Split(tuple(used), tuple(between)), Run("merge", 0, None, {}, None),
-        rasterize=rasterize, networks=Networks(None, None), settings=SETTINGS, show=show,
+        rasterize=rasterize, networks=PerceptualNetworks(None, None), settings=SETTINGS, show=show,
     )  # fmt: skip
     return scores

@@ -16,7 +16,7 @@ from splatnode.capture.messaging.keys import create_keys, expect_server
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateClient
-from splatnode.capture.process.config import typed
+from splatnode.capture.process.config import parse_config
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader
@@ -192,7 +192,7 @@ def wrong_key(way: Way) -> None:
 
 def _refusal(way: Way, keys: Path) -> str:
     """What a client with these keys is told."""
-    client = StateClient(RECON_SCENE, typed(way.network | {"keys": str(keys)}, Network), SceneHeader)
+    client = StateClient(RECON_SCENE, parse_config(way.network | {"keys": str(keys)}, Network), SceneHeader)
     return refusal(client)
 
 

@@ -80,7 +80,7 @@ def fill(spool: Spool, count: int, images: Sequence[Frame]) -> list[str]:
         if index % EVERY == EVERY - 1:
             message = _spoiled(message, KINDS[index // EVERY % len(KINDS)])
             refused.append(name)
-        spool.put(Key(header.session, header.sequence), message)
+        spool.store(Key(header.session, header.sequence), message)
     return refused
 
 
@@ -99,7 +99,7 @@ def two_ends(folder: Path, count: int) -> dict[str, Any]:
     images = [Frame(0, f"{index}.png", 0, np.full((6, 8, 3), index, np.uint8), None) for index in range(7)]
     refused, taken = fill(spool, count, images), []
     with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
-        while server.queued and time.monotonic() < started + PATIENCE_S:
+        while server.num_queued and time.monotonic() < started + PATIENCE_S:
             server.serve(0.001)
             if (received := client.receive(0.001)) is not None:
                 taken.append(received.frame.name)
@@ -108,7 +108,7 @@ def two_ends(folder: Path, count: int) -> dict[str, Any]:
         return _row(count, refused, named, started) | {
             "delivered_once": len(taken) == len(set(taken)) == count - len(refused),
             "acknowledged": server.acknowledged,
-            "left": server.queued,
+            "left": server.num_queued,
             "refused_by_recon": client.refused,
         }
 

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import yaml
 
-from splatnode.capture.cameras.synthetic import TARGET, Config, intrinsic_matrix, look_at, photograph
+from splatnode.capture.cameras.synthetic import TARGET, Config, intrinsic_matrix, look_at, render_image
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.keys import create_keys
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
@@ -98,7 +98,7 @@ def photograph_walk(folder: Path, count: int) -> None:
         distance, height = 3.3 + 0.25 * np.sin(0.73 * way), 1.55 + 0.25 * np.sin(1.17 * way + 1.0)
         centre = np.array([TARGET[0] + distance * np.cos(azimuth), TARGET[1] + distance * np.sin(azimuth), height])
         camera = look_at(centre, TARGET + 0.05 * np.sin([way, 1.3 * way, 1.9 * way])), K
-        image = photograph(PICTURE, camera, index)
+        image = render_image(PICTURE, camera, index)
         cv2.imwrite(str(folder / f"walk_{index:05d}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
 
 

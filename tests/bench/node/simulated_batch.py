@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from splatnode.recon.batch.command import run_batch
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 
 OUT, TALLY = "out", "tally"  # in the folder: the batch, and a line for each time that a recording began
@@ -24,22 +24,22 @@ MOST_CORES = 2
 _ENDS = {"OK": (GOOD, 0.85), "NO_OVERLAP": (REFUSED, 0.1), "failed": ("exit 9", 0.04), "killed": ("kill -9 $$", 0.01)}
 
 
-def recordings(folder: Path, count: int) -> list[Recording]:
-    return [Recording(f"{number:06d}", str(folder / f"{number:06d}")) for number in range(count)]
+def recordings(folder: Path, count: int) -> list[BatchRecording]:
+    return [BatchRecording(f"{number:06d}", str(folder / f"{number:06d}")) for number in range(count)]
 
 
-def end_of(recording: Recording, longest_sleep_s: float = LONGEST_SLEEP_S) -> tuple[str, str, float]:
+def end_of(recording: BatchRecording, longest_sleep_s: float = LONGEST_SLEEP_S) -> tuple[str, str, float]:
     """What it comes to, the shell's command for that, and for how long it sleeps before: drawn from its name alone."""
     chance = random.Random(recording.name)
     (name,) = chance.choices(list(_ENDS), [share for _, share in _ENDS.values()])
     return name, _ENDS[name][0], chance.uniform(0, longest_sleep_s)
 
 
-def work(longest_sleep_s: float, recording: Recording, folder: Path) -> Sequence[str]:
+def work(longest_sleep_s: float, recording: BatchRecording, folder: Path) -> Sequence[str]:
     _, command, sleep_s = end_of(recording, longest_sleep_s)
     tally = Path(recording.source).with_name(TALLY)
     told = f"echo {recording.name} >> '{tally}'; sleep {sleep_s:.3f}; {command}"
-    return simulated(Recording(recording.name, told), folder)
+    return simulated(BatchRecording(recording.name, told), folder)
 
 
 def main() -> None:

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.status import heartbeats
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.geometry import Similarity
@@ -75,7 +75,9 @@ def main() -> None:
             ):
                 place["psnr"] = psnr(_of(name, snapshot), scene, splits[name])
         if not args.no_offline:
-            *_, offline = reconstruct(list(scene.frames(splits[name].train)), Config(max_gaussians=300_000))
+            *_, offline = reconstruct(
+                list(scene.frames(splits[name].train)), ReconstructionConfig(max_gaussians=300_000)
+            )
             row = {"psnr": psnr(offline, scene, splits[name]), "gaussians": len(offline.gaussians)}
             live.setdefault("offline", {})[name] = row | {"cameras": len(offline.cameras)}
     for place in places:
@@ -105,7 +107,7 @@ def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], poses:
     }
     true = scene.cameras
     names = [each for each in cameras if each in true]
-    errors = camera_errors(
+    errors = compare_cameras(
         np.stack([cameras[each][0] for each in names]),
         np.stack([true[each].T_world_camera for each in names]),
         np.stack([cameras[each][1].K for each in names]),

@@ -91,7 +91,7 @@ def _begun(folder: Path, disk: Path, walk: building.Config, chance: random.Rando
 
     def photograph(number: int) -> Path:
         path = folder / building.frame_name(number)
-        cv2.imwrite(str(path), cv2.cvtColor(building.photograph(walk, number), cv2.COLOR_RGB2BGR))
+        cv2.imwrite(str(path), cv2.cvtColor(building.render_image(walk, number), cv2.COLOR_RGB2BGR))
         return path
 
     way = Way(node, images, disk, network, stranger, chance, photograph)

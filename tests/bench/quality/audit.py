@@ -27,14 +27,14 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.process.progress import say
-from splatnode.recon.auditing.motion import Motion, motion, twist
+from splatnode.recon.auditing.motion import MeasuredMotion, measure_motion, twist
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.locating.locate import Placed, described, placed
+from splatnode.recon.locating.locate import Localization, localize_with_inliers, prepare_query_image
 from splatnode.recon.result.landmarks import Landmarks
 from tests.bench.quality.locate import estimated
 from tests.support.synthetic import photographs, view_graph
@@ -102,13 +102,13 @@ def warped(image: Image, K: Array, T: Array) -> Image:
     )
 
 
-def check(scene: str, name: str, kind: str, found: Motion, true: Array, unit: float) -> Check:
+def check(scene: str, name: str, kind: str, found: MeasuredMotion, true: Array, unit: float) -> Check:
     error = twist(np.linalg.inv(true) @ found.T_before_after)
     return Check(
         scene,
         name,
         kind,
-        found.significant,
+        found.is_significant,
         found.common,
         round(found.degrees, 4),
         round(100.0 * found.distance / unit, 4),
@@ -124,23 +124,28 @@ def of_scene(scene: EvaluationScene, landmarks: Landmarks, names: Sequence[str],
     true = np.stack([scene.cameras[name].T_world_camera for name in landmarks.names])
     to_scene = align_cameras(true, landmarks.Ts_world_camera)
     images = {name: shrunk(scene.image(name)) for name in names}
-    before: tuple[str, Placed] | None = None
+    before: tuple[str, Localization] | None = None
     for name in names:
-        first = placed(landmarks, described(images[name]))
-        if not isinstance(first, Placed):
+        first = localize_with_inliers(landmarks, prepare_query_image(images[name]))
+        if not isinstance(first, Localization):
             continue
         other = images[names[int(generator.integers(len(names)))]]
         for number in range(times):
             T = turn(generator) if number % 2 else np.eye(4)
             image = warped(images[name], first.located.K, T) if number % 2 else images[name]
-            second = placed(landmarks, described(another_day(image, other, generator)))
-            if isinstance(second, Placed):
+            second = localize_with_inliers(landmarks, prepare_query_image(another_day(image, other, generator)))
+            if isinstance(second, Localization):
                 yield check(
-                    scene.name, name, "turned" if number % 2 else "still", motion(first, second), T, landmarks.unit
+                    scene.name,
+                    name,
+                    "turned" if number % 2 else "still",
+                    measure_motion(first, second),
+                    T,
+                    landmarks.unit,
                 )
         if before is not None:
             Ts = [to_scene.camera(scene.cameras[each].T_world_camera) for each in (before[0], name)]
-            found = motion(before[1], first)
+            found = measure_motion(before[1], first)
             yield check(scene.name, name, "pair", found, np.linalg.inv(Ts[0]) @ Ts[1], landmarks.unit)
         before = name, first
 
@@ -152,12 +157,14 @@ def of_built_in(times: int) -> Iterator[Check]:
     landmarks = estimate.landmarks
     assert landmarks is not None
     to_scene = align_cameras(np.stack([T for T, _ in synthetic.scene_cameras(PLACE)]), landmarks.Ts_world_camera)
-    cameras = synthetic.held_out_cameras(PLACE)
+    cameras = synthetic.evaluation_cameras(PLACE)
     for index, (T_world_camera, K) in enumerate(cameras):
         name = f"held_out_{index}"
-        other = synthetic.photograph(PLACE, cameras[(index + 2) % len(cameras)], 900)
-        first = placed(landmarks, described(synthetic.photograph(PLACE, (T_world_camera, K), 1000 + index)))
-        if not isinstance(first, Placed):
+        other = synthetic.render_image(PLACE, cameras[(index + 2) % len(cameras)], 900)
+        first = localize_with_inliers(
+            landmarks, prepare_query_image(synthetic.render_image(PLACE, (T_world_camera, K), 1000 + index))
+        )
+        if not isinstance(first, Localization):
             continue
         moves: dict[str, Callable[[], Array]] = {
             "still": lambda: np.eye(4),
@@ -167,12 +174,12 @@ def of_built_in(times: int) -> Iterator[Check]:
         for number in range(times):
             for kind, move in moves.items():
                 T = move()
-                image = synthetic.photograph(PLACE, (T_world_camera @ T, K), 10 * number + index)
-                second = placed(landmarks, described(another_day(image, other, generator)))
-                if isinstance(second, Placed):
+                image = synthetic.render_image(PLACE, (T_world_camera @ T, K), 10 * number + index)
+                second = localize_with_inliers(landmarks, prepare_query_image(another_day(image, other, generator)))
+                if isinstance(second, Localization):
                     in_scene = T.copy()
                     in_scene[:3, 3] *= to_scene.scale
-                    yield check(BUILT_IN, name, kind, motion(first, second), in_scene, landmarks.unit)
+                    yield check(BUILT_IN, name, kind, measure_motion(first, second), in_scene, landmarks.unit)
 
 
 def shift(generator: np.random.Generator, length: float) -> Array:

@@ -21,16 +21,16 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.config import preset
-from splatnode.recon.estimation import Estimate, estimate_depth
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.estimation import Reconstruction, estimate_depth
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.places import Photo
-from splatnode.recon.evaluate.stability.warps import distorted
-from splatnode.recon.evaluate.start import Start, find_start, foundation
+from splatnode.recon.evaluate.stability.places import TrialImage
+from splatnode.recon.evaluate.stability.warps import distort_image
+from splatnode.recon.evaluate.start import Start, extract_start_config, find_start
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import load_prior
-from splatnode.recon.registration.straightened import corner_shift, straight_pixels, straightened
+from splatnode.recon.registration.straightened import corner_shift, undistort_keyframes, undistort_pixels
 from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = (
@@ -79,7 +79,7 @@ class Row:
 class Bent(EvaluationScene):
     """A scene whose photographs were bent, and their true cameras with them."""
 
-    photos: Mapping[str, Photo] = field(default_factory=dict)  # by name, bent
+    photos: Mapping[str, TrialImage] = field(default_factory=dict)  # by name, bent
     seen_by: tuple[Intrinsics, Intrinsics] | None = None  # a lens and the pinhole of its straight photographs
 
     def image(self, name: str) -> npt.NDArray[np.uint8]:
@@ -93,19 +93,19 @@ class Bent(EvaluationScene):
         lens, pinhole = self.seen_by
         height, width = image.shape[:2]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
-        shown = straight_pixels(pixels, lens.resized(width, height), pinhole)
+        shown = undistort_pixels(pixels, lens.resized(width, height), pinhole)
         inside = np.all((shown >= 0) & (shown <= (pinhole.width, pinhole.height)), axis=1)
         return image, inside.reshape(height, width)
 
 
 def bent(scene: EvaluationScene, names: Sequence[str], k1: float, k2: float) -> Bent:
     """The photographs of these names as a lens with these radial coefficients shows them."""
-    photos = {name: distorted(Photo(name, scene.image(name), scene.cameras[name]), k1, k2) for name in names}
+    photos = {name: distort_image(TrialImage(name, scene.image(name), scene.cameras[name]), k1, k2) for name in names}
     cameras = {name: photo.camera for name, photo in photos.items() if photo.camera is not None}
     return Bent(scene.name, scene.paths, cameras, None, photos)
 
 
-def as_photographed(estimate: Estimate) -> Estimate:
+def as_photographed(estimate: Reconstruction) -> Reconstruction:
     """The same cameras, of which nothing is known but that they are pinholes."""
     if estimate.registration is None:
         raise ValueError("there are no cameras")
@@ -114,7 +114,7 @@ def as_photographed(estimate: Estimate) -> Estimate:
     return estimate_depth(known, load_prior(CONFIG))
 
 
-def told(scene: EvaluationScene, views: int, k1: float, k2: float, estimate: Estimate) -> Row:
+def told(scene: EvaluationScene, views: int, k1: float, k2: float, estimate: Reconstruction) -> Row:
     """What was estimated of the lens."""
     registration, code = estimate.registration, estimate.verdict.code.value
     if registration is None or not estimate.publishable:
@@ -122,13 +122,13 @@ def told(scene: EvaluationScene, views: int, k1: float, k2: float, estimate: Est
     camera = registration.cameras[0]
     frame = estimate.graph.keyframes[camera.index].frame
     lens = lens_of(estimate, frame)
-    straight = straightened(estimate.graph, registration)[0] is not estimate.graph
+    straight = undistort_keyframes(estimate.graph, registration)[0] is not estimate.graph
     shift = SIDE * corner_shift(lens)
     found = (round(coefficient, 4) for coefficient in camera.radial.tolist())
     return Row(scene.name, views, k1, k2, code, *found, round(shift, 2), straight)
 
 
-def lens_of(estimate: Estimate, frame: Frame) -> Intrinsics:
+def lens_of(estimate: Reconstruction, frame: Frame) -> Intrinsics:
     """The lens of the first camera, as it was estimated."""
     if estimate.registration is None:
         raise ValueError("there are no cameras")
@@ -137,7 +137,7 @@ def lens_of(estimate: Estimate, frame: Frame) -> Intrinsics:
     return Intrinsics(frame.width, frame.height, focal, focal, cx, cy, "estimated", (*camera.radial.tolist(), 0.0, 0.0))
 
 
-def scored(start: Start, kind: str, scene: Bent, split: Split, networks: Networks, known: Row) -> Row:
+def scored(start: Start, kind: str, scene: Bent, split: Split, networks: PerceptualNetworks, known: Row) -> Row:
     snapshot, row, seconds = timed(partial(last, start, CONFIG), scene, split, networks)
     return replace(
         known,
@@ -154,20 +154,20 @@ def scored(start: Start, kind: str, scene: Bent, split: Split, networks: Network
     )
 
 
-def rows(scene: EvaluationScene, split: Split, rest: Sequence[str], networks: Networks) -> list[Row]:
+def rows(scene: EvaluationScene, split: Split, rest: Sequence[str], networks: PerceptualNetworks) -> list[Row]:
     k1, k2, *_ = (*map(float, rest), 0.0)
     if not k1:
-        work = IncrementalReconstruction(foundation(CONFIG))
+        work = IncrementalReconstruction(extract_start_config(CONFIG))
         for frame in scene.frames(split.train):
-            work.take(frame)
+            work.add_frame(frame)
         return [told(scene, len(split.train), k1, k2, work.estimate_thoroughly())]
     split = replace(split, test=split.test[::EVERY])
     place = bent(scene, (*split.train, *split.test), k1, k2)
-    start = find_start(place.frames(split.train), foundation(CONFIG))
+    start = find_start(place.frames(split.train), extract_start_config(CONFIG))
     known = told(scene, len(split.train), k1, k2, start.estimate)
     if not known.straightened or start.estimate.registration is None:
         return [known]
-    graph, _ = straightened(start.estimate.graph, start.estimate.registration)
+    graph, _ = undistort_keyframes(start.estimate.graph, start.estimate.registration)
     straight = graph.keyframes[start.estimate.registration.cameras[0].index]
     if straight.lens is None or straight.frame.intrinsics is None:
         raise AssertionError("a straightened keyframe has its lens and its pinhole")

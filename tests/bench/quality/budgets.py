@@ -15,8 +15,8 @@ from itertools import pairwise
 
 from msgspec.structs import replace
 
-from splatnode.recon.config import Config, preset
-from splatnode.recon.evaluate.start import continued
+from splatnode.recon.config import ReconstructionConfig, preset
+from splatnode.recon.evaluate.start import continue_reconstruction
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Scoring, load_case, parsed, parser_of
 
@@ -53,10 +53,10 @@ def snapshots(start: bytes, limit: str, value: float) -> Iterator[Snapshot]:
         config = replace(config, optimize=replace(config.optimize, checkpoints=CHECKPOINTS))
     else:
         config = within(config, limit, value, begun.seconds)
-    return continued(begun, config)
+    return continue_reconstruction(begun, config)
 
 
-def within(config: Config, limit: str, value: float, spent: float) -> Config:
+def within(config: ReconstructionConfig, limit: str, value: float, spent: float) -> ReconstructionConfig:
     """`config` with a limit; one of time is counted from the points on, which took `spent` seconds."""
     if limit == "budget_s":
         return replace(config, budget_s=spent + value)

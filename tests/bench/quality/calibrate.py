@@ -23,7 +23,7 @@ from splatnode.capture.calibration.board import Board
 from splatnode.capture.calibration.coverage import CORNERS
 from splatnode.capture.calibration.gathering import Gathering
 from splatnode.capture.calibration.hold_out import choose
-from splatnode.capture.calibration.lacking import ENOUGH, uncovered, unknown
+from splatnode.capture.calibration.lacking import ENOUGH, describe_missing_coverage, describe_uncertainty
 from splatnode.capture.calibration.uncertainty import pixel_sigmas
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import lens as lenses
@@ -82,7 +82,7 @@ def measured(name: str, photographs: int, seed: int) -> Result:
     if choice is None or coverage is None:
         raise ValueError(f"no lens explains the views of {name}, seed {seed}")
     found = choice.taken.estimate
-    missing = [*filter(None, [uncovered(coverage)]), *unknown(found, coverage, ENOUGH)]
+    missing = [*filter(None, [describe_missing_coverage(coverage)]), *describe_uncertainty(found, coverage, ENOUGH)]
     corners = np.array([[x * WIDTH, y * HEIGHT] for x, y in CORNERS.values()], np.float64)
     errors = np.linalg.norm(lenses.project(lenses.unproject(corners, true), found.lens) - corners, axis=1)
     worst = int(np.argmax(errors))

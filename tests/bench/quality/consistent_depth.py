@@ -23,8 +23,8 @@ from torch import Tensor
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.metrics import psnr, ssim
-from splatnode.recon.evaluate.perceptual import Networks
-from splatnode.recon.evaluate.protocol import Run, Settings, evaluate, mean
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
+from splatnode.recon.evaluate.protocol import Run, Settings, compute_mean, evaluate
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.geometry import angles_deg
@@ -158,7 +158,7 @@ def measured(case: Case, scenes: Path) -> Row:
         views.append(HeldOut(name, round(turn, 1), round(psnr(image, truth), 2), round(ssim(image, truth), 4)))
 
     about = Run("preview", 0, None, {}, None)
-    networks = Networks(None, None)
+    networks = PerceptualNetworks(None, None)
     evaluate(
         snapshot, case.scene, case.split, about, rasterize=rasterize, networks=networks, settings=SEARCH, show=keep
     )
@@ -169,8 +169,8 @@ def measured(case: Case, scenes: Path) -> Row:
         apart_deg=round(apart, 1),
         consistent_depth=_rounded(snapshot.consistent_depth, 4),
         least=_rounded(min(shares, default=None), 4),
-        psnr=_rounded(mean([view.psnr for view in views]), 2),
-        ssim=_rounded(mean([view.ssim for view in views]), 4),
+        psnr=_rounded(compute_mean([view.psnr for view in views]), 2),
+        ssim=_rounded(compute_mean([view.ssim for view in views]), 4),
         held_out=tuple(views),
         num_gaussians=len(snapshot.gaussians),
         seconds=round(time.process_time() - began, 1),

@@ -20,10 +20,10 @@ from pathlib import Path
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
@@ -63,11 +63,11 @@ def measured(across_deg: float, views: int, pinhole: bool, chosen: str, folder: 
     config = synthetic.Config(views=views, width=lens.width, height=lens.height, lens=lens)
     frames = list(synthetic.stream(config))
     held_out = [
-        Frame(number, f"test_{number:03d}.png", number, synthetic.photograph(config, camera, number), lens)
-        for number, camera in enumerate(synthetic.held_out_cameras(config), start=views)
+        Frame(number, f"test_{number:03d}.png", number, synthetic.render_image(config, camera, number), lens)
+        for number, camera in enumerate(synthetic.evaluation_cameras(config), start=views)
     ]
-    poses = [T for T, _ in (*synthetic.scene_cameras(config), *synthetic.held_out_cameras(config))]
-    straight = [undistorted(frame) for frame in (*frames, *held_out)]
+    poses = [T for T, _ in (*synthetic.scene_cameras(config), *synthetic.evaluation_cameras(config))]
+    straight = [undistort_frame(frame) for frame in (*frames, *held_out)]
     cameras = [
         CameraEstimate(each.name, each.frame_id, T, each.intrinsics.K, each.width, each.height)
         for each, T in zip(straight, poses, strict=True)
@@ -77,7 +77,7 @@ def measured(across_deg: float, views: int, pinhole: bool, chosen: str, folder: 
     write_file(folder / "cameras.json", encode_cameras(cameras))
     split = Split(tuple(frame.name for frame in frames), tuple(frame.name for frame in held_out))
     snapshot = run(frames, preset(chosen))
-    scoring = Scoring(Networks(None, None), Settings(alignment_steps=STEPS))
+    scoring = Scoring(PerceptualNetworks(None, None), Settings(alignment_steps=STEPS))
     scored = Case(load_scene(folder), split).score(snapshot, chosen, scoring)
     errors = scored.rotation_error_deg, scored.centre_error_pct
     name = "pinhole" if pinhole else "fisheye"

@@ -16,17 +16,22 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.recon.evaluate.stability.fitting.cross_validation import fitted, left_out, report, without_each_scene
-from splatnode.recon.evaluate.stability.fitting.module import source
-from splatnode.recon.evaluate.stability.fitting.rejudged import rejudged
-from splatnode.recon.evaluate.stability.fitting.samples import load, read
+from splatnode.recon.evaluate.stability.fitting.cross_validation import (
+    fit_models,
+    fit_without_each_scene,
+    make_report,
+    pair_held_out_models,
+)
+from splatnode.recon.evaluate.stability.fitting.module import format_module
+from splatnode.recon.evaluate.stability.fitting.rejudged import rejudge_rows
+from splatnode.recon.evaluate.stability.fitting.samples import load_results, read_samples
 from splatnode.recon.evaluate.stability.windows import charts
-from splatnode.recon.evaluate.stability.windows.command import report_lines
-from splatnode.recon.evaluate.stability.windows.row import Row
+from splatnode.recon.evaluate.stability.windows.command import format_report
+from splatnode.recon.evaluate.stability.windows.row import WindowRow
 from splatnode.recon.evaluate.stability.windows.summary import summarise
 from splatnode.recon.evaluate.stability.windows.window import COUNTS
 from splatnode.recon.result.export.staged import json_bytes, write_file
-from splatnode.recon.verification.models import Fitted, Numbers
+from splatnode.recon.verification.models import VerdictModel, VerdictModels
 
 KEPT = ("scene", "count", "stride", "start", "angle_deg", "method", "verdict", "published", "right")  # of a row
 MODULE = Path("recon/verification/fitted.py")
@@ -38,13 +43,13 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help=f"write {MODULE}")
     parser.add_argument("--out", type=Path, help="folder for fit.json, windows.json and charts")
     arguments = parser.parse_args()
-    samples = read(arguments.results)
-    many, pairs = ([sample for sample in samples if sample.pair is pair] for pair in (False, True))
-    of_many, of_pairs = without_each_scene(many), without_each_scene(pairs)
-    numbers = Fitted(fitted(many), fitted(pairs))
+    samples = read_samples(arguments.results)
+    many, pairs = ([sample for sample in samples if sample.is_pair is pair] for pair in (False, True))
+    of_many, of_pairs = fit_without_each_scene(many), fit_without_each_scene(pairs)
+    numbers = VerdictModels(fit_models(many), fit_models(pairs))
     found = {
-        "many": {"samples": len(many), "cross_validated": report(left_out(many, of_many))},
-        "pair": {"samples": len(pairs), "cross_validated": report(left_out(pairs, of_pairs))},
+        "many": {"samples": len(many), "cross_validated": make_report(pair_held_out_models(many, of_many))},
+        "pair": {"samples": len(pairs), "cross_validated": make_report(pair_held_out_models(pairs, of_pairs))},
         "numbers": asdict(numbers),
     }
     print(json.dumps(found, indent=1))
@@ -53,19 +58,19 @@ def main() -> None:
         write_file(arguments.out / "fit.json", json_bytes(found))
         _windows(arguments.results, of_many, arguments.out)
     if arguments.write:
-        MODULE.write_text(source(numbers))
+        MODULE.write_text(format_module(numbers))
 
 
-def _windows(results: list[Path], numbers: Mapping[str, Numbers], out: Path) -> None:
+def _windows(results: list[Path], numbers: Mapping[str, VerdictModel], out: Path) -> None:
     """windows.json of all windows in `results`, judged by the numbers without their scene, its charts and tables."""
-    contents = [content for content in map(load, results) if "rows" in content]
+    contents = [content for content in map(load_results, results) if "rows" in content]
     contents = [content for content in contents if content.get("told", "nothing") == "nothing"]
-    rows = [row for content in contents for row in msgspec.convert(content["rows"], list[Row])]
-    judged = rejudged([row for row in rows if row.count in COUNTS], numbers)
-    records = [{**{name: getattr(row, name) for name in KEPT}, "found": row.found.value} for row in judged]
+    rows = [row for content in contents for row in msgspec.convert(content["rows"], list[WindowRow])]
+    judged = rejudge_rows([row for row in rows if row.count in COUNTS], numbers)
+    records = [{**{name: getattr(row, name) for name in KEPT}, "found": row.outcome.value} for row in judged]
     write_file(out / "windows.json", json_bytes({"summary": summarise(judged), "rows": records}))
     charts.draw(judged, out)
-    print("\n".join(report_lines(judged)))
+    print("\n".join(format_report(judged)))
 
 
 if __name__ == "__main__":

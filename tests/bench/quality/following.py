@@ -13,9 +13,9 @@ from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.geometry import align_cameras, angles_deg
-from splatnode.recon.locating.follow import QUICK, followed
-from splatnode.recon.locating.locate import Photograph, Placed, described, locate
-from splatnode.recon.locating.outcome import Claim, Located, NotLocated
+from splatnode.recon.locating.follow import QUICK, localize_near
+from splatnode.recon.locating.locate import Localization, QueryImage, localize_image, prepare_query_image
+from splatnode.recon.locating.outcome import LocalizationBounds, Located, NotLocated
 from splatnode.recon.matching.match import match
 from splatnode.recon.preparation import prepare
 from splatnode.recon.result.landmarks import Landmarks
@@ -54,25 +54,25 @@ def errors_of(found: Located | NotLocated, truth: Array, unit: float) -> dict[st
 
 def nearby(landmarks: Landmarks, image: npt.NDArray[np.uint8], first: Located, before: Array) -> dict[str, object]:
     """What is found near to `before` and near to the farthest camera, where it is not looked for everywhere."""
-    photograph, Ts = described(image, None, QUICK), landmarks.Ts_world_camera
+    photograph, Ts = prepare_query_image(image, None, QUICK), landmarks.Ts_world_camera
     centre = first.T_world_camera[:3, 3]
     farthest = Ts[np.argmax(np.linalg.norm(Ts[:, :3, 3] - centre, axis=1))]
-    near, far = (followed(landmarks, photograph, replace(first, T_world_camera=T)) for T in (before, farthest))
+    near, far = (localize_near(landmarks, photograph, replace(first, T_world_camera=T)) for T in (before, farthest))
     outcome = "refused"
-    if isinstance(far, Placed):
+    if isinstance(far, Localization):
         apart = np.linalg.norm(far.located.T_world_camera[:3, 3] - centre) / landmarks.unit
         outcome = "right" if 100.0 * apart <= FAR_PERCENT else "wrong"
-    return {"quickly": isinstance(near, Placed), "near_farthest": outcome}
+    return {"quickly": isinstance(near, Localization), "near_farthest": outcome}
 
 
-def placed_near(landmarks: Landmarks, photograph: Photograph) -> bool:
+def placed_near(landmarks: Landmarks, photograph: QueryImage) -> bool:
     """Whether a photograph is placed near to one of the scene's first cameras, as if theirs had taken it."""
     frame = photograph.frame
     for T, focal in list(zip(landmarks.Ts_world_camera, landmarks.lenses.focals, strict=True))[:NEAR_STRANGERS]:
         K = np.diag([focal * max(frame.width, frame.height)] * 2 + [1.0])
         K[:2, 2] = frame.width / 2, frame.height / 2
-        before = Located(T, K, np.zeros((6, 6)), Claim(0.0, 0.0, 0.0, 5.0), 0, False)
-        if isinstance(followed(landmarks, photograph, before), Placed):
+        before = Located(T, K, np.zeros((6, 6)), LocalizationBounds(0.0, 0.0, 0.0, 5.0), 0, False)
+        if isinstance(localize_near(landmarks, photograph, before), Localization):
             return True
     return False
 
@@ -87,16 +87,16 @@ def video(place: int) -> Iterator[FollowingFrame]:
     true = np.stack([T for T, _ in synthetic.scene_cameras(config)])
     to_scene, last = align_cameras(true, landmarks.Ts_world_camera), None
     for number, camera in enumerate(synthetic.video_cameras(config, 8)[10:30]):
-        image = synthetic.photograph(config, camera, 1000 + number)
+        image = synthetic.render_image(config, camera, 1000 + number)
         begun, quick = time.process_time(), None
         if isinstance(last, Located):
-            quick = followed(landmarks, described(image, None, QUICK), last)
-        found = quick.located if isinstance(quick, Placed) else locate(landmarks, image)
+            quick = localize_near(landmarks, prepare_query_image(image, None, QUICK), last)
+        found = quick.located if isinstance(quick, Localization) else localize_image(landmarks, image)
         seconds = time.process_time() - begun
         errors = errors_of(found, to_scene.camera(camera[0]), landmarks.unit)
         if number:
             error = errors.get("rotation_deg"), errors.get("centre_percent")
-            yield FollowingFrame(place, number, isinstance(quick, Placed), seconds, *error)
+            yield FollowingFrame(place, number, isinstance(quick, Localization), seconds, *error)
         last = found
 
 

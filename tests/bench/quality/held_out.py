@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
 from splatnode.recon.evaluate.protocol import Row as Scored
 from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.regions import Counts
@@ -22,7 +22,7 @@ from splatnode.recon.result.snapshot import Snapshot
 
 @dataclass(frozen=True, eq=False)
 class Scoring:
-    networks: Networks
+    networks: PerceptualNetworks
     settings: Settings
 
 

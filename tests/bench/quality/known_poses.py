@@ -19,10 +19,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.given_pose import given_pose
+from splatnode.capture.given_pose import make_given_pose
 from splatnode.capture.process.progress import say
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import Config, overlaid, preset
+from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
@@ -77,13 +77,13 @@ def main() -> None:
 
 def _rows(scene: EvaluationScene, folder: Path, views: int, seeds: int) -> list[Row]:
     names = load_split(folder, list(scene.cameras), views).train
-    config = overlaid(preset("balanced"), {"registration": {"trust_poses": True}, "quick": True})
+    config = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "quick": True})
     away = _distance(scene)
     frames = []
     for frame in scene.frames(names):
         lens = scene.cameras[frame.name].intrinsics_for(frame.width, frame.height)
         frames.append(replace(frame, intrinsics=replace(lens, source="given")))
-    alone = overlaid(config, {"registration": {"trust_poses": False}})
+    alone = apply_changes(config, {"registration": {"trust_poses": False}})
     graph = estimate_frame_cameras(frames, load_prior(alone), alone, Clock())[0].graph
     found = []
     for kind in KINDS if views > 3 else KINDS[:1]:
@@ -94,7 +94,9 @@ def _rows(scene: EvaluationScene, folder: Path, views: int, seeds: int) -> list[
     return found
 
 
-def _row(scene: EvaluationScene, graph: ViewGraph, config: Config, away: float, kind: str, seed: int) -> Row:
+def _row(
+    scene: EvaluationScene, graph: ViewGraph, config: ReconstructionConfig, away: float, kind: str, seed: int
+) -> Row:
     generator = np.random.default_rng(seed)
     false = None if kind == "clean" else int(generator.integers(len(graph.keyframes)))
     true, keyframes = {}, []
@@ -102,12 +104,12 @@ def _row(scene: EvaluationScene, graph: ViewGraph, config: Config, away: float, 
         true[keyframe.name] = T = scene.cameras[keyframe.name].T_world_camera.copy()
         T[:3, 3] /= away
         told = _disturbed(T, generator, kind if index == false else "clean")
-        frame = replace(keyframe.frame, given_pose=given_pose(told, SIGMA_M, SIGMA_DEG))
+        frame = replace(keyframe.frame, given_pose=make_given_pose(told, SIGMA_M, SIGMA_DEG))
         keyframes.append(replace(keyframe, frame=frame))
     begun = time.process_time()
     estimate = estimate_cameras(replace(graph, keyframes=tuple(keyframes)), (), config)
     seconds = round(time.process_time() - begun, 2)
-    given, registration = estimate.given, estimate.registration
+    given, registration = estimate.prior_world, estimate.registration
     told = scene.name, len(keyframes), kind, seed, estimate.verdict.code.value
     if given is None or registration is None:
         placed = 0 if registration is None else len(registration.cameras)

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.evaluate.shown import Surface
 from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.frames.keyframe import modelled_image
-from splatnode.recon.geometry import Similarity, to_camera
+from splatnode.recon.frames.keyframe import resize_image
+from splatnode.recon.geometry import Similarity, transform_to_camera
 from splatnode.recon.priors import reprojection, stereo
 from splatnode.recon.priors.pointmap import Pointmap
 
@@ -64,7 +64,7 @@ class KnownSurfaces:
         target = _pointmap(KnownView(T_world_camera, K, nothing))
         nearest = np.full((height, width), np.inf, np.float32)
         for view in self.views.values():
-            nearest = np.minimum(nearest, reprojection.nearest(_pointmap(view), target)[0])
+            nearest = np.minimum(nearest, reprojection.project_nearest(_pointmap(view), target)[0])
         return KnownView(T_world_camera, K, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32))
 
 
@@ -90,16 +90,16 @@ def of_photographs(scene: EvaluationScene, points: Array, to_true: Similarity) -
 
     `points` (M, 3), of a registration, tell only how far stereo has to search; `to_true` carries them there.
     """
-    images = {name: modelled_image(scene.image(name), LONGER_SIDE) for name in scene.cameras}
+    images = {name: resize_image(scene.image(name), LONGER_SIDE) for name in scene.cameras}
     world = to_true(points)
     views = []
     for name, image in images.items():
         camera = scene.cameras[name]
-        z = to_camera(world, camera.T_world_camera)[:, 2]
+        z = transform_to_camera(world, camera.T_world_camera)[:, 2]
         height, width = image.shape[:2]
-        near_far = stereo.depth_range(z, RANGE_MARGIN)
+        near_far = stereo.estimate_depth_range(z, RANGE_MARGIN)
         views.append(stereo.StereoView(image, camera.K_for(width, height), camera.T_world_camera, near_far))
-    maps = stereo.depth_maps(views, stereo.Config())
+    maps = stereo.estimate_depth_maps(views, stereo.StereoConfig())
     return KnownSurfaces(
         {
             name: KnownView(view.T_world_camera, view.K, np.where(each.num_consistent >= AGREEING, each.depth, 0))
@@ -111,7 +111,7 @@ def of_photographs(scene: EvaluationScene, points: Array, to_true: Similarity) -
 def of_built_in(config: synthetic.Config) -> KnownSurfaces:
     """The surfaces of the built-in place, as its photographs and those held out see them."""
     taken = [(synthetic.frame_name(i), camera) for i, camera in enumerate(synthetic.scene_cameras(config))]
-    between = [(f"between_{i:03d}", camera) for i, camera in enumerate(synthetic.held_out_cameras(config))]
+    between = [(f"between_{i:03d}", camera) for i, camera in enumerate(synthetic.evaluation_cameras(config))]
     return KnownSurfaces(
         {
             name: KnownView(camera[0], camera[1], _finite(synthetic.depth_map(config, camera)))

@@ -21,20 +21,20 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.stability.case import frames, world
+from splatnode.recon.evaluate.stability.case import make_frames, make_world
 from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
-from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, Kind, with_intrinsics
-from splatnode.recon.evaluate.stability.outcome import compare
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
-from splatnode.recon.evaluate.stability.places import Photo, Place, neighbours, parallel
+from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, AssumptionBreak, set_intrinsics
+from splatnode.recon.evaluate.stability.outcome import score_cameras
+from splatnode.recon.evaluate.stability.own_cameras import ensure_registration, list_registered_cameras
+from splatnode.recon.evaluate.stability.places import TrialImage, TrialScene, find_neighbour_sets, find_parallel_sets
 from splatnode.recon.evaluate.stability.windows.row import OURS
-from splatnode.recon.evaluate.stability.windows.store import Key, among, matched, plain_features
+from splatnode.recon.evaluate.stability.windows.store import Key, load_plain_features, match_keyframes, select_keys
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames.screening import screen_all
-from splatnode.recon.ladder.ladder import climbed
-from splatnode.recon.matching.moving import without_moving
+from splatnode.recon.ladder.ladder import run_fallbacks
+from splatnode.recon.matching.moving import mask_moving_objects
 from splatnode.recon.preparation import load_prior, prepare
 
 STEP_DEG = 12.0
@@ -69,11 +69,11 @@ class Trial:
     evidence: Mapping[str, object] | None
 
 
-def window(place: Place, count: int) -> list[Photo]:
+def window(place: TrialScene, count: int) -> list[TrialImage]:
     """Consecutive photographs that overlap well; all the same in every run. Empty where the scene has too few."""
-    starts, stride = neighbours(place.Ts_world_camera, count, STEP_DEG)
+    starts, stride = find_neighbour_sets(place.Ts_world_camera, count, STEP_DEG)
     if not starts:
-        starts, stride = parallel(place.Ts_world_camera, count)
+        starts, stride = find_parallel_sets(place.Ts_world_camera, count)
     if not starts:
         stride = max(1, min(2, (len(place.names) - 1) // max(1, count - 1)))
         starts = list(range(len(place.names) - stride * (count - 1)))
@@ -81,35 +81,50 @@ def window(place: Place, count: int) -> list[Photo]:
         return []
     generator = np.random.default_rng([count, zlib.crc32(place.name.encode())])
     start = int(generator.choice(starts))
-    return place.photos([start + stride * index for index in range(count)])
+    return place.load_images([start + stride * index for index in range(count)])
 
 
-def run_trial(photos: Sequence[Photo], kind: Kind, setting: str, known: dict[Key, bytes], config: Config) -> Trial:
+def run_trial(
+    photos: Sequence[TrialImage],
+    kind: AssumptionBreak,
+    setting: str,
+    known: dict[Key, bytes],
+    config: ReconstructionConfig,
+) -> Trial:
     """`known` keeps features and matches of the photographs by their names, for the next trials of the scene."""
     generator = np.random.default_rng([len(photos), zlib.crc32(f"{photos[0].place} {kind.name}".encode())])
-    changed = kind.change(with_intrinsics(photos, setting), generator)
+    changed = kind.change(set_intrinsics(photos, setting), generator)
     started = time.perf_counter()
-    kept, _, rejected = screen_all(frames(changed), config.screening)
+    kept, _, rejected = screen_all(make_frames(changed), config.screening)
     prior = load_prior(config)
-    pieces = {key: known[key] for key in among(known.keys(), [photo.name for photo in changed])}
-    keyframes = [prepare(frame, config, plain_features(pieces, frame.name)) for frame in kept]
-    graph, found = matched(keyframes, pieces, config.matching, prior.matcher)
+    pieces = {key: known[key] for key in select_keys(known.keys(), [photo.name for photo in changed])}
+    keyframes = [prepare(frame, config, load_plain_features(pieces, frame.name)) for frame in kept]
+    graph, found = match_keyframes(keyframes, pieces, config.matching, prior.matcher)
     known.update(found)
-    graph = without_moving(graph, prior.matcher)
-    estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
+    graph = mask_moving_objects(graph, prior.matcher)
+    estimate = run_fallbacks(estimate_cameras(graph, rejected, config), rejected, config)
     seconds = time.perf_counter() - started
-    estimate, published = registered(estimate, config), estimate.verdict.publishable
-    cameras = cameras_of(estimate)
-    score = compare(cameras, (world(changed),), rough=estimate.verdict.code.value == ROUGH)
+    estimate, published = ensure_registration(estimate, config), estimate.verdict.publishable
+    cameras = list_registered_cameras(estimate)
+    score = score_cameras(cameras, (make_world(changed),), rough=estimate.verdict.code.value == ROUGH)
     ratios: dict[str, float] = {}
     bounds: dict[str, float] = {}
     worst = None
     if published and score.errors:
         for what in ("rotation", "centre", "focal"):
-            each = {e.name: (e.claimed()[what][0] / e.claimed()[what][1]) for e in score.errors if e.claimed()}
-            bounds[what] = float(np.median([e.claimed()[what][1] for e in score.errors if e.claimed()]))
+            each = {
+                e.name: (e.pair_with_bounds()[what][0] / e.pair_with_bounds()[what][1])
+                for e in score.errors
+                if e.pair_with_bounds()
+            }
+            bounds[what] = float(
+                np.median([e.pair_with_bounds()[what][1] for e in score.errors if e.pair_with_bounds()])
+            )
             ratios[what] = max(each.values(), default=0.0)
-        worst = max(score.errors, key=lambda e: max(x / b for x, b in e.claimed().values()) if e.claimed() else 0).name
+        worst = max(
+            score.errors,
+            key=lambda e: max(x / b for x, b in e.pair_with_bounds().values()) if e.pair_with_bounds() else 0,
+        ).name
     return Trial(
         photos[0].place, len(photos), kind.name, setting, estimate.verdict.code.value, published,
         published and not score.right, score.exact, len(cameras) if published else 0,
@@ -130,8 +145,8 @@ def run_scene(
 ) -> list[Trial]:
     """`sample`: at most so many kinds for each number of images and setting, drawn at random, besides the clean set."""
     scene = load_scene(folder)
-    place = Place(scene, tuple(name for name in scene.paths if name in scene.cameras))
-    config, found = Config(), []
+    place = TrialScene(scene, tuple(name for name in scene.paths if name in scene.cameras))
+    config, found = ReconstructionConfig(), []
     for count in counts:
         photos = window(place, count)
         if not photos:

@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.config import Config, preset
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.config import ReconstructionConfig, preset
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.start import Start, find_start, foundation
+from splatnode.recon.evaluate.start import Start, extract_start_config, find_start
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.result.snapshot import Snapshot
@@ -34,7 +34,7 @@ from tests.bench.quality.real_sets import last, measure, timed
 SETS = ("fountain_p11:6", "llff_fern:6", "fox:12")
 LEAST, MOST, BALANCE = 0.5, 2.0, 0.2
 ON = preset("balanced")
-OFF = msgspec.structs.replace(ON, light=light.Config(enabled=False))
+OFF = msgspec.structs.replace(ON, light=light.ExposureConfig(enabled=False))
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def logs_of(start: Start, told: Mapping[str, float] = MappingProxyType({})) -> M
     """(3,) logarithms of the gains that are found, by photograph; `told` is what cameras say of them."""
     maps = list(start.estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
-    found = light.log_gains(maps, [images[each.name] for each in maps], told)
+    found = light.estimate_log_gains(maps, [images[each.name] for each in maps], told)
     return {each.name: own for each, own in zip(maps, found, strict=True)}
 
 
@@ -86,11 +86,11 @@ def gain_errors(
     return round(float(np.median(errors)), 3), round(float(errors.max()), 3)
 
 
-def grown(frames: Sequence[Frame], config: Config) -> IncrementalReconstruction:
+def grown(frames: Sequence[Frame], config: ReconstructionConfig) -> IncrementalReconstruction:
     """A reconstruction that got the photographs one at a time."""
     work = IncrementalReconstruction(config)
     for frame in frames:
-        work.take(frame)
+        work.add_frame(frame)
         work.update()
     return work
 
@@ -99,16 +99,16 @@ def finished(work: IncrementalReconstruction) -> Snapshot:
     """Of the scene that is made of all photographs, as the node makes it when no further one comes."""
     work.estimate_thoroughly()
     work.rebuild()
-    for show in work.refine(work.begun, work.config.optimize):
+    for show in work.refine(work.initial_scene, work.config.optimize):
         work.show(show)
     return work.snapshot(final=True)
 
 
-def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
+def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: PerceptualNetworks) -> list[Row]:
     frames = scene.frames(split.train)
     gains = drawn(len(frames))
     under = [changed(frame, own) for frame, own in zip(frames, gains, strict=True)]
-    starts = {kind: find_start(each, foundation(ON)) for kind, each in (("plain", frames), ("under", under))}
+    starts = {kind: find_start(each, extract_start_config(ON)) for kind, each in (("plain", frames), ("under", under))}
     true = {frame.name: own for frame, own in zip(frames, gains, strict=True)}
     errors = gain_errors(starts["plain"], starts["under"], true)
 
@@ -118,7 +118,7 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
         scores = row.psnr, row.ssim, row.lpips_alex, row.num_gaussians
         return Row(scene.name, len(frames), kind, row.verdict, *scores, round(seconds, 1), round(saturated, 2), found)
 
-    def offline(kind: str, config: Config) -> Callable[[], Snapshot]:
+    def offline(kind: str, config: ReconstructionConfig) -> Callable[[], Snapshot]:
         return partial(last, starts[kind], config)
 
     result = [

@@ -35,17 +35,17 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.config import Config, preset
+from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.core import set_threads
-from splatnode.recon.estimation import Estimate, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.true_cameras import TrueCamera
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.ladder.ladder import climbed
+from splatnode.recon.ladder.ladder import run_fallbacks
 from splatnode.recon.locating.follow import QUICK, follow
-from splatnode.recon.locating.locate import described, locate, located
+from splatnode.recon.locating.locate import localize_image, localize_query, prepare_query_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching.match import match
 from splatnode.recon.preparation import load_prior, prepare
@@ -103,12 +103,12 @@ class Stranger:
     outcome_following: str  # "placed" where it was, near to one of the scene's cameras; else "refused"
 
 
-def estimated(scene: EvaluationScene, names: Sequence[str], config: Config) -> Estimate:
+def estimated(scene: EvaluationScene, names: Sequence[str], config: ReconstructionConfig) -> Reconstruction:
     """Cameras and verdict, as `splatnode replay` finds them."""
     kept, _, rejected = screen_all(scene.frames(names), config.screening)
     prior = load_prior(config)
     graph = match([prepare(frame, config) for frame in kept], config.matching, prior.matcher)
-    return climbed(estimate_cameras(graph, rejected, config), rejected, config)
+    return run_fallbacks(estimate_cameras(graph, rejected, config), rejected, config)
 
 
 def trials(scene: EvaluationScene, views: int, landmarks: Landmarks, names: Sequence[str]) -> Iterator[Trial]:
@@ -122,7 +122,7 @@ def trials(scene: EvaluationScene, views: int, landmarks: Landmarks, names: Sequ
             for other in landmarks.names
         )
         image = scene.image(name)
-        found = locate(landmarks, image)
+        found = localize_image(landmarks, image)
         truth = to_scene.camera(scene.cameras[name].T_world_camera)
         timed = _timed(landmarks, image, truth) if number % EVERY == 0 else {}
         errors = errors_of(found, truth, landmarks.unit)
@@ -139,7 +139,7 @@ def _timed(landmarks: Landmarks, image: npt.NDArray[np.uint8], truth: Array) -> 
     What it follows was taken a tenth of the distance to the scene, and 3 degrees, from it.
     """
     small, begun = _shrunk(image), time.process_time()
-    first = locate(landmarks, small)
+    first = localize_image(landmarks, small)
     seconds = {"seconds": time.process_time() - begun}
     if isinstance(first, NotLocated):
         return seconds
@@ -297,10 +297,10 @@ def _strangers(
     for of, scene in scenes.items():
         for name in photographs[of]:
             image = scene.image(name)
-            photograph, quick = described(image), described(_shrunk(image), None, QUICK)
+            photograph, quick = prepare_query_image(image), prepare_query_image(_shrunk(image), None, QUICK)
             for other, landmarks in known.items():
                 if other != of:
-                    found = outcome(located(landmarks, photograph))
+                    found = outcome(localize_query(landmarks, photograph))
                     following = "placed" if placed_near(landmarks, quick) else "refused"
                     yield Stranger(other, of, name, {of, other} <= COURTYARD, found, following)
 

@@ -30,18 +30,18 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.camera_errors import camera_errors
-from splatnode.recon.geometry import spread
-from splatnode.recon.metric.config import Baseline, Config
-from splatnode.recon.metric.evidence import Evidence, gathered
-from splatnode.recon.metric.marker_detection import Sighting
-from splatnode.recon.metric.markers import by_markers
+from splatnode.recon.evaluate.camera_errors import compare_cameras
+from splatnode.recon.geometry import compute_rms_radius
+from splatnode.recon.metric.config import Baseline, MetricConfig
+from splatnode.recon.metric.evidence import Evidence, gather_evidence
+from splatnode.recon.metric.marker_detection import MarkerDetection
+from splatnode.recon.metric.markers import estimate_scale_from_markers
 from splatnode.recon.metric.measurement import Measurement
-from splatnode.recon.metric.metres import in_metres
-from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
-from splatnode.recon.metric.stereo import by_stereo
-from splatnode.recon.metric.stereo_pairs import Pair, pairs_of
-from splatnode.recon.metric.views import View, views_of
+from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.poses import PoseAlignment, PoseSigmas, align_to_poses
+from splatnode.recon.metric.stereo import estimate_scale_from_stereo
+from splatnode.recon.metric.stereo_pairs import StereoPair, make_pairs
+from splatnode.recon.metric.views import MetricView, make_metric_views
 from splatnode.recon.offline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support import marked
@@ -50,7 +50,7 @@ from tests.support.stereo import right_photographs
 
 SIDE_M, BASELINE_M, OFF = 0.1, 0.075, 0.2
 DRAWS = 40  # of odometry, of each kind, in each place
-SIGMAS = Sigmas(Config().poses_sigma_m, Config().poses_sigma_deg, Config().poses_drift)
+SIGMAS = PoseSigmas(MetricConfig().poses_sigma_m, MetricConfig().poses_sigma_deg, MetricConfig().poses_drift)
 
 Array = npt.NDArray[np.float64]
 Row = dict[str, Any]
@@ -69,44 +69,44 @@ def measured(told: Measurement | str, truth: float) -> Row:
     }
 
 
-def of_marker(snapshot: Snapshot, sightings: Sequence[Sighting], truth: float) -> Iterator[Row]:
+def of_marker(snapshot: Snapshot, sightings: Sequence[MarkerDetection], truth: float) -> Iterator[Row]:
     """Each two photographs that show the marker; then with a baseline that is off, which must be refused."""
-    views = views_of(snapshot)
+    views = make_metric_views(snapshot)
     first, last = snapshot.cameras[0].name, snapshot.cameras[-1].name
     apart = truth * float(np.linalg.norm(views[first].centre - views[last].centre))
     for two in combinations(sightings, 2):
-        (told,) = by_markers(views, two, SIDE_M, 0.0)
+        (told,) = estimate_scale_from_markers(views, two, SIDE_M, 0.0)
         row = {"what": "marker", "photographs": [each.photograph for each in two], **measured(told, truth)}
         refused = []
         for factor in (1.0 - OFF, 1.0 + OFF):
-            asked = Config(marker_m=SIDE_M, baseline=Baseline(first, last, factor * apart))
-            refused.append(not in_metres(snapshot, asked, Evidence(two)).scale.metric)
+            asked = MetricConfig(marker_m=SIDE_M, baseline=Baseline(first, last, factor * apart))
+            refused.append(not apply_metric_scale(snapshot, asked, Evidence(two)).scale.metric)
         yield {**row, "wrong_baselines": len(refused), "refused": sum(refused)}
 
 
-def of_stereo(snapshot: Snapshot, pairs: Sequence[Pair], truth: float, off: float) -> Iterator[Row]:
+def of_stereo(snapshot: Snapshot, pairs: Sequence[StereoPair], truth: float, off: float) -> Iterator[Row]:
     """What each pair says, and all, against what a baseline says that is `off` (a share) of its stated length."""
-    views = views_of(snapshot)
+    views = make_metric_views(snapshot)
     for chosen in (pairs, *([pair] for pair in pairs)):
-        told = by_stereo(views, snapshot.landmarks, chosen, BASELINE_M, 0.0)
+        told = estimate_scale_from_stereo(views, snapshot.landmarks, chosen, BASELINE_M, 0.0)
         yield {"what": "stereo", "off_percent": 100 * off, "pairs": len(chosen), **measured(told, truth / (1.0 + off))}
 
 
 def of_poses(
-    views: Mapping[str, View], Ts: Sequence[Array], names: Sequence[str], truth: float, seed: int
+    views: Mapping[str, MetricView], Ts: Sequence[Array], names: Sequence[str], truth: float, seed: int
 ) -> Iterator[Row]:
     """Odometry of both kinds, as it is and with one pose wrong by a metre."""
     for draw, kind in ((draw, kind) for draw in range(DRAWS) for kind in ("steps", "way")):
         rng = np.random.default_rng([seed, draw])
         given = dict(zip(names, drifting(Ts, rng, whole=kind == "way"), strict=True))
-        yield {"what": "poses", "kind": kind, **_aligned(by_poses(views, given, SIGMAS), truth)}
+        yield {"what": "poses", "kind": kind, **_aligned(align_to_poses(views, given, SIGMAS), truth)}
         wrong, direction = names[int(rng.integers(len(names)))], rng.normal(size=3)
         given[wrong] = given[wrong].copy()
         given[wrong][:3, 3] += direction / np.linalg.norm(direction)
-        yield {"what": "poses", "kind": kind, "wrong": wrong, **_aligned(by_poses(views, given, SIGMAS), truth)}
+        yield {"what": "poses", "kind": kind, "wrong": wrong, **_aligned(align_to_poses(views, given, SIGMAS), truth)}
 
 
-def _aligned(found: Aligned | str, truth: float) -> Row:
+def _aligned(found: PoseAlignment | str, truth: float) -> Row:
     if isinstance(found, str):
         return {"told": found, "left_out": []}
     return {**measured(found.unit, truth), "left_out": [each.split()[3] for each in found.told]}
@@ -121,14 +121,14 @@ def place(seed: int) -> list[Row]:
     snapshot = run(frames, preset("preview"))
     if len(snapshot.cameras) < 2:
         return [{"what": "refused", "told": snapshot.verdict.message}]
-    views, names = views_of(snapshot), [frame.name for frame in frames]
+    views, names = make_metric_views(snapshot), [frame.name for frame in frames]
     used = [names.index(camera.name) for camera in snapshot.cameras]
     centres = np.stack([views[names[index]].centre for index in used])
     Ts = [cameras[index][0] for index in used]
-    truth = spread(np.stack(Ts)[:, :3, 3]) / spread(centres)
-    rows = list(of_marker(snapshot, gathered(frames, Config(marker_m=SIDE_M)).sightings, truth))
+    truth = compute_rms_radius(np.stack(Ts)[:, :3, 3]) / compute_rms_radius(centres)
+    rows = list(of_marker(snapshot, gather_evidence(frames, MetricConfig(marker_m=SIDE_M)).sightings, truth))
     off = 0.01 * (seed % 6)
-    pairs = pairs_of(frames, right_photographs(config, BASELINE_M * (1.0 + off), markers))
+    pairs = make_pairs(frames, right_photographs(config, BASELINE_M * (1.0 + off), markers))
     rows += of_stereo(snapshot, pairs, truth, off)
     rows += of_poses(views, Ts, [names[index] for index in used], truth, seed)
     rows.append(_unharmed(snapshot, Ts, [names[index] for index in used], seed))
@@ -138,12 +138,12 @@ def place(seed: int) -> list[Row]:
 def _unharmed(snapshot: Snapshot, Ts: Sequence[Array], names: Sequence[str], seed: int) -> Row:
     """The cameras' errors after the best similarity, without poses and with: the same."""
     given = dict(zip(names, drifting(Ts, np.random.default_rng(seed)), strict=True))
-    with_poses = in_metres(snapshot, Config(), Evidence(poses=given))
+    with_poses = apply_metric_scale(snapshot, MetricConfig(), Evidence(poses=given))
     errors = []
     for each in (snapshot, with_poses):
         estimated = np.stack([camera.T_world_camera for camera in each.cameras])
         Ks = np.stack([camera.K for camera in each.cameras])
-        found = camera_errors(estimated, np.stack(Ts), Ks, Ks)
+        found = compare_cameras(estimated, np.stack(Ts), Ks, Ks)
         errors.append([round(found.rotation_deg, 6), round(found.centre_pct, 6)])
     return {"what": "unharmed", "without": errors[0], "with": errors[1]}
 

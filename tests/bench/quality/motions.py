@@ -29,11 +29,11 @@ from splatnode.capture.diorama.odometry import odometry
 from splatnode.capture.motion import Motion
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.metric.config import Config
-from splatnode.recon.metric.gravity import by_gravity
+from splatnode.recon.metric.config import MetricConfig
+from splatnode.recon.metric.gravity import estimate_up
 from splatnode.recon.metric.measurement import Measurement
-from splatnode.recon.metric.motions import by_motions
-from splatnode.recon.metric.views import View, views_of
+from splatnode.recon.metric.motions import estimate_scale_from_motions
+from splatnode.recon.metric.views import MetricView, make_metric_views
 from splatnode.recon.offline import run
 from tests.bench.quality.metres import Array, Row, measured
 
@@ -42,7 +42,7 @@ NOISE = Odometry(drift=0.02, noise_deg=2.0)
 SLIP_M, TWO_SIDED_95 = 1.0, 2.45  # standard deviations in two dimensions
 
 
-def of_odometry(views: Mapping[str, View], names: Sequence[str], Ts: Sequence[Array], seed: int) -> Iterator[Row]:
+def of_odometry(views: Mapping[str, MetricView], names: Sequence[str], Ts: Sequence[Array], seed: int) -> Iterator[Row]:
     """All rows of the cameras `names` of a place, which truly are at `Ts`."""
     to_truth = align_cameras(np.stack([views[name].T_world_camera for name in names]), np.stack(Ts))
     true_up = to_truth.rotation.T @ [0.0, 0.0, 1.0]
@@ -57,7 +57,7 @@ def of_odometry(views: Mapping[str, View], names: Sequence[str], Ts: Sequence[Ar
             "wrong": wrong,
             **_unit(views, _slipped(motions, names, wrong, rng), to_truth.scale),
         }
-        up = by_gravity(views, {name: gravity for name, (_, gravity) in zip(names, told, strict=True)})
+        up = estimate_up(views, {name: gravity for name, (_, gravity) in zip(names, told, strict=True)})
         if up is None:
             yield {"what": "gravity", "told": "nothing"}
             continue
@@ -76,7 +76,7 @@ def _slipped(motions: Mapping[str, Motion], names: Sequence[str], wrong: str, rn
             direction = rng.normal(size=3)
             step[:3, 3] += SLIP_M * direction / np.linalg.norm(direction)
         sigmas = [float(np.sqrt(b**2 - a**2)) for a, b in zip(*map(_sigmas, (one, other)), strict=True)]
-        found[name] = found[before].then(step, sigmas[0], sigmas[1])
+        found[name] = found[before].append_step(step, sigmas[0], sigmas[1])
     return found
 
 
@@ -84,9 +84,9 @@ def _sigmas(motion: Motion) -> tuple[float, float]:
     return motion.sigma_m, motion.sigma_deg
 
 
-def _unit(views: Mapping[str, View], motions: Mapping[str, Motion], truth: float) -> Row:
+def _unit(views: Mapping[str, MetricView], motions: Mapping[str, Motion], truth: float) -> Row:
     """What the motions say, and which photographs the motions that were left out led to."""
-    said = by_motions(views, motions, Config().motions_shared)
+    said = estimate_scale_from_motions(views, motions, MetricConfig().motions_shared)
     sentences = [each for each in said if isinstance(each, str)]
     if isinstance(said[0], Measurement):
         return {**measured(said[0], truth), "left_out": [each.split()[5] for each in sentences]}
@@ -102,7 +102,7 @@ def place(seed: int) -> list[Row]:
         return [{"seed": seed, "what": "refused", "told": snapshot.verdict.message}]
     names = [frame.name for frame in frames]
     used = sorted(names.index(camera.name) for camera in snapshot.cameras)
-    rows = of_odometry(views_of(snapshot), [names[i] for i in used], [cameras[i][0] for i in used], seed)
+    rows = of_odometry(make_metric_views(snapshot), [names[i] for i in used], [cameras[i][0] for i in used], seed)
     return [{"seed": seed, **row} for row in rows]
 
 

@@ -17,13 +17,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.masks import masked
+from splatnode.capture.masks import apply_mask
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.regions import Counts
-from splatnode.recon.evaluate.shown import counts_of, surfaces
-from splatnode.recon.frames.keyframe import modelled_mask
+from splatnode.recon.evaluate.shown import compute_surfaces, count_visibility_by_name
+from splatnode.recon.frames.keyframe import resize_mask
 from splatnode.recon.offline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case
@@ -64,7 +64,7 @@ def _made(kind: str, frames: Sequence[Frame]) -> _Made:
 
 
 def _scored(case: Case, made: _Made, share: float, shown: Mapping[str, Counts]) -> Result:
-    scoring = Scoring(Networks(None, None), Settings(alignment_steps=STEPS))
+    scoring = Scoring(PerceptualNetworks(None, None), Settings(alignment_steps=STEPS))
     scored = case.score(made.snapshot, "balanced", scoring, shown)
     two = scored.regions.get("two")
     seen = (None, None) if two is None else (two.psnr, two.share_pct)
@@ -77,18 +77,18 @@ def _scored(case: Case, made: _Made, share: float, shown: Mapping[str, Counts]) 
 def results(case: Case) -> Iterable[Result]:
     """For each share: of the photographs as they are, then with the thing, with masks and without."""
     frames, look = case.scene.frames(case.split.train), look_of(0)
-    seen = surfaces(case.scene, Settings().longer_side)
+    seen = compute_surfaces(case.scene, Settings().longer_side)
     clean = _made("without", frames)
     for share in SHARES:
         moved = [pasted(frame, share, seed, look) for seed, frame in enumerate(frames)]
         training = [
-            replace(seen[frame.name], used=modelled_mask(mask, *seen[frame.name].depth.shape))
+            replace(seen[frame.name], used=resize_mask(mask, *seen[frame.name].depth.shape))
             for frame, mask in moved
             if frame.name in seen
         ]
-        shown = counts_of(case.split.test, seen, training)
+        shown = count_visibility_by_name(case.split.test, seen, training)
         yield _scored(case, clean, share, shown)
-        given = [kept for frame, mask in moved if isinstance(kept := masked(frame, mask), Frame)]
+        given = [kept for frame, mask in moved if isinstance(kept := apply_mask(frame, mask), Frame)]
         yield _scored(case, _made("masks", given), share, shown)
         yield _scored(case, _made("found", [frame for frame, _ in moved]), share, shown)
 

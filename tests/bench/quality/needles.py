@@ -35,12 +35,12 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.config import Config, preset
+from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.evaluate.protocol import Settings
-from splatnode.recon.evaluate.start import Start, continued, find_start
+from splatnode.recon.evaluate.start import Start, continue_reconstruction, find_start
 from splatnode.recon.geometry import Similarity, align_cameras
-from splatnode.recon.result.export import viewer_safe
-from splatnode.recon.result.only_seen import only_seen
+from splatnode.recon.result.export import sanitize_gaussians
+from splatnode.recon.result.only_seen import remove_unconfirmed
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality import known_surfaces
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
@@ -114,10 +114,10 @@ def aligned(cameras: Mapping[str, npt.NDArray[np.float64]], onto: Mapping[str, n
     return align_cameras(np.stack(list(cameras.values())), np.stack([onto[name] for name in cameras]))
 
 
-def finished(place: Place, config: Config) -> tuple[Snapshot, float]:
+def finished(place: Place, config: ReconstructionConfig) -> tuple[Snapshot, float]:
     """The scene, and the processor seconds from its depth maps on."""
     began = time.process_time()
-    *_, snapshot = continued(place.start, config)
+    *_, snapshot = continue_reconstruction(place.start, config)
     return snapshot, time.process_time() - began
 
 
@@ -126,7 +126,7 @@ def measured(label: str, place: Place, snapshot: Snapshot, seconds: float, pictu
     estimated = {camera.name: camera.T_world_camera for camera in snapshot.cameras}
     true = {name: place.known.views[name].T_world_camera for name in estimated}
     known = place.known.moved(aligned(true, estimated))
-    gaussians = viewer_safe(snapshot.gaussians)
+    gaussians = sanitize_gaussians(snapshot.gaussians)
     stands = footing(gaussians, known)
     shares = []
     for index, viewpoint in enumerate(viewpoints([known.views[name] for name in estimated])):
@@ -173,7 +173,7 @@ def main() -> None:
         place = built_in(int(views)) if scene == BUILT_IN else recorded(name, folders)
         snapshot, seconds = finished(place, config)
         if arguments.only_seen:
-            rows.append(measured(arguments.label, place, only_seen(snapshot), seconds, arguments.pictures))
+            rows.append(measured(arguments.label, place, remove_unconfirmed(snapshot), seconds, arguments.pictures))
         else:
             row = measured(arguments.label, place, snapshot, seconds, arguments.pictures)
             rows.append(scored(row, place, snapshot, scoring))

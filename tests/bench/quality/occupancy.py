@@ -41,11 +41,11 @@ from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import Similarity, align_cameras
 from splatnode.recon.occupancy.build import NoMap, occupancy_map
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.priors.confirmed import confirmed_depths
+from splatnode.recon.priors.confirmed import compute_consistent_depths
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.recon.threads import at_most
+from splatnode.recon.threads import apply_thread_limit
 from tests.bench.quality.pane import Pane, photograph
 from tests.bench.quality.solid import inside, reached, surface, touched
 from tests.conftest import ROOT
@@ -129,7 +129,7 @@ def room(name: str, keyframes: Sequence[int], mirror: bool = False, config: buil
     """Keyframes of the building."""
     return Place(
         name,
-        lambda: [building.photograph(config, index) for index in keyframes],
+        lambda: [building.render_image(config, index) for index in keyframes],
         [building.scene_camera(config, index) for index in keyframes],
         (config.width, config.height),
         lambda: _building(building.state(config, keyframes[0])),
@@ -137,12 +137,12 @@ def room(name: str, keyframes: Sequence[int], mirror: bool = False, config: buil
     )
 
 
-def _building(state: view.State) -> list[Solid]:
+def _building(state: view.BuildingState) -> list[Solid]:
     zones = [interior(state.seed, building.BARE, zone.number) for zone in ZONES]
     return [solid for zone in zones for solid in zone.solids] + list(zones[CHAIR_ROOM].chairs[state.chair])
 
 
-def _mirror(state: view.State) -> Solid:
+def _mirror(state: view.BuildingState) -> Solid:
     zone = interior(state.seed, building.BARE, MIRROR_ROOM)
     assert zone.mirror is not None
     return zone.solids[zone.mirror]
@@ -176,7 +176,7 @@ def mapped(place: Place) -> tuple[Snapshot, list[int]]:
         )
         for each in estimate.pointmaps.values()
     )
-    depths = confirmed_depths(list(estimate.pointmaps.values()))
+    depths = compute_consistent_depths(list(estimate.pointmaps.values()))
     snapshot = Snapshot(0, estimate.verdict, cameras, GaussianArrays.empty(), {}, (), 0, final=True, depths=depths)
     return snapshot, [int(camera.name[:3]) for camera in cameras]
 
@@ -205,7 +205,7 @@ def _scores(place: Place, made: OccupancyMap, to_true: Similarity, true: list[Ca
         return in_truth(made.origin + (np.argwhere(state) + 0.5) * made.voxel)
 
     axes = to_true.scale * made.voxel * to_true.rotation @ T[:3, :3]
-    free, occupied = made.states == State.FREE, made.states == State.OCCUPIED
+    free, occupied = made.states == VoxelState.FREE, made.states == VoxelState.OCCUPIED
     air = centres(free)
     resized = [(T_camera, _shrunk(K, place.size)) for T_camera, K in true]
     shown = [surface(solids, camera, _WIDTH, _HEIGHT) for camera in resized]
@@ -230,10 +230,10 @@ def _scores(place: Place, made: OccupancyMap, to_true: Similarity, true: list[Ca
         "occupied": int(occupied.sum()),
         "free_solid": float(touched(solids, air, axes).mean()),
         "free_centre_solid": float(inside(solids, air).mean()),
-        "found": float((states == State.OCCUPIED).mean()),
+        "found": float((states == VoxelState.OCCUPIED).mean()),
         "found_near": float(near.at(_into(to_true, points)).mean()),
         "occupied_off": float(1.0 - binary_dilation(surfaces, _BESIDE)[occupied].mean()),
-        "unknown": float((made.states.ravel() == State.NOT_SEEN)[visible].mean()),
+        "unknown": float((made.states.ravel() == VoxelState.NOT_SEEN)[visible].mean()),
         "up": made.upright.source,
         "up_error_deg": float(np.degrees(np.arccos(np.clip(up[2], -1, 1)))),
         "floor_error_metres": abs(float(in_truth(np.zeros((1, 3)))[0, 2])) if made.upright.on_floor else None,
@@ -243,7 +243,7 @@ def _scores(place: Place, made: OccupancyMap, to_true: Similarity, true: list[Ca
 
 def _behind(pane: Solid, air: Array, axes: Array) -> dict[str, float]:
     """Of the voxels called free that the pane's outline covers, those behind it."""
-    local = pane.to_local(air)
+    local = pane.transform_to_local(air)
     across = (np.abs(local[:, [0, 2]]) <= 1).all(1)
     distance = (local[:, 1] - 1) * float(np.linalg.norm(pane.axes[:, 1]))
     behind = int((across & (distance < 0)).sum())
@@ -282,7 +282,7 @@ def main() -> None:
     head = ["git", "rev-parse", "--short=7", "HEAD"]
     commit = subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
     told = {"command": shlex.join(["python", "-m", "tests.bench", "occupancy", *sys.argv[1:]]), "commit": commit}
-    with at_most(1):
+    with apply_thread_limit(1):
         for place, views in places(args.views, args.seeds):
             rows.append(asdict(row(place, *mapped(place), views)))
             print(json.dumps(rows[-1]), flush=True)

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.builder import turn
-from splatnode.capture.diorama.building.view import mirrored
-from splatnode.capture.diorama.cast import Camera, cast, coloured, trace
+from splatnode.capture.diorama.building.view import mirror_camera
+from splatnode.capture.diorama.cast import Camera, cast, colour_pixels, trace
 from splatnode.capture.diorama.solids import Shape, Solid
 
 THROUGH, BACK = 0.9, 0.08  # of the light, that passes the glass, and that it reflects
@@ -39,8 +39,8 @@ def photograph(config: synthetic.Config, camera: Camera, pane: Pane, noise_seed:
     colours, z = cast(solids, dense, width, height)
     glass, _ = trace([pane.solid], dense, width, height)
     glass = np.where(glass < z, glass, np.inf)
-    virtual = mirrored(pane.solid, dense)
-    reflected = coloured(solids, virtual, *trace(solids, virtual, width, height, glass + 1e-3))
+    virtual = mirror_camera(pane.solid, dense)
+    reflected = colour_pixels(solids, virtual, *trace(solids, virtual, width, height, glass + 1e-3))
     mixed = np.where(np.isfinite(glass)[..., None], THROUGH * colours + BACK * reflected, colours)
     image = cv2.resize(mixed, (config.width, config.height), interpolation=cv2.INTER_AREA)
     grain = np.random.default_rng([config.seed, noise_seed]).normal(scale=config.noise, size=image.shape)

@@ -18,13 +18,13 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from splatnode.recon.config import Config, preset
+from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.evaluate.protocol import Settings
-from splatnode.recon.evaluate.start import Start, continued
+from splatnode.recon.evaluate.start import Start, continue_reconstruction
 from splatnode.recon.optimize.control import prune, relocate
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.export.formats.spz import encode_spz
-from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.scene import pixelwise
@@ -55,13 +55,13 @@ class Row:
     peak_rss_mb: float | None  # of the process so far, cameras and points included where it found them itself
 
 
-def configurations(chosen: int) -> dict[str, Config]:
+def configurations(chosen: int) -> dict[str, ReconstructionConfig]:
     """By method, with `chosen` the size that splatnode chose."""
     ours = preset("balanced")
     ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
     fine = replace(ours.seeding, max_error=1e-4, min_area_px=1.0)
     by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
-    by_pixel = replace(ours, pixelwise=pixelwise.Config(), optimize=replace(ours.optimize, control=None))
+    by_pixel = replace(ours, pixelwise=pixelwise.PixelwiseConfig(), optimize=replace(ours.optimize, control=None))
     relocating = replace(ours.optimize, control=ControlChoice("relocate", relocate.Config()))
     forced = {
         f"x{factor:g}": replace(ours, seeding=fine, optimize=by_size, max_gaussians=round(factor * chosen))
@@ -71,10 +71,10 @@ def configurations(chosen: int) -> dict[str, Config]:
     return {SELF: ours, **forced, PIXEL: by_pixel, RIVAL: rival}
 
 
-def measure(case: Case, start: Start, method: str, config: Config, scoring: Scoring) -> Row:
+def measure(case: Case, start: Start, method: str, config: ReconstructionConfig, scoring: Scoring) -> Row:
     """One scene from the points to its scores. `start` is used up."""
     started = time.process_time()
-    *_, snapshot = continued(start, config)
+    *_, snapshot = continue_reconstruction(start, config)
     seconds = time.process_time() - started
     peak = peak_rss_mb()
     scored = case.score(snapshot, method, scoring)
@@ -87,7 +87,7 @@ def measure(case: Case, start: Start, method: str, config: Config, scoring: Scor
         ssim=scored.ssim,
         lpips=scored.lpips_alex,
         ply_bytes=scored.scene_bytes,
-        spz_bytes=len(encode_spz(viewer_safe(snapshot.gaussians))),
+        spz_bytes=len(encode_spz(sanitize_gaussians(snapshot.gaussians))),
         seconds=seconds,
         peak_rss_mb=peak,
     )

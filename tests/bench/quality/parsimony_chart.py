@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from splatnode.recon.evaluate.charts import pareto_front
+from splatnode.recon.evaluate.charts import find_pareto_front
 
 SELF, PIXEL, RIVAL = "chosen", "pixel", "mcmc"
 MEASURES = {"psnr": 1, "ssim": 1, "lpips": -1}  # and whether more is better
@@ -126,7 +126,7 @@ def draw(rows: Sequence[Record]) -> bytes:
 
 def _chart(chart: Any, methods: Mapping[str, Record], key: str, cost: str) -> None:
     forced = sorted((row for name, row in methods.items() if name.startswith("x")), key=lambda row: row[cost])
-    front = pareto_front([(row[cost], row[key]) for row in methods.values()], MEASURES[key] > 0)
+    front = find_pareto_front([(row[cost], row[key]) for row in methods.values()], MEASURES[key] > 0)
     chart.step(*zip(*front, strict=True), where="post", color="#7F7F7F", linestyle="--", linewidth=1, label="front")
     chart.plot(
         [row[cost] for row in forced], [row[key] for row in forced], "o-", color="#56B4E9", label="splatnode, forced"

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate
-from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.stability.claim import errors_of
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of
+from splatnode.recon.evaluate.stability.claim import measure_camera_errors
+from splatnode.recon.evaluate.stability.own_cameras import list_registered_cameras
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
-from splatnode.recon.frames.keyframe import Keyframe, modelled_image
+from splatnode.recon.frames.keyframe import Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching.match import match
 from splatnode.recon.registration import register
@@ -61,13 +61,13 @@ class Row:
         return self.beyond is True
 
 
-def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> Row:
+def measure(scene: EvaluationScene, names: tuple[str, ...], config: ReconstructionConfig) -> Row:
     """One set of photographs from pixels to a verdict."""
     frames = scene.frames(names)
     processor, laps = time.process_time(), [time.perf_counter()]
     found = [features.extract(frame.image, config.matching.features) for frame in frames]
     laps.append(time.perf_counter())
-    pictures = [modelled_image(frame.image, config.size) for frame in frames]
+    pictures = [resize_image(frame.image, config.size) for frame in frames]
     graph = match(map(Keyframe, frames, pictures, found), config.matching)
     laps.append(time.perf_counter())
     registration = register.register(graph.keyframes, graph.pairs, config.registration)
@@ -79,7 +79,7 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> R
     )
     seconds = np.diff(laps).tolist()
     errors = against_truth(scene, names, registration)
-    estimate = Estimate(graph, registration, evidence, verdict)
+    estimate = Reconstruction(graph, registration, evidence, verdict)
     return Row(
         scene=scene.name,
         views=len(names),
@@ -96,12 +96,12 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> R
     )
 
 
-def _beyond(scene: EvaluationScene, estimate: Estimate) -> bool | None:
-    cameras = cameras_of(estimate)
+def _beyond(scene: EvaluationScene, estimate: Reconstruction) -> bool | None:
+    cameras = list_registered_cameras(estimate)
     if not estimate.publishable or not all(camera.name in scene.cameras for camera in cameras):
         return None
     rough = estimate.verdict.code is Code.OK_ROUGH
-    return any(error.wrong(rough) for error in errors_of(cameras, scene.cameras))
+    return any(error.is_wrong(rough) for error in measure_camera_errors(cameras, scene.cameras))
 
 
 def against_truth(
@@ -115,7 +115,7 @@ def against_truth(
     truth = [scene.cameras[names[camera.index]] for camera in known]
     estimated = np.stack([camera.T_world_camera for camera in known])
     true = np.stack([camera.T_world_camera for camera in truth])
-    errors = camera_errors(
+    errors = compare_cameras(
         estimated,
         true,
         np.stack([np.diag([camera.focal, camera.focal, 1.0]) for camera in known]),
@@ -150,7 +150,7 @@ def main() -> None:
         for views in arguments.views:
             if f"train{views}" in splits[name]:
                 split = load_split(arguments.shared / "scenes" / name, list(scene.paths), views)
-                rows.append(measure(scene, split.train, Config()))
+                rows.append(measure(scene, split.train, ReconstructionConfig()))
                 print(json.dumps(asdict(rows[-1])), flush=True)
     published = [row for row in rows if row.publishable]
     summary = {

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatnode.recon.evaluate.camera_errors import camera_errors
-from splatnode.recon.priors.mast3r.global_alignment import align
+from splatnode.recon.evaluate.camera_errors import compare_cameras
+from splatnode.recon.priors.mast3r.global_alignment import align_views
 from splatnode.recon.priors.mast3r.network import Mast3r
-from splatnode.recon.priors.stereo import Config
+from splatnode.recon.priors.stereo import StereoConfig
 from splatnode.recon.result.report import peak_rss_mb
 from tests.bench.speed.stereo import METHODS, make_case, run
 from tests.recon.priors.test_mast3r_global_alignment import cameras, intrinsics, predictions
@@ -61,11 +61,11 @@ def alignment(_: Path, count: int = 12) -> dict[str, float]:
         truth = cameras(count)
         pairs = predictions(truth, 0.01, 0.2, np.random.default_rng(seed))
         started = time.perf_counter()
-        views = align(pairs)
+        views = align_views(pairs)
         seconds = time.perf_counter() - started
         estimated = np.stack([view.T_world_camera for view in views])
         Ks = intrinsics([view.focal for view in views])
-        errors = camera_errors(estimated, truth, Ks, intrinsics([45.0] * count))
+        errors = compare_cameras(estimated, truth, Ks, intrinsics([45.0] * count))
         found.append((errors.rotation_deg, errors.centre_pct, seconds))
     worst = np.max(np.array(found, np.float64), axis=0)
     return dict(zip(("rotation_deg", "centre_pct", "seconds"), worst.tolist(), strict=True))
@@ -75,7 +75,7 @@ def patchmatchnet(scene: Path) -> dict[str, float]:
     """Five neighbouring views, 640 pixels wide."""
     every = [image.name for image in sorted((scene / "images").iterdir())]
     case = make_case(scene, every[3:8], every, longer_side=640)
-    _, measured = run(case, Config(), method=METHODS["patchmatchnet"]())
+    _, measured = run(case, StereoConfig(), method=METHODS["patchmatchnet"]())
     return {"median_relative_error": measured["median_relative_error"], "seconds": measured["seconds"]["wall"]}
 
 

@@ -34,7 +34,7 @@ from splatnode.recon.core import set_threads
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.locating.locate import locate
+from splatnode.recon.locating.locate import localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.landmarks_file import decode_landmarks, encode_landmarks
@@ -98,7 +98,7 @@ def trials(scene: EvaluationScene, landmarks: Landmarks, names: Sequence[str], t
             query = make(image, K, number)
             for source in told if warp in TOLD_WARPS else [""]:
                 begun = time.process_time()
-                found = locate(landmarks, query.image, _stated(K, query, source))
+                found = localize_image(landmarks, query.image, _stated(K, query, source))
                 seconds = time.process_time() - begun
                 yield _trial((scene.name, name, warp, source), found, query, truth, landmarks.unit, seconds)
 

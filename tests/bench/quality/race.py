@@ -23,18 +23,18 @@ import msgspec
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.arguments import names, positive
 from splatnode.capture.process.progress import say
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import Entrants, Plan, run_bench
+from splatnode.recon.evaluate.bench import MethodRunner, Plan, run_bench
 from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
 from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Settings
 from splatnode.recon.evaluate.records import Bench
 from splatnode.recon.evaluate.report import redraw
-from splatnode.recon.evaluate.start import Start, continued, foundation
+from splatnode.recon.evaluate.start import Start, continue_reconstruction, extract_start_config
 from splatnode.recon.jobs.calls import Engine, engine
-from splatnode.recon.rasterize.device import Device, DeviceUnavailable, chosen
-from splatnode.recon.rasterize.dispatch import rasterizer
+from splatnode.recon.rasterize.device import Device, DeviceUnavailable, choose_device
+from splatnode.recon.rasterize.dispatch import make_rasterizer
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.shared_arguments import add_device
@@ -57,23 +57,23 @@ class Field:
     chosen: int
     device: Device = "cpu"
 
-    def config(self, name: str) -> Config | None:
+    def config(self, name: str) -> ReconstructionConfig | None:
         """Of a method that only this bench has."""
         base, _, fill = name.partition("+")
         if base not in ("pixel", "mcmc"):
             return None
         config = configurations(self.chosen)[PIXEL if base == "pixel" else RIVAL]
-        return methods.surrounded(config, "fill") if fill else config
+        return methods.add_surroundings(config, "fill") if fill else config
 
     def reconstruct(self, frames: Sequence[Frame], name: str, seed: int, start: Start | None) -> Iterator[Snapshot]:
         config = self.config(name)
         if config is None or start is None:
-            return methods.by_name(frames, name, seed, start, self.device)
-        return continued(start, msgspec.structs.replace(config, seed=seed, device=self.device))
+            return methods.run_method(frames, name, seed, start, self.device)
+        return continue_reconstruction(start, msgspec.structs.replace(config, seed=seed, device=self.device))
 
-    def start_of(self, name: str) -> Config | None:
+    def start_of(self, name: str) -> ReconstructionConfig | None:
         config = self.config(name)
-        return methods.start_of(name) if config is None else foundation(config)
+        return methods.select_start_config(name) if config is None else extract_start_config(config)
 
 
 @dataclass(frozen=True)
@@ -94,15 +94,15 @@ def run(case: Case, how: How, scenes: Path, out: Path) -> Bench:
     plan = partial(Plan, (scene,), (len(case.train),), seeds=how.seeds, timed=how.timed)
     go_on = partial(run_bench, out_dir=out, scoring=how.scoring, command=command(), resume=True, engine=how.engine)
     first = Field(1, how.device)  # the number of Gaussians is for others
-    bench = go_on(plan((REFERENCE,)), Entrants(first.reconstruct, first.start_of))
+    bench = go_on(plan((REFERENCE,)), MethodRunner(first.reconstruct, first.start_of))
     mine = [row for row in bench.rows if (row.scene, row.views, row.method) == (case.name, len(case.train), REFERENCE)]
     if mine[0].psnr is None:
         return bench  # refused: the others start from the same cameras, so there is nothing to compare
     entrants = Field(mine[0].num_gaussians or 1, how.device)
-    return go_on(plan(how.methods), Entrants(entrants.reconstruct, entrants.start_of))
+    return go_on(plan(how.methods), MethodRunner(entrants.reconstruct, entrants.start_of))
 
 
-def quick_networks(weights_dir: Path) -> Networks:
+def quick_networks(weights_dir: Path) -> PerceptualNetworks:
     return load_networks(weights_dir).quickest
 
 
@@ -124,11 +124,11 @@ def main() -> None:
     settings = INTERPOLATED_START if args.interpolated_start else Settings()
     wanted: Device = args.device or "cpu"
     try:
-        on = chosen(wanted)
+        on = choose_device(wanted)
     except DeviceUnavailable as error:
         parser.error(str(error))
     networks = partial(quick_networks, (args.shared / "weights").absolute())
-    scoring = Scoring(rasterizer(on), networks, settings, by_region=True)
+    scoring = Scoring(make_rasterizer(on), networks, settings, by_region=True)
     if networks().alex is None:
         parser.error(f"{args.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
     found = [case for case in cases() if not args.names or {case.name, case.label} & set(args.names)]

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from splatnode.recon.config import PRESETS
-from splatnode.recon.evaluate.charts import INK, plain, png, style
+from splatnode.recon.evaluate.charts import INK, choose_style, encode_png, style_axes
 from splatnode.recon.evaluate.contest import OURS, WHOLE
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.tables import Measure
@@ -122,14 +122,14 @@ def draw(ends: Sequence[Row]) -> bytes:
         color=INK,
         fontsize=11,
     )
-    return png(figure)
+    return encode_png(figure)
 
 
 def _chart(chart: Axes, found: Sequence[Point], recipes: Sequence[str]) -> None:
     largest = max(point.size for point in found)
     for point in found:
         recipe, _, filled = point.method.partition("+")
-        colour, marker = style(recipes.index(recipe))
+        colour, marker = choose_style(recipes.index(recipe))
         if point.spread is not None:
             chart.errorbar(point.time, point.lead, yerr=point.spread, color=colour, linewidth=1.2, capsize=3, zorder=2)
         area = SMALLEST + (LARGEST - SMALLEST) * point.size / largest
@@ -142,12 +142,14 @@ def _chart(chart: Axes, found: Sequence[Point], recipes: Sequence[str]) -> None:
     chart.xaxis.set_minor_locator(NullLocator())
     chart.xaxis.set_minor_formatter(NullFormatter())
     chart.margins(0.12, 0.15)
-    plain(chart)
+    style_axes(chart)
 
 
 def _legend(figure: Figure, recipes: Sequence[str]) -> None:
     handles = [
-        Line2D([], [], color=style(i)[0], marker=style(i)[1], label=recipe, linestyle="none", markersize=7)
+        Line2D(
+            [], [], color=choose_style(i)[0], marker=choose_style(i)[1], label=recipe, linestyle="none", markersize=7
+        )
         for i, recipe in enumerate(recipes)
     ]
     hollow = Line2D([], [], color=INK, marker="o", markerfacecolor="none", linestyle="none", label="as published")

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process.progress import say
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
 from splatnode.recon.evaluate.protocol import Row, Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split, load_split
-from splatnode.recon.evaluate.start import Start, continued
+from splatnode.recon.evaluate.start import Start, continue_reconstruction
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
@@ -27,7 +27,7 @@ def timed(
     made: Callable[[], Snapshot],
     scene: EvaluationScene,
     split: Split,
-    networks: Networks,
+    networks: PerceptualNetworks,
     settings: Settings = Settings(),  # noqa: B008 (it is frozen)
 ) -> tuple[Snapshot, Row, float]:
     """What `made` makes with `balanced`, its scores, and the seconds of the processor that it took."""
@@ -39,9 +39,9 @@ def timed(
     return snapshot, row, seconds
 
 
-def last(start: Start, config: Config) -> Snapshot:
+def last(start: Start, config: ReconstructionConfig) -> Snapshot:
     """The scene of these cameras and points, as it is in the end."""
-    *_, snapshot = continued(start, config)
+    *_, snapshot = continue_reconstruction(start, config)
     return snapshot
 
 
@@ -50,7 +50,7 @@ def measure(
     description: str | None,
     sets: Sequence[str],
     form: str,
-    rows: Callable[[EvaluationScene, Split, Sequence[str], Networks], Sequence[Any]],
+    rows: Callable[[EvaluationScene, Split, Sequence[str], PerceptualNetworks], Sequence[Any]],
     in_words: Callable[[Any], str],
 ) -> None:
     """Writes what `rows` finds, dataclasses, to the file of `--out` after each set, and says it.

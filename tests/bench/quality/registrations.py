@@ -21,17 +21,17 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.stability.case import Row
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.stability.case import MatrixRow
 from splatnode.recon.evaluate.stability.claim import ROUGH
 from splatnode.recon.evaluate.stability.matrix import ROWS
-from splatnode.recon.evaluate.stability.outcome import compare, outcome
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
-from splatnode.recon.evaluate.stability.places import Sampler, load_places, loaded_places
+from splatnode.recon.evaluate.stability.outcome import classify_outcome, score_cameras
+from splatnode.recon.evaluate.stability.own_cameras import ensure_registration, list_registered_cameras
+from splatnode.recon.evaluate.stability.places import Sampler, load_scenes_by_motion, load_trial_scenes
 from splatnode.recon.evaluate.stability.windows import ours
-from splatnode.recon.evaluate.stability.windows.row import OURS, judged
-from splatnode.recon.evaluate.stability.windows.store import Key, among
-from splatnode.recon.evaluate.stability.windows.window import Window, moving, windows_of
+from splatnode.recon.evaluate.stability.windows.row import OURS, judge_window
+from splatnode.recon.evaluate.stability.windows.store import Key, select_keys
+from splatnode.recon.evaluate.stability.windows.window import Window, draw_windows, select_moving_scenes
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 
@@ -58,13 +58,13 @@ def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, ours.To
 def of_scene(scene: Path, out: Path) -> list[dict[str, Any]]:
     """The rows of the scene's windows, each with what was told."""
     rows, caches = [], defaultdict[str, dict[Key, bytes]](dict)
-    for place in moving(loaded_places([scene], out)):
-        for window, told in plan(partial(windows_of, place, seed=0)):
+    for place in select_moving_scenes(load_trial_scenes([scene], out)):
+        for window, told in plan(partial(draw_windows, place, seed=0)):
             cache = caches["given" if told == "given" else "centred"]
-            known = {key: cache[key] for key in among(cache.keys(), window.names)}
-            answer, found = ours.answered(place, window, Config(), False, told, known)
+            known = {key: cache[key] for key in select_keys(cache.keys(), window.names)}
+            answer, found = ours.answer_window(place, window, ReconstructionConfig(), False, told, known)
             cache.update(found)
-            rows.append({"told": told, "row": asdict(judged(window, OURS, answer, place.scene.cameras))})
+            rows.append({"told": told, "row": asdict(judge_window(window, OURS, answer, place.scene.cameras))})
     return rows
 
 
@@ -72,14 +72,14 @@ def of_row(job: tuple[int, int], scenes: Sequence[Path], out: Path) -> dict[str,
     """A trial of a row of the matrix by its position, and its seed; None where the scenes do not do for it."""
     row, seed = ROWS[job[0]], job[1]
     try:
-        case = row.make(Sampler(load_places(scenes, out), row.name, seed))
+        case = row.make(Sampler(load_scenes_by_motion(scenes, out), row.name, seed))
     except ValueError:
         return None
     found, _ = estimate_frame_cameras(case.source(), load_prior(case.config), case.config, Clock())
-    estimate = registered(found, case.config)
-    cameras, verdict = cameras_of(estimate), estimate.verdict
-    score = compare(cameras, case.worlds, rough=verdict.code.value == ROUGH)
-    ended = outcome(case.demand, verdict.publishable, score.right, verdict.code in case.codes)
+    estimate = ensure_registration(found, case.config)
+    cameras, verdict = list_registered_cameras(estimate), estimate.verdict
+    score = score_cameras(cameras, case.worlds, rough=verdict.code.value == ROUGH)
+    ended = classify_outcome(case.demand, verdict.publishable, score.right, verdict.code in case.codes)
     return {
         "row": row.number, "name": row.name, "seed": seed, "method": OURS, "note": case.note,
         "verdict": verdict.code.value, "published": verdict.publishable, "outcome": ended.value,
@@ -88,7 +88,7 @@ def of_row(job: tuple[int, int], scenes: Sequence[Path], out: Path) -> dict[str,
     }  # fmt: skip
 
 
-def asks_for_cameras(row: Row) -> bool:
+def asks_for_cameras(row: MatrixRow) -> bool:
     return row.name not in OTHERS and row.number < LENS_ROWS
 
 

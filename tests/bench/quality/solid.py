@@ -21,7 +21,7 @@ def inside(solids: Sequence[Solid], points: Array) -> Mask:
     """(M,) which of the points (M, 3) are in a solid."""
     found = np.zeros(len(points), bool)
     for solid, near in _neighbours(solids, points, 0.0):
-        found[near[_within(solid.shape, solid.to_local(points[near]))]] = True
+        found[near[_within(solid.shape, solid.transform_to_local(points[near]))]] = True
     return found
 
 
@@ -35,7 +35,7 @@ def touched(solids: Sequence[Solid], centres: Array, axes: Array) -> Mask:
     found = np.zeros(len(centres), bool)
     for solid, near in _neighbours(solids, centres, float(np.abs(offsets).max())):
         for offset in offsets:
-            found[near[_within(solid.shape, solid.to_local(centres[near] + offset))]] = True
+            found[near[_within(solid.shape, solid.transform_to_local(centres[near] + offset))]] = True
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.start import foundation
+from splatnode.recon.evaluate.start import extract_start_config
 from tests.bench.quality import race
 
 
@@ -28,7 +28,7 @@ def test_a_case_lies_under_its_own_name_beside_its_split(tmp_path):
 
 def test_methods_of_the_race_start_from_what_ours_starts_from():
     field = race.Field(12345)
-    ours = foundation(preset("balanced"))
+    ours = extract_start_config(preset("balanced"))
     for name in ("pixel", "pixel+fill", "mcmc", "mcmc+fill", "instantsplat-xl+fill"):
         assert field.start_of(name) == ours
     mcmc, filled = field.config("mcmc"), field.config("mcmc+fill")

@@ -18,11 +18,11 @@ import numpy as np
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.lens import project, unproject
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.places import Photo
-from splatnode.recon.evaluate.stability.warps import distorted
+from splatnode.recon.evaluate.stability.places import TrialImage
+from splatnode.recon.evaluate.stability.warps import distort_image
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.offline import run
 from splatnode.recon.result.snapshot import Snapshot
@@ -45,16 +45,16 @@ class Row:
     seconds: float
 
 
-def as_it_came(photo: Photo) -> Photo:
+def as_it_came(photo: TrialImage) -> TrialImage:
     return replace(photo, intrinsics=_told(photo))
 
 
-def radial(photo: Photo, k1: float, k2: float) -> Photo:
-    bent = distorted(photo, k1, k2)
+def radial(photo: TrialImage, k1: float, k2: float) -> TrialImage:
+    bent = distort_image(photo, k1, k2)
     return replace(bent, intrinsics=replace(_told(bent), distortion=(k1, k2, 0.0, 0.0)))
 
 
-def fisheye(photo: Photo) -> Photo:
+def fisheye(photo: TrialImage) -> TrialImage:
     """As an equidistant fisheye shows it whose corners look where the photograph's do."""
     pinhole = _told(photo)
     height, width = photo.image.shape[:2]
@@ -68,15 +68,15 @@ def fisheye(photo: Photo) -> Photo:
     return replace(photo, image=image, intrinsics=told)
 
 
-LENSES: dict[str, Callable[[Photo], Photo]] = {
+LENSES: dict[str, Callable[[TrialImage], TrialImage]] = {
     "as it came": as_it_came,
     **{f"radial {k1:+g} {k2:+g}": partial(radial, k1=k1, k2=k2) for k1, k2 in RADIALS},
     "fisheye": fisheye,
 }
 
 
-def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
-    photos = [Photo(name, scene.image(name), scene.cameras[name]) for name in split.train]
+def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: PerceptualNetworks) -> list[Row]:
+    photos = [TrialImage(name, scene.image(name), scene.cameras[name]) for name in split.train]
     found = []
     for lens, bent in LENSES.items():
         shown = [bent(photo) for photo in photos]
@@ -91,7 +91,7 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
     return found
 
 
-def _told(photo: Photo) -> Intrinsics:
+def _told(photo: TrialImage) -> Intrinsics:
     """The true intrinsics of a photograph that a pinhole took."""
     assert photo.camera is not None
     return photo.camera.intrinsics_for(photo.image.shape[1], photo.image.shape[0])
@@ -101,7 +101,7 @@ def _errors(snapshot: Snapshot, scene: EvaluationScene) -> CameraErrors:
     true = [scene.cameras[camera.name] for camera in snapshot.cameras]
     Ts = np.stack([camera.T_world_camera for camera in snapshot.cameras])
     Ks = np.stack([camera.K for camera in snapshot.cameras])  # lenses were told: their errors say nothing
-    return camera_errors(Ts, np.stack([camera.T_world_camera for camera in true]), Ks, Ks)
+    return compare_cameras(Ts, np.stack([camera.T_world_camera for camera in true]), Ks, Ks)
 
 
 def in_words(row: Row) -> str:

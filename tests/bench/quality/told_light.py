@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.perceptual import PerceptualNetworks
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.start import Start, find_start, foundation
+from splatnode.recon.evaluate.start import Start, extract_start_config, find_start
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.scene import light
 from tests.bench.quality.light import ON, changed, drawn, gain_errors
@@ -50,14 +50,14 @@ def words(gains: Mapping[str, float]) -> dict[str, dict[str, float]]:
 def is_left(start: Start, told: Mapping[str, float]) -> bool:
     maps = list(start.estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
-    return not light.differing(maps, images, ON.light, told)
+    return not light.estimate_exposures(maps, images, ON.light, told)
 
 
-def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
+def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: PerceptualNetworks) -> list[Row]:
     frames = scene.frames(split.train)
     true = {frame.name: own for frame, own in zip(frames, drawn(len(frames)), strict=True)}
-    plain = find_start(frames, foundation(ON))
-    under = find_start([changed(frame, true[frame.name]) for frame in frames], foundation(ON))
+    plain = find_start(frames, extract_start_config(ON))
+    under = find_start([changed(frame, true[frame.name]) for frame in frames], extract_start_config(ON))
     return [
         Row(scene.name, len(frames), kind, gain_errors(plain, under, true, told), is_left(plain, told))
         for kind, told in words({name: float(own.mean()) for name, own in true.items()}).items()

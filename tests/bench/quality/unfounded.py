@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import to_camera
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.geometry import transform_to_camera
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.export.quaternions import matrices_from_quats
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
@@ -65,7 +65,7 @@ def covered(gaussians: GaussianArrays, stands: Footing, known: KnownSurfaces, vi
     painted = replace(gaussians, sh=((colours - 0.5) / _SH_C0).astype(np.float32)[:, None])
     shares = render_arrays(painted, *camera).rgb
     rgb = render_arrays(gaussians, *camera).rgb
-    without = render_arrays(take(gaussians, ~(needle | floater)), *camera).rgb
+    without = render_arrays(select_gaussians(gaussians, ~(needle | floater)), *camera).rgb
     seen = np.abs(rgb - without).max(-1) >= VISIBLE
     needles, floaters = (seen & (shares[..., i] >= COVERED) for i in (0, 1))
     return Covered(rgb, needles, floaters, seen & (shares.sum(-1) >= COVERED))
@@ -74,7 +74,7 @@ def covered(gaussians: GaussianArrays, stands: Footing, known: KnownSurfaces, vi
 def needle_shaped(gaussians: GaussianArrays, viewpoint: Viewpoint) -> Mask:
     """(N,) which Gaussians are seen from there as at least LONG and SLENDER."""
     R = viewpoint.T_world_camera[:3, :3]
-    in_camera = to_camera(gaussians.means.astype(np.float64), viewpoint.T_world_camera)
+    in_camera = transform_to_camera(gaussians.means.astype(np.float64), viewpoint.T_world_camera)
     z = np.maximum(in_camera[:, 2], 1e-6)
     axes = matrices_from_quats(gaussians.quats.astype(np.float64)) * gaussians.scales[:, None, :]
     axes = R.T @ axes

@@ -26,9 +26,9 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses.lens import unproject
 from splatnode.capture.process.progress import say
-from splatnode.recon.config import Config, preset
-from splatnode.recon.estimation import Estimate, estimate_cameras
-from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.config import ReconstructionConfig, preset
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.match import match
 from splatnode.recon.preparation import prepare
@@ -68,7 +68,7 @@ def lenses() -> dict[str, Intrinsics]:
     return {**radial, **{f"fisheye {across:g}": equidistant(across, WIDTH, HEIGHT) for across in FISHEYES_DEG}}
 
 
-def measured(name: str, lens: Intrinsics, views: int, seed: int, config: Config) -> Row:
+def measured(name: str, lens: Intrinsics, views: int, seed: int, config: ReconstructionConfig) -> Row:
     place = synthetic.Config(views=views, width=WIDTH, height=HEIGHT, seed=seed, lens=lens)
     frames = [replace(frame, intrinsics=None) for frame in synthetic.stream(place)]
     graph = match((prepare(frame, config) for frame in frames), config.matching)
@@ -90,14 +90,16 @@ def corner_moves_pct(lens: Intrinsics) -> float | None:
     return 100 * float(furthest) / math.hypot(lens.width / 2, lens.height / 2)
 
 
-def against_truth(row: Row, estimate: Estimate, lens: Intrinsics, Ts_true: Sequence[Array], rays: Array) -> Row:
+def against_truth(row: Row, estimate: Reconstruction, lens: Intrinsics, Ts_true: Sequence[Array], rays: Array) -> Row:
     """With the errors of the cameras and of their lens."""
     if estimate.registration is None or not estimate.registration.cameras:
         return row
     cameras = estimate.registration.cameras
     Ks = np.stack([np.diag([camera.focal, camera.focal, 1.0]) for camera in cameras])
     true = np.stack([Ts_true[camera.index] for camera in cameras])
-    errors = camera_errors(np.stack([each.T_world_camera for each in cameras]), true, Ks, np.stack([lens.K] * len(Ks)))
+    errors = compare_cameras(
+        np.stack([each.T_world_camera for each in cameras]), true, Ks, np.stack([lens.K] * len(Ks))
+    )
     first = cameras[0]
     corner_error = None
     if (rays[:, 2] > 0).all():

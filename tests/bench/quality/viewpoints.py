@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import spread
-from splatnode.recon.optimize.pseudo_views import interpolate, path
+from splatnode.recon.geometry import compute_rms_radius
+from splatnode.recon.optimize.pseudo_views import interpolate, order_cameras
 from tests.bench.quality.known_surfaces import KnownView
 
 Array = npt.NDArray[np.float64]
@@ -33,8 +33,8 @@ def viewpoints(views: Sequence[KnownView]) -> list[Viewpoint]:
 
     Whatever is moved is turned back to what it had before it at the median depth. Nothing is drawn by chance.
     """
-    order = [views[i] for i in path([view.T_world_camera for view in views])]
-    apart = spread(np.stack([view.T_world_camera[:3, 3] for view in views]))
+    order = [views[i] for i in order_cameras([view.T_world_camera for view in views])]
+    apart = compute_rms_radius(np.stack([view.T_world_camera[:3, 3] for view in views]))
     found = []
     for index in range(COUNT):
         start, share = divmod((index + 0.5) / COUNT * (len(order) - 1), 1.0)

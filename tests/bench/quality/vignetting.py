@@ -19,10 +19,10 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.protocol import Networks
+from splatnode.recon.evaluate.protocol import PerceptualNetworks
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.corruptions import vignetted
-from splatnode.recon.evaluate.start import find_start, foundation
+from splatnode.recon.evaluate.stability.corruptions import apply_vignetting
+from splatnode.recon.evaluate.start import extract_start_config, find_start
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.scene import light
 from tests.bench.quality.real_sets import last, measure, timed
@@ -30,7 +30,7 @@ from tests.bench.quality.real_sets import last, measure, timed
 SETS = ("fountain_p11:6", "llff_fern:6", "sceaux:6")
 LOSSES = (0.0, 0.45, 0.6)  # of the light in the corners
 ON = preset("balanced")
-OFF = msgspec.structs.replace(ON, light=light.Config(enabled=False))
+OFF = msgspec.structs.replace(ON, light=light.ExposureConfig(enabled=False))
 
 
 @dataclass(frozen=True)
@@ -55,17 +55,17 @@ class Dimmed(EvaluationScene):
     loss: float = 0.0
 
     def image(self, name: str) -> npt.NDArray[np.uint8]:
-        return vignetted(super().image(name), self.loss)
+        return apply_vignetting(super().image(name), self.loss)
 
 
-def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
+def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: PerceptualNetworks) -> list[Row]:
     return [row for loss in LOSSES for row in _of_a_lens(scene, split, loss, networks)]
 
 
-def _of_a_lens(scene: EvaluationScene, split: Split, loss: float, networks: Networks) -> list[Row]:
+def _of_a_lens(scene: EvaluationScene, split: Split, loss: float, networks: PerceptualNetworks) -> list[Row]:
     seen = Dimmed(scene.name, scene.paths, scene.cameras, scene.masks, loss)
     frames: list[Frame] = seen.frames(split.train)
-    start = find_start(frames, foundation(ON))
+    start = find_start(frames, extract_start_config(ON))
     result = []
     for config in (ON, OFF):
         snapshot, row, seconds = timed(partial(last, start, config), seen, split, networks)

@@ -20,7 +20,7 @@ from splatnode.recon.merging.command import write_maps
 from splatnode.recon.merging.submap import Submap
 from splatnode.recon.occupancy.command import read_to_map
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.threads import at_most
+from splatnode.recon.threads import apply_thread_limit
 from tests.bench.quality.occupancy import room, row
 
 
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="that the bench `building` left")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
-    with at_most(1):
+    with apply_thread_limit(1):
         snapshot = merged(args.folder / "node" / "out")
         numbers = [building.frame_index(camera.name) for camera in snapshot.cameras]
         scenes = f"building, a walk in {len(snapshot.scenes)} scenes"

@@ -19,8 +19,8 @@ from collections import Counter
 from pathlib import Path
 
 from splatnode.capture.process.progress import say
-from splatnode.recon.evaluate.stability.places import loaded_places
-from splatnode.recon.evaluate.timing import processor
+from splatnode.recon.evaluate.stability.places import load_trial_scenes
+from splatnode.recon.evaluate.timing import describe_processor
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT
 
@@ -32,14 +32,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/campaign.json"))
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        loaded_places((), Path(folder))
+        load_trial_scenes((), Path(folder))
         rest = ["--rows", args.rows, "--seeds", str(args.seeds), "--cores", "1", "--out", folder]
         took_s, processor_s = campaign_s([sys.executable, "-m", "splatnode", "stability", *rest])
         trials = json.loads(Path(folder, "stability.json").read_text())["trials"]
     own_s = [trial["processor_seconds"] or 0.0 for trial in trials]
     result = {
         "command": shlex.join(["python", "-m", "tests.bench", "campaign", *sys.argv[1:]]),
-        "processor": processor(),
+        "processor": describe_processor(),
         "rows": sorted({trial["row"] for trial in trials}),
         "kinds": len({trial["name"] for trial in trials}),
         "trials": len(trials),

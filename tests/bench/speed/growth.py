@@ -16,8 +16,8 @@ import tempfile
 from pathlib import Path
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.evaluate.demo import write_photographs
-from splatnode.recon.evaluate.records import this_machine
+from splatnode.recon.evaluate.demo import write_training_images
+from splatnode.recon.evaluate.records import describe_machine
 
 ROOT = Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "tests" / "bench" / "results" / "growth.json"
@@ -55,7 +55,7 @@ def rows_of(args: argparse.Namespace) -> list[dict]:
     for views in args.views:
         folder = args.out / f"capture_{views}"
         if not (folder / "images").exists():
-            write_photographs(folder, synthetic.Config(views=views))
+            write_training_images(folder, synthetic.Config(views=views))
         for _ in range(args.repeat):
             photographs = (folder / "images").resolve()
             found = {"new": measured(photographs, args.preset)}
@@ -133,7 +133,7 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     rows = rows_of(args)
     command = "python -m tests.bench " + " ".join(["growth", *sys.argv[1:]])
-    machine = {**this_machine(), "instruction_set": os.environ.get("SPLATNODE_ISA")}
+    machine = {**describe_machine(), "instruction_set": os.environ.get("SPLATNODE_ISA")}
     content = {"command": command, "machine": machine, "rows": rows}
     (args.out / "growth.json").write_text(json.dumps(content, indent=1) + "\n")
     draw(rows, args.out / "growth.png")

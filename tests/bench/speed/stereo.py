@@ -19,13 +19,19 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.networks.weight_folder import find
-from splatnode.recon.priors.classical import DepthMaps
+from splatnode.recon.priors.classical import DepthEstimator
 from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.patchmatchnet import WEIGHTS, load_network
 from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
-from splatnode.recon.priors.stereo import Config, SparsePoints, StereoView, depth_maps, depth_range
+from splatnode.recon.priors.stereo import (
+    SparsePoints,
+    StereoConfig,
+    StereoView,
+    estimate_depth_maps,
+    estimate_depth_range,
+)
 
 Float64 = npt.NDArray[np.float64]
 LONGER_SIDE = 512  # of the images that stereo works on
@@ -118,9 +124,9 @@ def _mutual_matches(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> t
 
 
 def stereo_view(photo: Photo, depths: Float64, longer_side: int) -> StereoView:
-    image = modelled_image(photo.image, longer_side)
+    image = resize_image(photo.image, longer_side)
     scale = np.diag([image.shape[1] / photo.image.shape[1], image.shape[0] / photo.image.shape[0], 1.0])
-    return StereoView(image, scale @ photo.K, photo.T_world_camera, depth_range(depths))
+    return StereoView(image, scale @ photo.K, photo.T_world_camera, estimate_depth_range(depths))
 
 
 def perturbed(view: StereoView, angle_deg: float, generator: np.random.Generator) -> StereoView:
@@ -232,12 +238,12 @@ def _share(masks: list[npt.NDArray[np.bool_]], among: list[npt.NDArray[np.bool_]
 
 def run(
     case: Case,
-    config: Config,
+    config: StereoConfig,
     *,
     seed: int = 0,
     pose_error_deg: float = 0.0,
     seeded: float = 0.0,
-    method: DepthMaps = depth_maps,
+    method: DepthEstimator = estimate_depth_maps,
 ) -> tuple:
     """(depth maps, measurements). `seeded` is the share of reference points given as sparse points."""
     generator = np.random.default_rng(seed)
@@ -252,11 +258,14 @@ def run(
     return maps, {"seconds": seconds, **measure(case, maps)}
 
 
-def _patchmatchnet() -> DepthMaps:
-    return NetworkStereo(load_network(find(*WEIGHTS))).depth_maps
+def _patchmatchnet() -> DepthEstimator:
+    return NetworkStereo(load_network(find(*WEIGHTS))).estimate_depth_maps
 
 
-METHODS: dict[str, Callable[[], DepthMaps]] = {"classical": lambda: depth_maps, "patchmatchnet": _patchmatchnet}
+METHODS: dict[str, Callable[[], DepthEstimator]] = {
+    "classical": lambda: estimate_depth_maps,
+    "patchmatchnet": _patchmatchnet,
+}
 
 
 def main() -> None:
@@ -277,7 +286,7 @@ def main() -> None:
         case = make_case(arguments.shared / "scenes" / name, names, sorted({*names, *splits[name]["test"]}))
         _, row = run(
             case,
-            Config(),
+            StereoConfig(),
             seed=arguments.seed,
             pose_error_deg=arguments.pose_error_deg,
             seeded=arguments.seeded,

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.viewer.sources import load_result
-from splatnode.viewer.state import State
+from splatnode.viewer.state import ViewerState
 
 
 def agreement(result: Path) -> dict:
@@ -23,7 +23,7 @@ def agreement(result: Path) -> dict:
     renderer = rendering.OffscreenRenderer(width, height)
     scene = Scene3D(renderer.scene)
     scene.set_drawing(True)
-    scene.show_gaussians(gaussians, State())
+    scene.show_gaussians(gaussians, ViewerState())
     renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
     rows = []
     for camera in cameras:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.viewer.sources import load_result
 from tests.bench.speed.rasterize import processor_name
 from tests.support.node import processor_s
@@ -65,7 +65,7 @@ def write_scene(result: Path, folder: Path) -> None:
     """The result with GAUSSIANS Gaussians, and its cameras."""
     snapshot = load_result(result).snapshot
     chosen = np.arange(GAUSSIANS) % len(snapshot.gaussians)
-    (folder / "scene.ply").write_bytes(encode_ply(take(snapshot.gaussians, np.sort(chosen))))
+    (folder / "scene.ply").write_bytes(encode_ply(select_gaussians(snapshot.gaussians, np.sort(chosen))))
     (folder / "cameras.json").write_bytes(encode_cameras(snapshot.cameras))
 
 

@@ -24,8 +24,8 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.recon.result.export.prepare import take
-from splatnode.recon.result.message import to_message
+from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.analysis import analyse
@@ -159,7 +159,7 @@ def growing(whole: Snapshot) -> list[Snapshot]:
     parts = []
     for number, cameras in enumerate((3, max(3, count // 2), count)):
         share = cameras / count
-        gaussians = take(whole.gaussians, np.random.default_rng(0).random(len(whole.gaussians)) < share)
+        gaussians = select_gaussians(whole.gaussians, np.random.default_rng(0).random(len(whole.gaussians)) < share)
         verdict = whole.verdict
         if cameras < count:
             verdict = Verdict(Code.OK_PARTIAL, f"{cameras} of {count} photographs were placed.", "Go on.", (), True)
@@ -189,7 +189,7 @@ def main() -> None:
         config.write_text(f"network: {{directory: {folder}}}\n")
         network = Network(directory=Path(folder))
         with StateServer(RECON_SCENE, network) as server, Publisher(RECON_STATUS, network) as heartbeats:
-            server.publish(*to_message(growing(moment.snapshot)[0], "place", Numbering().next()))
+            server.publish(*encode_snapshot(growing(moment.snapshot)[0], "place", Numbering().next()))
             command = [sys.executable, "-m", "splatnode", "view", str(config), "--size", "x".join(map(str, WINDOW))]
             command += ["--out", str(arguments.out)]
             viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -217,7 +217,7 @@ def drive(moment: Moment, server: StateServer, heartbeats: Publisher, viewer: su
     while viewer.poll() is None and screen.picture(*PICTURE).std() < 8:
         settle(0.2)
     for snapshot in growing(moment.snapshot):
-        server.publish(*to_message(snapshot, "place", numbering.next()))
+        server.publish(*encode_snapshot(snapshot, "place", numbering.next()))
         settle(2 * SETTLE_S)
     tracked = moment.snapshot.cameras[-1]
     settle(HEARTBEAT_S + SETTLE_S)

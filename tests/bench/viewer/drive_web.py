@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.canvas import project
@@ -212,7 +212,7 @@ def exactly(snapshot: Snapshot, number: int) -> Snapshot:
     """The scene with `number` Gaussians, chosen by chance; of a smaller scene some are there more than once."""
     have, rng = len(snapshot.gaussians), np.random.default_rng(0)
     chosen = np.concatenate([np.arange(have)] * (number // have) + [rng.permutation(have)[: number % have]])
-    return replace(snapshot, gaussians=take(snapshot.gaussians, chosen))
+    return replace(snapshot, gaussians=select_gaussians(snapshot.gaussians, chosen))
 
 
 @contextlib.contextmanager

@@ -25,9 +25,9 @@ import numpy as np
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.probe import probe_window
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished, load_result
-from splatnode.viewer.state import Engine, State
-from splatnode.viewer.viewpoint import orbited
+from splatnode.viewer.sources import FixedSource, load_result
+from splatnode.viewer.state import Engine, ViewerState
+from splatnode.viewer.viewpoint import orbit
 from tests.bench.speed.rasterize import processor_name
 from tests.bench.viewer.agreement import agreement
 from tests.bench.viewer.watching import thinned, watch
@@ -96,8 +96,8 @@ class TourOver(Exception):
 class Tour(Session):
     """A session whose viewpoint moves at every tick of the window, for VIEWS + 3 ticks."""
 
-    def __init__(self, moment: Moment, state: State) -> None:
-        super().__init__(Finished(moment), state)
+    def __init__(self, moment: Moment, state: ViewerState) -> None:
+        super().__init__(FixedSource(moment), state)
         self.ticks: list[float] = []
         self.processor: list[float] = []  # seconds of all threads so far
 
@@ -109,7 +109,7 @@ class Tour(Session):
         came = super().receive()
         view = self.viewpoint_to_move()
         if view is not None:
-            self.move(orbited(view, 0.02, 0.0))
+            self.move(orbit(view, 0.02, 0.0))
         return came or view is not None
 
 
@@ -117,7 +117,7 @@ def time_pictures(result: Path, engine: Engine, as_points: bool, window: tuple[i
     """Seconds from picture to picture while the viewpoint moves, the first ones left out."""
     from splatnode.viewer.window import show
 
-    tour = Tour(thinned(load_result(result), GAUSSIANS), State(as_points=as_points))
+    tour = Tour(thinned(load_result(result), GAUSSIANS), ViewerState(as_points=as_points))
     with contextlib.suppress(TourOver):
         show(tour, software=engine is Engine.CORE, screenshots=result, size=window)
     seconds = np.diff(tour.ticks)[2:]

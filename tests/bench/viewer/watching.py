@@ -15,8 +15,8 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.recon.result.export.prepare import SH_C0, take
-from splatnode.recon.result.message import to_message
+from splatnode.recon.result.export.prepare import SH_C0, select_gaussians
+from splatnode.recon.result.message import encode_snapshot
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.sources import load_result
 from splatnode.viewer.viewpoint import scene_pivot
@@ -31,7 +31,7 @@ def thinned(moment: Moment, number: int) -> Moment:
     """The moment with `number` of its Gaussians, chosen by chance."""
     gaussians = moment.snapshot.gaussians
     chosen = np.random.default_rng(0).permutation(len(gaussians))[:number]
-    return replace(moment, snapshot=replace(moment.snapshot, gaussians=take(gaussians, np.sort(chosen))))
+    return replace(moment, snapshot=replace(moment.snapshot, gaussians=select_gaussians(gaussians, np.sort(chosen))))
 
 
 def watch(result: Path, minutes: float, period_s: float) -> dict:
@@ -50,7 +50,7 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
             )
             try:
                 first = scene_of_colour(moment, 20_000, (1.0, 1.0, 1.0))
-                server.publish(*to_message(first.snapshot, "place", numbering.next()))
+                server.publish(*encode_snapshot(first.snapshot, "place", numbering.next()))
                 if not wait_for_colour(screen, PIXEL, (1.0, 1.0, 1.0), server, 120.0):
                     raise SystemExit(
                         f"no scene at {PIXEL} of the screen: is it of 1280 x 800, with the viewer in its middle?"
@@ -61,7 +61,7 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
                     number = int(rng.integers(1000, len(moment.snapshot.gaussians)))
                     colour = COLOURS[len(sizes) % len(COLOURS)]
                     there = scene_of_colour(moment, number, colour)
-                    message = to_message(there.snapshot, "place", numbering.next())
+                    message = encode_snapshot(there.snapshot, "place", numbering.next())
                     published = time.monotonic()
                     server.publish(*message)
                     seen = wait_for_colour(screen, PIXEL, colour, server, 10.0)

@@ -16,7 +16,7 @@ from splatnode.capture.calibration import command
 from splatnode.capture.calibration.board import Board
 from splatnode.capture.calibration.lacking import Limits
 from splatnode.capture.cameras import folder
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.lenses import lens as lenses
 from splatnode.capture.reader import Config, Reader
@@ -158,7 +158,7 @@ def as_mcap(images: list[np.ndarray], where: Path) -> Path:
 def as_recording(images: list[np.ndarray], where: Path) -> Path:
     with Recorder(where / "recording") as recorder:
         for number, image in enumerate(images):
-            recorder.write(framed(number, f"{number}.png", number + 1, image, None))
+            recorder.write(make_frame(number, f"{number}.png", number + 1, image, None))
     return where / "recording"
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.corners import View
-from splatnode.capture.calibration.estimate import estimated
+from splatnode.capture.calibration.corners import BoardView
+from splatnode.capture.calibration.estimate import estimate_lens
 from splatnode.capture.calibration.hold_out import choose
 from splatnode.capture.calibration.lacking import ENOUGH
 from splatnode.capture.calibration.models import MODELS
@@ -29,7 +29,7 @@ LENSES = {
 }
 
 
-def views_of(lens: Intrinsics, Ts: Sequence[np.ndarray], seed: int = 0, spoilt: int = 0) -> list[View]:
+def views_of(lens: Intrinsics, Ts: Sequence[np.ndarray], seed: int = 0, spoilt: int = 0) -> list[BoardView]:
     """What would be seen of the board; `spoilt` corners of each view are far off."""
     rng, views = np.random.default_rng(seed), []
     for number, T in enumerate(Ts):
@@ -38,7 +38,7 @@ def views_of(lens: Intrinsics, Ts: Sequence[np.ndarray], seed: int = 0, spoilt: 
         noise = rng.normal(0, SIGMA, (len(inside), 2))
         noise[:spoilt] += rng.choice([-3.0, 3.0], (min(spoilt, len(inside)), 2))
         if len(inside) >= 12:
-            views.append(View(str(number), inside, pixels[inside] + noise))
+            views.append(BoardView(str(number), inside, pixels[inside] + noise))
     return views
 
 
@@ -60,7 +60,7 @@ def test_what_is_told_of_the_errors_is_what_they_are():
     """Over 12 draws of the noise the errors are as large as the covariance says."""
     true, model, ratios = LENSES["opencv2"], MODELS["opencv2"], []
     for seed in range(12):
-        found = estimated(views_of(true, waved(BOARD, true, 20, seed), seed), BOARD, model, WIDTH, HEIGHT)
+        found = estimate_lens(views_of(true, waved(BOARD, true, 20, seed), seed), BOARD, model, WIDTH, HEIGHT)
         assert found is not None
         errors = np.array([found.lens.fx - true.fx, found.lens.cx - true.cx, found.lens.cy - true.cy])
         ratios.append(errors / np.sqrt(np.diag(found.covariance)[[0, 2, 3]]))
@@ -70,19 +70,19 @@ def test_what_is_told_of_the_errors_is_what_they_are():
 def test_corners_that_were_not_seen_right_are_left_out():
     true = LENSES["pinhole"]
     views = views_of(true, waved(BOARD, true, 20, 5), spoilt=2)
-    found = estimated(views, BOARD, MODELS["opencv2"], WIDTH, HEIGHT)
+    found = estimate_lens(views, BOARD, MODELS["opencv2"], WIDTH, HEIGHT)
     assert found is not None and found.left_out >= 2 * len(views) - 2
     assert abs(found.lens.fx / true.fx - 1) < 0.001
 
 
 def test_a_board_that_was_always_parallel_leaves_the_focal_length_open():
     true = LENSES["pinhole"]
-    flat = estimated(views_of(true, parallel(BOARD, true, 20, 5)), BOARD, MODELS["pinhole"], WIDTH, HEIGHT)
+    flat = estimate_lens(views_of(true, parallel(BOARD, true, 20, 5)), BOARD, MODELS["pinhole"], WIDTH, HEIGHT)
     assert flat is None or flat.focal_sigma > ENOUGH.focal
 
 
 def test_views_of_another_board_fit_no_lens():
     true = LENSES["pinhole"]
     views = views_of(true, waved(BOARD, true, 12, 5))
-    found = estimated(views, Board(12, 7), MODELS["opencv2"], WIDTH, HEIGHT)
+    found = estimate_lens(views, Board(12, 7), MODELS["opencv2"], WIDTH, HEIGHT)
     assert found is None or found.rms_px > 1.0

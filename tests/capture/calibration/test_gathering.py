@@ -10,10 +10,10 @@ import pytest
 
 from splatnode.capture.calibration import command, gathering, thinning
 from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.corners import LEAST_CORNERS, View
-from splatnode.capture.calibration.coverage import nothing_seen, with_view
+from splatnode.capture.calibration.corners import LEAST_CORNERS, BoardView
+from splatnode.capture.calibration.coverage import add_view, create_coverage
 from splatnode.capture.calibration.gathering import MOST_VIEWS, Gathering
-from splatnode.capture.calibration.lacking import TooLittle, uncovered
+from splatnode.capture.calibration.lacking import TooLittle, describe_missing_coverage
 from splatnode.capture.calibration.models import MODELS
 from splatnode.capture.calibration.rotations import rotations
 from splatnode.capture.cameras import folder, v4l2
@@ -27,7 +27,9 @@ PICTURE = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
 TILTS = ((0.0, 0.0), (20.0, 0.0), (-20.0, 0.0), (0.0, 20.0), (0.0, -20.0))
 
 
-def shown(name: str, tilt: Sequence[float], place: tuple[float, float], share: float, right_end: float = WIDTH) -> View:
+def shown(
+    name: str, tilt: Sequence[float], place: tuple[float, float], share: float, right_end: float = WIDTH
+) -> BoardView:
     """The board tilted by degrees, its middle at a place in the picture of whose width it takes a share."""
     distance = BOARD.columns * BOARD.square_mm * FOCAL / (share * WIDTH)
     middle = np.array([*(np.array(place) - (WIDTH / 2, HEIGHT / 2)) * distance / FOCAL, distance])
@@ -36,10 +38,10 @@ def shown(name: str, tilt: Sequence[float], place: tuple[float, float], share: f
     pixels = FOCAL * points[:, :2] / points[:, 2:] + (WIDTH / 2, HEIGHT / 2)
     seen = ((pixels > 5) & (pixels < (right_end - 5, HEIGHT - 5))).all(axis=1)
     noise = np.random.default_rng(len(name)).normal(0, 0.05, pixels.shape)
-    return View(name, np.flatnonzero(seen), (pixels + noise)[seen])
+    return BoardView(name, np.flatnonzero(seen), (pixels + noise)[seen])
 
 
-def by_chance(count: int, left: int, tilted_from: int = 0) -> dict[str, View]:
+def by_chance(count: int, left: int, tilted_from: int = 0) -> dict[str, BoardView]:
     """Views at random places; the first ones are in the picture's `left` half, or parallel to it, alone."""
     rng, found = np.random.default_rng(0), {}
     while len(found) < count:
@@ -54,16 +56,16 @@ def by_chance(count: int, left: int, tilted_from: int = 0) -> dict[str, View]:
     return found
 
 
-def frames(views: dict[str, View], times: int) -> list[Frame]:
+def frames(views: dict[str, BoardView], times: int) -> list[Frame]:
     names = [name for name in views for _ in range(times)]
     return [Frame(number, name, number, PICTURE, None) for number, name in enumerate(names)]
 
 
 @pytest.fixture
-def finding(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, View]], None]:
+def finding(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, BoardView]], None]:
     """Pictures show the views of their names, without being looked at."""
 
-    def find(views: dict[str, View]) -> None:
+    def find(views: dict[str, BoardView]) -> None:
         monkeypatch.setattr(gathering, "corner_finder", lambda board: lambda name, image: views[name])
 
     return find
@@ -83,8 +85,8 @@ def test_of_two_views_near_each_other_the_one_that_is_nearer_to_a_third_is_super
     places = {"a": (500.0, 375.0), "b": (504.0, 375.0), "c": (512.0, 375.0), "low": (504.0, 640.0)}
     a, b, c, low = (shown(name, (0.0, 0.0), place, 0.3) for name, place in places.items())
     apart = np.array([[np.inf, 4.0, 12.0], [4.0, np.inf, 8.0], [12.0, 8.0, np.inf]])
-    assert thinning.superfluous([a, b, c], apart, WIDTH, HEIGHT) == 1
-    assert thinning.superfluous([a, low, c], apart, WIDTH, HEIGHT) == 0
+    assert thinning.find_redundant_view([a, b, c], apart, WIDTH, HEIGHT) == 1
+    assert thinning.find_redundant_view([a, low, c], apart, WIDTH, HEIGHT) == 0
 
 
 def test_of_too_many_views_those_are_kept_that_see_all_that_was_seen(finding):
@@ -94,11 +96,15 @@ def test_of_too_many_views_those_are_kept_that_see_all_that_was_seen(finding):
     for frame in frames(views, 1):
         of_photographs.take(frame)
     assert len(of_photographs.views) == MOST_VIEWS < of_photographs.kept and of_photographs.is_full
-    seen = nothing_seen(WIDTH, HEIGHT)
+    seen = create_coverage(WIDTH, HEIGHT)
     for view in of_photographs.views:
-        seen = with_view(seen, view)
+        seen = add_view(seen, view)
     coverage = of_photographs.coverage
-    assert coverage is not None and np.array_equal(seen.seen, coverage.seen) and uncovered(coverage) is None
+    assert (
+        coverage is not None
+        and np.array_equal(seen.seen, coverage.seen)
+        and describe_missing_coverage(coverage) is None
+    )
 
 
 class FromFrames:
@@ -123,7 +129,7 @@ def focal_by(monkeypatch: pytest.MonkeyPatch, opened: FromFrames, live: bool) ->
     monkeypatch.setattr(command, "Reader", lambda opener, _live, config: Reader(opener, False, config))
     camera = Camera("v4l2", v4l2.Config()) if live else Camera("folder", folder.Config(Path("photographs")))
     config = CaptureConfig(camera, reader=Config())
-    choice, _ = command._shown(config, BOARD, [MODELS["pinhole"]], None, lambda _: None)
+    choice, _ = command._calibrate_stream(config, BOARD, [MODELS["pinhole"]], None, lambda _: None)
     return choice.taken.estimate.lens.fx
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.calibration.models import MODELS
-from splatnode.capture.calibration.projection import projected
+from splatnode.capture.calibration.projection import project_points
 from splatnode.capture.lenses import lens as lenses
 
 RNG = np.random.default_rng(0)
@@ -33,23 +33,23 @@ def points_of(name: str) -> np.ndarray:
 def test_pixels_are_those_of_the_lens_that_is_written(name: str):
     points = points_of(name)
     lens = MODELS[name].lens(numbers_of(name), 640, 480)
-    found = projected(points, numbers_of(name), MODELS[name].kind).pixels
+    found = project_points(points, numbers_of(name), MODELS[name].kind).pixels
     assert np.abs(found - lenses.project(points, lens)).max() < 1e-6
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_derivatives_are_those_of_small_steps(name: str):
     points, numbers, kind, step = points_of(name)[:-1], numbers_of(name), MODELS[name].kind, 1e-6
-    found = projected(points, numbers, kind)
+    found = project_points(points, numbers, kind)
     for axis in range(3):
         way = step * np.eye(3)[axis]
-        change = projected(points + way, numbers, kind).pixels - projected(points - way, numbers, kind).pixels
+        change = project_points(points + way, numbers, kind).pixels - project_points(points - way, numbers, kind).pixels
         assert np.allclose(found.by_point[:, :, axis], change / (2 * step), rtol=1e-5, atol=1e-3)
     for number in range(len(numbers)):
         way = step * np.eye(len(numbers))[number]
-        change = projected(points, numbers + way, kind).pixels - projected(points, numbers - way, kind).pixels
+        change = project_points(points, numbers + way, kind).pixels - project_points(points, numbers - way, kind).pixels
         assert np.allclose(found.by_lens[:, :, number], change / (2 * step), rtol=1e-5, atol=1e-3)
 
 
 def test_a_radial_lens_sees_nothing_behind_it():
-    assert np.isnan(projected(np.array([[0.1, 0.2, -1.0]]), numbers_of("opencv5"), "opencv").pixels).all()
+    assert np.isnan(project_points(np.array([[0.1, 0.2, -1.0]]), numbers_of("opencv5"), "opencv").pixels).all()

@@ -4,11 +4,11 @@ import numpy as np
 import yaml
 
 from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.corners import View
-from splatnode.capture.calibration.coverage import nothing_seen, with_view
+from splatnode.capture.calibration.corners import BoardView
+from splatnode.capture.calibration.coverage import add_view, create_coverage
 from splatnode.capture.calibration.hold_out import Choice, choose
 from splatnode.capture.calibration.models import MODELS
-from splatnode.capture.calibration.report import lens_file, told
+from splatnode.capture.calibration.report import describe_choice, lens_file
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.lenses import lens as lenses
@@ -18,14 +18,14 @@ BOARD = Board()
 LENS = Intrinsics(640, 480, 620.0, 620.0, 325.0, 236.0, "given")
 
 
-def found(stretch: float) -> tuple[Choice, list[View]]:
+def found(stretch: float) -> tuple[Choice, list[BoardView]]:
     """The lens from a board that was printed so many times too wide."""
     rng, views = np.random.default_rng(0), []
     for number, T in enumerate(waved(BOARD, LENS, 20, 1)):
         points = BOARD.corners * (stretch, 1.0, 1.0)
         pixels = lenses.project(points @ T[:3, :3].T + T[:3, 3], LENS) + rng.normal(0, 0.03, (len(points), 2))
         inside = np.flatnonzero(((pixels > 0) & (pixels < (640, 480))).all(axis=1))
-        views.append(View(str(number), inside, pixels[inside]))
+        views.append(BoardView(str(number), inside, pixels[inside]))
     choice = choose(views, BOARD, 640, 480, [MODELS["pinhole"]])
     assert choice is not None
     return choice, views
@@ -34,14 +34,14 @@ def found(stretch: float) -> tuple[Choice, list[View]]:
 def test_a_board_that_was_printed_too_wide_is_warned_of():
     straight, views = found(1.0)
     stretched, _ = found(1.02)
-    coverage = with_view(nothing_seen(640, 480), views[0])
-    assert "fx and fy differ" not in " ".join(told(straight, coverage))
-    assert "fx and fy differ by" in " ".join(told(stretched, coverage))
+    coverage = add_view(create_coverage(640, 480), views[0])
+    assert "fx and fy differ" not in " ".join(describe_choice(straight, coverage))
+    assert "fx and fy differ by" in " ".join(describe_choice(stretched, coverage))
 
 
 def test_the_file_is_the_lens_and_says_how_well_it_is_known(tmp_path):
     choice, views = found(1.0)
-    text = lens_file(choice, with_view(nothing_seen(640, 480), views[0]), BOARD)
+    text = lens_file(choice, add_view(create_coverage(640, 480), views[0]), BOARD)
     (tmp_path / "lens.yaml").write_text(text)
     lens = read_lens(tmp_path / "lens.yaml")
     assert abs(lens.fx - choice.taken.estimate.lens.fx) < 1e-4 and lens.distortion == ()

@@ -13,7 +13,7 @@ from splatnode.capture.diorama.building.plan import CORRIDOR, ZONES, zones_at
 from splatnode.capture.diorama.building.rooms import CHAIR_ROOM, LOOK_ALIKES, MIRROR_ROOM
 from splatnode.capture.diorama.look_at import look_at
 from splatnode.capture.frame import Frame
-from splatnode.capture.process.config import typed
+from splatnode.capture.process.config import parse_config
 from splatnode.capture.stamp import Clock, Stamp
 
 TINY = building.Config(width=96, height=72, samples=1)
@@ -36,7 +36,7 @@ def tours(room: int) -> list[tuple[int, int]]:
 
 
 def test_it_is_a_camera_of_capture_whose_photographs_are_made_when_they_are_asked_for():
-    config = typed({"camera": {"kind": "building", "width": 96, "height": 72}}, CaptureConfig)
+    config = parse_config({"camera": {"kind": "building", "width": 96, "height": 72}}, CaptureConfig)
     assert config.camera.config.keyframes == 1000
     stream = camera_opener(config.camera)()
     first, second = next(stream), next(stream)
@@ -48,10 +48,10 @@ def test_it_is_a_camera_of_capture_whose_photographs_are_made_when_they_are_aske
 
 
 def test_same_seed_same_pixels_and_another_seed_another_building():
-    photograph = building.photograph(TINY, 7)
+    photograph = building.render_image(TINY, 7)
     interior.cache_clear()
-    assert np.array_equal(photograph, building.photograph(msgspec.structs.replace(TINY, keyframes=20), 7))
-    other = building.photograph(msgspec.structs.replace(TINY, seed=1), 7)
+    assert np.array_equal(photograph, building.render_image(msgspec.structs.replace(TINY, keyframes=20), 7))
+    other = building.render_image(msgspec.structs.replace(TINY, seed=1), 7)
     assert np.abs(photograph.astype(int) - other).mean() > 15
 
 
@@ -71,7 +71,7 @@ def test_the_camera_goes_in_small_steps_and_stays_in_the_building():
 
 
 def test_neighbours_show_mostly_the_same():
-    shares = [building.shared_surface(TINY, index, index + 1) for index in range(0, 130, 3)]
+    shares = [building.measure_shared_surface(TINY, index, index + 1) for index in range(0, 130, 3)]
     assert min(shares) > 0.4 and np.median(shares) > 0.7
 
 
@@ -86,12 +86,12 @@ def test_rooms_are_toured_again_and_the_corridor_is_walked_both_ways():
 def test_a_tour_of_a_room_shows_what_an_earlier_one_showed_and_another_room_does_not():
     (first, last), (again, until), *_ = tours(CHAIR_ROOM)
     earlier, later = range(first + 4, last - 6, 3), range(again, until, 3)
-    back = [max(building.shared_surface(TINY, a, b) for b in later) for a in earlier]
+    back = [max(building.measure_shared_surface(TINY, a, b) for b in later) for a in earlier]
     assert min(back) > 0.5
     assert any(building.same_place(TINY, earlier[3], index) for index in later)
     elsewhere = tours(3)[0][0]
     inside, there = range(first, first + 16, 3), range(elsewhere + 8, elsewhere + 26, 3)  # of both, before a door shows
-    assert not any(building.shared_surface(TINY, a, b) > 0.1 for a in inside for b in there)
+    assert not any(building.measure_shared_surface(TINY, a, b) > 0.1 for a in inside for b in there)
 
 
 def test_two_rooms_have_one_paper_and_other_arrangements():
@@ -147,16 +147,16 @@ def test_a_mirrored_camera_mirrored_again_is_itself():
     zone = interior(0, building.state(TINY, 0).density, MIRROR_ROOM)
     assert zone.mirror is not None
     camera = building.scene_camera(TINY, 3)
-    once = view.mirrored(zone.solids[zone.mirror], camera)
+    once = view.mirror_camera(zone.solids[zone.mirror], camera)
     assert np.linalg.det(once[0][:3, :3]) == pytest.approx(-1)
-    assert np.allclose(view.mirrored(zone.solids[zone.mirror], once)[0], camera[0])
+    assert np.allclose(view.mirror_camera(zone.solids[zone.mirror], once)[0], camera[0])
 
 
 def test_some_keyframes_in_a_row_show_a_blank_wall_and_few():
     first, last = tours(3)[1][1], tours(1)[0][0]  # on the way from one to the other it goes to the blank end
     blank = []
     for index in range(first + 20, last - 20):
-        photograph = building.photograph(msgspec.structs.replace(TINY, noise=0.0), index).mean(-1)
+        photograph = building.render_image(msgspec.structs.replace(TINY, noise=0.0), index).mean(-1)
         detail = np.abs(np.diff(photograph, axis=1))
         blank.append((detail > 6).mean() < 0.1)
     runs = [len(list(group)) for is_blank, group in itertools.groupby(blank) if is_blank]
@@ -165,19 +165,19 @@ def test_some_keyframes_in_a_row_show_a_blank_wall_and_few():
 
 def test_a_held_out_camera_lies_between_its_neighbours():
     before, after = (building.scene_camera(TINY, index)[0][:3, 3] for index in (20, 21))
-    held_out = building.held_out_camera(TINY, 20)[0][:3, 3]
+    held_out = building.evaluation_camera(TINY, 20)[0][:3, 3]
     gap = np.linalg.norm(after - before)
     assert max(np.linalg.norm(held_out - before), np.linalg.norm(held_out - after)) < 0.7 * gap
 
 
 def test_a_kidnapped_robot_goes_on_in_another_room():
     kidnapped = msgspec.structs.replace(TINY, kidnap_at=30)
-    assert np.array_equal(building.photograph(TINY, 29), building.photograph(kidnapped, 29))
+    assert np.array_equal(building.render_image(TINY, 29), building.render_image(kidnapped, 29))
     steps = [
         np.linalg.norm(building.scene_camera(config, 30)[0][:3, 3] - building.scene_camera(config, 29)[0][:3, 3])
         for config in (TINY, kidnapped)
     ]
     assert steps[0] < 0.42 and steps[1] > 3
     assert building.room(TINY, 30) != building.room(kidnapped, 30) is not None
-    assert building.shared_surface(kidnapped, 29, 30) < 0.05
+    assert building.measure_shared_surface(kidnapped, 29, 30) < 0.05
     assert len([building.scene_camera(kidnapped, index) for index in range(990, 1000)]) == 10

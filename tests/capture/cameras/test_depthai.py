@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import depthai as oak
-from splatnode.capture.cameras.depthai import Config, Source, find, read, stream, to_frame, to_pair
+from splatnode.capture.cameras.depthai import Config, Source, convert_frame, convert_stereo_pair, find, read, stream
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.right_image import Baseline
@@ -123,7 +123,7 @@ def use(monkeypatch, fake):
 
 def framed(message, frame_id: int) -> Frame:
     """The frame of a message that is one."""
-    frame = to_frame(message, frame_id)
+    frame = convert_frame(message, frame_id)
     assert isinstance(frame, Frame)
     return frame
 
@@ -143,7 +143,7 @@ def test_a_frame_has_its_own_calibration():
 
 def test_a_frame_has_the_exposure_that_the_camera_tells():
     assert framed(message(), 0).exposure == ExposureSettings(0.008, 200.0)
-    left = to_pair(Baseline(0.075), pair(), 0)
+    left = convert_stereo_pair(Baseline(0.075), pair(), 0)
     assert isinstance(left, Frame) and left.exposure == ExposureSettings(0.008, 200.0)
 
 
@@ -248,7 +248,7 @@ def test_depthais_own_replay(tmp_path, monkeypatch):
         pipeline.start()
         frames = []
         with pytest.raises(CameraUnavailable, match="ended its stream"):
-            for frame in read(dai, Source(queue, (), to_frame), Config(lock=False), hold=lambda: None):
+            for frame in read(dai, Source(queue, (), convert_frame), Config(lock=False), hold=lambda: None):
                 frames.append(frame)
     assert len(frames) >= 10
     assert all(frame.image.shape == (120, 160, 3) and frame.intrinsics is None for frame in frames)
@@ -339,7 +339,7 @@ def test_stereo_cameras_without_a_calibration_say_so(monkeypatch, baseline):
 
 
 def test_a_right_picture_of_another_size_leaves_the_pair_out():
-    left_out = to_pair(Baseline(0.075), pair(shape=(60, 80)), 0)
+    left_out = convert_stereo_pair(Baseline(0.075), pair(shape=(60, 80)), 0)
     assert isinstance(left_out, DroppedFrame) and "its right image cannot be used" in left_out.reason
 
 

@@ -12,7 +12,7 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_pose import LARGEST_M, GivenPose
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, to_message
+from splatnode.capture.messaging.keyframe_messages import FrameHeader, encode_frame
 from splatnode.capture.messaging.wire import Numbering, decode
 
 NAMES = ("1341847980.722988.png", "1341847981.000000.png", "1341847982.500000.png")
@@ -51,7 +51,7 @@ def test_poses_by_name_go_with_the_keyframes(photographs, tmp_path):
     assert first is None and third is None and second is not None
     keyframe = frames[1]
     assert isinstance(keyframe, Frame)
-    assert decode(to_message(keyframe, Numbering()), FrameHeader).header.given_pose == second
+    assert decode(encode_frame(keyframe, Numbering()), FrameHeader).header.given_pose == second
     assert np.allclose(second.matrix[:3, 3], (1, 2, 3)) and second.sigma_m == 0.01
 
 

@@ -21,7 +21,7 @@ from splatnode.capture import film
 from splatnode.capture.cameras.mcap import Config, image_topics, stream
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.logged import mcap
-from splatnode.capture.logged.mcap import UnusableLog, unpacked
+from splatnode.capture.logged.mcap import UnusableLog, unpack_chunk
 from splatnode.capture.stamp import Clock, Stamp
 from tests.support.mcap_files import START_NS, STEP_NS, as_json, calibration, compressed, raw, write
 
@@ -103,17 +103,17 @@ def chunk(compression, data, size):
 
 @pytest.mark.parametrize("name, compress", [("lz4", lz4.frame.compress), ("zstd", zstandard.compress)])
 def test_a_chunk_is_decompressed_as_far_as_it_says_that_it_goes(name, compress):
-    (told,) = unpacked(chunk(name, compress(SCHEMA), len(SCHEMA)))
+    (told,) = unpack_chunk(chunk(name, compress(SCHEMA), len(SCHEMA)))
     assert told.name == "a"
     bomb = compress(bytes(1 << 26))
     tracemalloc.start()
     with pytest.raises(UnusableLog, match="says that it holds 1000 bytes, and holds more or fewer"):
-        list(unpacked(chunk(name, bomb, 1000)))
+        list(unpack_chunk(chunk(name, bomb, 1000)))
     most_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most_bytes < 1 << 22
     with pytest.raises(UnusableLog, match="more or fewer"):
-        list(unpacked(chunk(name, compress(SCHEMA), len(SCHEMA) + 1)))
+        list(unpack_chunk(chunk(name, compress(SCHEMA), len(SCHEMA) + 1)))
 
 
 def test_an_index_that_leads_nowhere_is_told(tmp_path):
@@ -161,8 +161,8 @@ def test_a_chunk_that_an_index_names_often_is_unpacked_once(tmp_path, monkeypatc
     places = chunk_places(file)
     assert len(places) > 1
     indexed_anew(file, places * 3000)
-    read, asked = mcap.unpacked, []
-    monkeypatch.setattr(mcap, "unpacked", lambda record: asked.append(record) or read(record))
+    read, asked = mcap.unpack_chunk, []
+    monkeypatch.setattr(mcap, "unpack_chunk", lambda record: asked.append(record) or read(record))
     assert len(list(mcap.messages(file, {"/image"}))) == 6
     assert len(asked) == len(places)
 
@@ -179,7 +179,7 @@ def test_a_chunk_within_another_one_is_refused(tmp_path):
 def test_the_records_of_a_chunk_are_not_in_memory_at_once():
     data = SCHEMA * 10_000
     tracemalloc.start()
-    assert sum(1 for _ in unpacked(chunk("", data, len(data)))) == 10_000
+    assert sum(1 for _ in unpack_chunk(chunk("", data, len(data)))) == 10_000
     most_bytes = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most_bytes < 2 * len(data)
@@ -187,9 +187,9 @@ def test_the_records_of_a_chunk_are_not_in_memory_at_once():
 
 def test_a_chunk_that_was_changed_is_refused():
     with pytest.raises(UnusableLog, match="its checksum is another one"):
-        list(unpacked(replace(chunk("", SCHEMA, len(SCHEMA)), uncompressed_crc=5)))
+        list(unpack_chunk(replace(chunk("", SCHEMA, len(SCHEMA)), uncompressed_crc=5)))
     with pytest.raises(UnusableLog, match="compressed by lz4, zstd or not, it is by 'bz2'"):
-        list(unpacked(chunk("bz2", SCHEMA, len(SCHEMA))))
+        list(unpack_chunk(chunk("bz2", SCHEMA, len(SCHEMA))))
 
 
 def test_an_image_that_cannot_be_decoded_costs_only_itself(tmp_path):

@@ -79,7 +79,7 @@ def test_cameras_are_rigid_upright_and_ten_degrees_apart():
 
 
 def test_held_out_cameras_lie_between_the_training_cameras():
-    cameras, held_out = synthetic.scene_cameras(SMALL), synthetic.held_out_cameras(SMALL)
+    cameras, held_out = synthetic.scene_cameras(SMALL), synthetic.evaluation_cameras(SMALL)
     assert len(held_out) == SMALL.views - 1
     centres = np.array([T[:3, 3] for T, _ in cameras])
     for index, (T_world_camera, _) in enumerate(held_out):
@@ -91,7 +91,7 @@ def test_depth_and_cameras_predict_where_the_next_view_sees_a_point():
     """Pixels moved by true depth and true cameras show the same colours: images, depth and cameras agree."""
     config = msgspec.structs.replace(SMALL, noise=0.0)
     (T_a, K), (T_b, _) = synthetic.scene_cameras(config)[:2]
-    image_a, image_b = (synthetic.photograph(config, camera).astype(np.float32) for camera in ((T_a, K), (T_b, K)))
+    image_a, image_b = (synthetic.render_image(config, camera).astype(np.float32) for camera in ((T_a, K), (T_b, K)))
     depth_a, depth_b = (synthetic.depth(config, index) for index in (0, 1))
     assert np.isfinite(depth_a).all() and depth_a.min() > 1 and depth_a.max() < 6
     u, v = np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5)
@@ -177,7 +177,7 @@ def test_through_a_fisheye_each_pixel_shows_what_a_pinhole_sees_along_its_ray():
     straight = Config(width=256, height=192, views=2, noise=0.0, samples=1)  # of a place with as many texels
     T_world_camera = synthetic.scene_cameras(config)[0][0]
     K = np.array([[64.0, 0, 128], [0, 64, 96], [0, 0, 1]])
-    seen, depth = (make(straight, (T_world_camera, K)) for make in (synthetic.photograph, synthetic.depth_map))
+    seen, depth = (make(straight, (T_world_camera, K)) for make in (synthetic.render_image, synthetic.depth_map))
     pixels = np.stack(np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5), -1).reshape(-1, 2)
     rays = unproject(pixels, lens)
     at = rays[:, :2] / rays[:, 2:] * 64 + (128, 96)

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.cameras.video import Config, stream
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.pace import paced
+from splatnode.capture.pace import pace_frames
 from splatnode.capture.stamp import Clock, Stamp
 from tests.support.clips import level_images, turn, write_clip, write_sound
 
@@ -116,11 +116,11 @@ def frame(stamp_ns):
 def test_the_recorded_pace():
     items = [DroppedFrame("x", "blurred"), frame(10**12), frame(10**12 + 50_000_000), frame(10**12 + 150_000_000)]
     start = time.monotonic()
-    assert list(paced(items, "recorded")) == items
+    assert list(pace_frames(items, "recorded")) == items
     assert time.monotonic() - start >= 0.15
     hour = [frame(10**12), frame(10**12 + 3600 * 10**9)]
     start = time.monotonic()
-    assert list(paced(hour, "fastest")) == hour
+    assert list(pace_frames(hour, "fastest")) == hour
     assert time.monotonic() - start < 60
 
 

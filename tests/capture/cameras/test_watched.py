@@ -19,9 +19,9 @@ from splatnode.capture.cameras.watched import Config, stream
 from splatnode.capture.config import Camera, camera_opener
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.nothing_new import NothingNew
+from splatnode.capture.nothing_new import KeepAlive
 from splatnode.capture.reader import Config as ReaderConfig
-from splatnode.capture.reader import Reader, State
+from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.cameras.test_folder import with_exif
@@ -41,7 +41,7 @@ def watch(folder, **config) -> Any:
 
 def opened(opener) -> Any:
     """The photographs of one opening."""
-    return (item for item in opener() if not isinstance(item, NothingNew))
+    return (item for item in opener() if not isinstance(item, KeepAlive))
 
 
 def slowly(path, data, pieces=6, pause_s=0.03):
@@ -212,9 +212,9 @@ def test_a_folder_that_is_back_is_no_longer_lost_though_nothing_new_is_in_it(tmp
         with Reader(camera_opener(Camera("watched", Config(folder, **QUICK)), mask), False, config) as reader:
             assert reader.next(60) is not None
             folder.rename(away)
-            wait_for(lambda: reader.state is State.DEGRADED)
+            wait_for(lambda: reader.state is ReaderState.DEGRADED)
             away.rename(folder)
-            wait_for(lambda: reader.state is State.STREAMING and not reader.why)
+            wait_for(lambda: reader.state is ReaderState.STREAMING and not reader.why)
 
 
 def test_photographs_that_are_gone_and_come_back_are_not_taken_again(tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 
 WIDTH, HEIGHT = 320, 240
 
@@ -44,7 +44,7 @@ def centres(image: np.ndarray) -> np.ndarray:
 def test_points_are_where_the_pinhole_says(given: Intrinsics):
     frame, points = dots(given.resized(WIDTH, HEIGHT))
     frame = Frame(0, "a.png", 0, frame.image, given)
-    straight = undistorted(frame)
+    straight = undistort_frame(frame)
     pinhole = straight.intrinsics
     assert pinhole is not None and pinhole.fx == pinhole.fy and not pinhole.distortion
     assert (pinhole.width, pinhole.height) == (WIDTH, HEIGHT) == (straight.width, straight.height)
@@ -60,8 +60,8 @@ def test_points_are_where_the_pinhole_says(given: Intrinsics):
 def test_no_corner_is_invented():
     given = Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 160.0, 120.0, "given", (0.2, 0.0, 0.0, 0.0))
     grey = Frame(0, "a.png", 0, np.full((HEIGHT, WIDTH, 3), 90, np.uint8), given)
-    assert (undistorted(grey).image == 90).all()
-    pinhole = undistorted(grey).intrinsics
+    assert (undistort_frame(grey).image == 90).all()
+    pinhole = undistort_frame(grey).intrinsics
     assert pinhole is not None
     corner = np.array([-pinhole.cx / pinhole.fx, -pinhole.cy / pinhole.fy])
     distorted = corner * (1 + 0.2 * (corner**2).sum()) * 300.0 + (160.0, 120.0)
@@ -71,12 +71,12 @@ def test_no_corner_is_invented():
 def test_what_is_straight_stays_as_it_is():
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     unknown = Frame(0, "a.png", 0, image, None)
-    assert undistorted(unknown) is unknown
+    assert undistort_frame(unknown) is unknown
     pinhole = Frame(0, "a.png", 0, image, Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 160.0, 120.0, "exif"))
-    assert undistorted(pinhole) is pinhole
+    assert undistort_frame(pinhole) is pinhole
 
 
 def test_coefficients_that_cannot_be_are_named():
     given = Intrinsics(WIDTH, HEIGHT, 200.0, 200.0, 160.0, 120.0, "given", (-2.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="a.png.*alibrat"):
-        undistorted(Frame(0, "a.png", 0, np.zeros((HEIGHT, WIDTH, 3), np.uint8), given))
+        undistort_frame(Frame(0, "a.png", 0, np.zeros((HEIGHT, WIDTH, 3), np.uint8), given))

@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.lens import project, unproject
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.lenses.wide_pinhole import MOST_DEG
 
 WIDTH, HEIGHT = 640, 480
@@ -30,7 +30,7 @@ def seen(lens: Intrinsics) -> Frame:
 
 @pytest.mark.parametrize("across_deg", [120.0, 170.0])
 def test_a_pixel_of_the_pinhole_shows_its_ray(across_deg):
-    frame = undistorted(seen(equidistant(across_deg)))
+    frame = undistort_frame(seen(equidistant(across_deg)))
     pinhole = frame.intrinsics
     assert pinhole is not None and pinhole.model == "opencv" and pinhole.fx == pinhole.fy and not pinhole.distortion
     assert (frame.width, frame.height) == (pinhole.width, pinhole.height)
@@ -45,13 +45,13 @@ def test_a_pixel_of_the_pinhole_shows_its_ray(across_deg):
 
 
 def test_the_pinhole_of_120_degrees_keeps_what_the_fisheye_has_up_and_down():
-    pinhole = undistorted(seen(equidistant(120.0))).intrinsics
+    pinhole = undistort_frame(seen(equidistant(120.0))).intrinsics
     assert pinhole is not None and abs(math.degrees(math.atan(pinhole.cy / pinhole.fy)) - 45.0) < 0.2
 
 
 def test_what_the_fisheye_did_not_see_is_masked():
     lens = Intrinsics(WIDTH, HEIGHT, 240, 240, WIDTH / 2, HEIGHT / 2, "given", (0.8,), "fisheye")  # a pincushion
-    frame = undistorted(seen(lens))
+    frame = undistort_frame(seen(lens))
     assert frame.mask is not None and 0.5 < frame.mask.mean() < 1 and not frame.mask[0, 0]
     pixels = np.stack(np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5), -1).reshape(-1, 2)
     assert frame.intrinsics is not None
@@ -64,7 +64,7 @@ def test_a_mask_goes_with_its_photograph():
     plain = seen(equidistant(120.0))
     used = np.ones((HEIGHT, WIDTH), bool)
     used[:, : WIDTH // 2] = False
-    frame = undistorted(Frame(0, "a.png", 0, plain.image, plain.intrinsics, mask=used))
+    frame = undistort_frame(Frame(0, "a.png", 0, plain.image, plain.intrinsics, mask=used))
     assert frame.mask is not None
     assert not frame.mask[:, : frame.width // 2 - 1].any() and frame.mask[:, frame.width // 2 + 2 :].all()
 
@@ -79,4 +79,4 @@ def test_a_mask_goes_with_its_photograph():
 )
 def test_what_no_fisheye_can_be_is_one_sentence(lens, said):
     with pytest.raises(ValueError, match=f"a.png: .*{said}"):
-        undistorted(Frame(0, "a.png", 0, np.zeros((HEIGHT, WIDTH, 3), np.uint8), lens))
+        undistort_frame(Frame(0, "a.png", 0, np.zeros((HEIGHT, WIDTH, 3), np.uint8), lens))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.lerobot import tables
-from splatnode.capture.lerobot.data_set import UnusableDataSet, film, parts
+from splatnode.capture.lerobot.data_set import UnusableDataSet, film, list_parts
 from tests.support.lerobot_sets import write
 
 pa = pytest.importorskip("pyarrow", reason="needs pyarrow")
@@ -46,7 +46,7 @@ def test_rows_are_counted_before_they_are_read(folder):
     file = put(folder, columns(pa.array(np.zeros(3_000_000, np.int64))))
     assert file.stat().st_size < 100_000
     with pytest.raises(UnusableDataSet, match="at most 1000000 rows, it has 3000000; split it"):
-        parts(folder)
+        list_parts(folder)
 
 
 def test_rows_of_all_files_together_are_bounded(folder):
@@ -54,7 +54,7 @@ def test_rows_of_all_files_together_are_bounded(folder):
     for index in range(1, 3):
         (file.parent / f"file-00{index}.parquet").write_bytes(file.read_bytes())
     with pytest.raises(UnusableDataSet, match="at most 1000000 rows, it has more"):
-        parts(folder)
+        list_parts(folder)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_rows_of_all_files_together_are_bounded(folder):
 def test_numbers_of_episodes_are_whole_and_within_bounds(folder, episodes, told):
     put(folder, columns(episodes))
     with pytest.raises(UnusableDataSet, match=told):
-        parts(folder)
+        list_parts(folder)
 
 
 @pytest.mark.parametrize("value", [1e300, -1.0, 0.5, float("inf"), float("nan")])
@@ -92,7 +92,7 @@ def test_texts_that_unfold_to_gigabytes_end_the_process_that_reads_them_and_no_o
         folder, columns(pa.array(range(1000))).append_column("task", text), compression="zstd", store_schema=False
     )
     assert file.stat().st_size < 100_000
-    assert len(parts(folder)) == 1000, "what is not needed is not read"
+    assert len(list_parts(folder)) == 1000, "what is not needed is not read"
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(UnusableDataSet, match="the table: .*(memory|cannot be read|ended)"):
         tables.check_whole(file, UnusableDataSet, "the table")
@@ -104,7 +104,7 @@ def test_a_directory_longer_than_its_file_is_refused(folder, length):
     file = put(folder, columns(pa.array([0])))
     file.write_bytes(file.read_bytes()[:-8] + struct.pack("<I", length) + b"PAR1")
     with pytest.raises(UnusableDataSet, match="its directory must have at most|cannot be read"):
-        parts(folder)
+        list_parts(folder)
 
 
 def test_damaged_bytes_are_refused_by_a_sentence(folder):
@@ -116,7 +116,7 @@ def test_damaged_bytes_are_refused_by_a_sentence(folder):
             damaged[place] = rng.integers(256)
         file.write_bytes(damaged)
         try:
-            assert len(parts(folder)) <= 2000
+            assert len(list_parts(folder)) <= 2000
         except UnusableDataSet as error:
             assert str(error).isprintable()
 
@@ -124,4 +124,4 @@ def test_damaged_bytes_are_refused_by_a_sentence(folder):
 def test_a_pipe_is_no_table(folder, tmp_path):
     os.mkfifo(folder / "meta" / "episodes" / "chunk-000" / "file-001.parquet")
     with pytest.raises(UnusableDataSet, match="must be a file, is a pipe or a device"):
-        parts(folder)
+        list_parts(folder)

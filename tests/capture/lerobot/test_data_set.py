@@ -15,11 +15,11 @@ import pytest
 from splatnode.capture import film
 from splatnode.capture.cameras import lerobot
 from splatnode.capture.lerobot import data_set
-from splatnode.capture.lerobot.data_set import UnusableDataSet, parts
+from splatnode.capture.lerobot.data_set import UnusableDataSet, list_parts
 from splatnode.capture.process import apart
 from splatnode.capture.video_process import VideoFrame
 from splatnode.command_line import main
-from splatnode.recon.replay_source import Request, source
+from splatnode.recon.replay_source import Request, load_source
 from tests.support.lerobot_sets import write
 
 pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
@@ -74,7 +74,7 @@ def check(found: list[Any]) -> None:
 
 
 def test_each_camera_of_each_episode_is_a_film(made):
-    assert parts(made) == [f"episode_{number:06d}/{key}" for number in range(3) for key in (TOP, WRIST)]
+    assert list_parts(made) == [f"episode_{number:06d}/{key}" for number in range(3) for key in (TOP, WRIST)]
     check(frames(made, f"episode_000001/{WRIST}"))
     check(frames(made, f"1/{WRIST}"))
     assert np.allclose(reds(frames(made, f"2/{TOP}")), (140, 160, 180, 200, 220), atol=6)
@@ -124,7 +124,7 @@ def test_another_version_is_refused_by_its_name(copy):
     (copy / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
     for given in (copy, film.part_of(copy, f"0/{TOP}")):
         with pytest.raises(UnusableDataSet, match=r"data set of version v3.0, it is of v2.1; convert it with LeRobot"):
-            source(Request(given))
+            load_source(Request(given))
 
 
 def test_a_data_set_without_videos_says_so(copy):
@@ -133,7 +133,7 @@ def test_a_data_set_without_videos_says_so(copy):
         feature["dtype"] = "image"
     (copy / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(UnusableDataSet, match="has no videos: .* pictures in the tables of data/ are not read"):
-        source(Request(copy))
+        load_source(Request(copy))
 
 
 def test_a_data_set_without_episodes_says_what_is_missing(copy):
@@ -141,13 +141,13 @@ def test_a_data_set_without_episodes_says_what_is_missing(copy):
     pq.write_table(pq.read_table(file).slice(0, 0), file)
     expected = r"copy' must have a row for each episode in meta/episodes/\*/\*.parquet; "
     with pytest.raises(UnusableDataSet, match=f"{expected}what is there has no rows: record an episode first"):
-        source(Request(copy))
+        load_source(Request(copy))
     with pytest.raises(UnusableDataSet, match="what is there has no rows"):
         frames(copy, f"1/{TOP}")
     file.unlink()
     for given in (copy, film.part_of(copy, f"1/{TOP}")):
         with pytest.raises(UnusableDataSet, match=f"{expected}there are no such files: copy or download the whole"):
-            source(Request(given))
+            load_source(Request(given))
 
 
 def test_without_pyarrow_it_says_what_pyarrow_is_needed_for(copy, monkeypatch, capsys):
@@ -174,7 +174,7 @@ def test_depth_is_no_camera(copy):
     info = json.loads((copy / "meta" / "info.json").read_text())
     info["features"][WRIST]["info"] = {"video.is_depth_map": True}
     (copy / "meta" / "info.json").write_text(json.dumps(info))
-    assert parts(copy) == [f"episode_{number:06d}/{TOP}" for number in range(3)]
+    assert list_parts(copy) == [f"episode_{number:06d}/{TOP}" for number in range(3)]
     assert len(frames(copy, "1")) == 3, "the only camera need not be named"
 
 
@@ -204,7 +204,7 @@ def test_what_is_not_there_is_told_with_what_is(made):
     with pytest.raises(UnusableDataSet, match=f"got '1/other'. The cameras are {TOP}, {WRIST}"):
         frames(made, "1/other")
     with pytest.raises(ValueError, match="is a LeRobot data set; name an episode and a camera of it, such as"):
-        source(Request(made))
+        load_source(Request(made))
 
 
 @pytest.mark.parametrize("path", ["/etc/{video_key}", "../{chunk_index}", "{nothing}", "{file_index:x9}"])
@@ -219,7 +219,7 @@ def test_a_video_path_leads_nowhere_else(copy, path):
 def test_an_info_that_is_none_is_told(copy, content):
     (copy / "meta" / "info.json").write_bytes(content)
     with pytest.raises(UnusableDataSet, match="info.json: cannot be read"):
-        parts(copy)
+        list_parts(copy)
 
 
 def test_the_camera_takes_a_configuration(made):

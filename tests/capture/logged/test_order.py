@@ -12,7 +12,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.logged import order
 from splatnode.capture.logged.mcap import topics
 from splatnode.capture.reader import Config as Reading
-from splatnode.capture.reader import Reader, State
+from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.stamp import Clock, Stamp
 from tests.support.mcap_files import START_NS, compressed, write
 
@@ -38,7 +38,7 @@ def read_frames(file: Path) -> list[tuple[int, int, Stamp | None]]:
     """The number, the time in the stream and the time of capture of each image, through the reader of `record`."""
     found = []
     with Reader(lambda: stream(Config(file)), live=False, config=Reading()) as reader:
-        while reader.state is not State.FINISHED:
+        while reader.state is not ReaderState.FINISHED:
             if (item := reader.next(0.05)) is not None:
                 assert isinstance(item, Frame), item
                 assert item.name == f"image_{len(found):06d}.png"

@@ -8,7 +8,7 @@ import zmq
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, received, to_message
+from splatnode.capture.messaging.keyframe_messages import FrameHeader, decode_frame, encode_frame
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Limits, Numbering, decode
 from splatnode.capture.right_image import Baseline, RightImage
@@ -20,7 +20,7 @@ RIGHT = RightImage(np.arange(55, dtype=np.uint8).reshape(5, 11), Baseline(0.075,
 
 def header(right=None) -> FrameHeader:
     """Of a frame with or without a right image."""
-    message = to_message(Frame(0, "a", 0, IMAGE, None, right=right), Numbering())
+    message = encode_frame(Frame(0, "a", 0, IMAGE, None, right=right), Numbering())
     return decode(message, FrameHeader).header
 
 
@@ -28,8 +28,8 @@ def header(right=None) -> FrameHeader:
 @pytest.mark.parametrize("mask", [None, MASK])
 def test_a_frame_arrives_with_its_mask_and_its_right_image(mask, right):
     numbering = Numbering()
-    parts = to_message(Frame(3, "a.png", 0, IMAGE, None, mask=mask, right=right), numbering)
-    found = received(Key(numbering.session, 0), [zmq.Frame(bytes(part)) for part in parts], Limits()).frame
+    parts = encode_frame(Frame(3, "a.png", 0, IMAGE, None, mask=mask, right=right), numbering)
+    found = decode_frame(Key(numbering.session, 0), [zmq.Frame(bytes(part)) for part in parts], Limits()).frame
     assert isinstance(found, Frame)
     assert found.mask is None if mask is None else np.array_equal(found.mask, mask)
     if right is None:

@@ -17,7 +17,7 @@ from splatnode.capture.messaging.network import files_for_strangers
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.crowd import network_of, next_to_go
-from splatnode.capture.process.limits import Limited
+from splatnode.capture.process.limits import LimitTooLow
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
 from tests.fuzz.siege import GREETING, HELLO
 from tests.support.node import descriptors
@@ -90,6 +90,6 @@ def test_what_strangers_may_take_is_left_free_or_the_start_is_refused(tmp_path, 
     assert files_for_strangers(ipc(tmp_path), 4) == 0
     needed = files_for_strangers(tcp(tmp_path), 4)
     assert needed >= 4 * PLACES
-    with pytest.raises(Limited, match="ulimit -n"):
+    with pytest.raises(LimitTooLow, match="ulimit -n"):
         monkeypatch.setattr("splatnode.capture.process.limits.resource.getrlimit", lambda _: (needed, needed))
         network_module.make_sure_of_room(needed, 0)

@@ -16,14 +16,14 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_pose import given_pose
-from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Refuse, Request, delivered
+from splatnode.capture.given_pose import make_given_pose
+from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Refuse, Request, add_delivery
 from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
 from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
 from splatnode.capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
 from splatnode.capture.messaging.wire import MAGIC, WireError, decode, encode
-from splatnode.capture.process.lock import Held
+from splatnode.capture.process.lock import LockHeld
 from splatnode.capture.stamp import Clock, Stamp
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
@@ -38,7 +38,7 @@ MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 
 def frame(index, size=(6, 8)):
     image = np.random.default_rng(index).integers(0, 256, (*size, 3)).astype(np.uint8)
     lens, captured_at = (INTRINSICS, Stamp(index + 10**18, Clock.UTC)) if index % 2 else (None, None)
-    pose = given_pose(MOVED, 0.02, 1.5) if index % 2 else None
+    pose = make_given_pose(MOVED, 0.02, 1.5) if index % 2 else None
     return Frame(index, f"{index}.png", index * 1000, image, lens, captured_at=captured_at, given_pose=pose)
 
 
@@ -89,19 +89,19 @@ def test_frames_arrive_in_order_and_leave_the_spool_when_acknowledged(tmp_path, 
         received = receive(server, client, 3)
         assert [one.sequence for one in received] == [0, 1, 2]
         settle(server, client)
-        assert server.queued == 7 and client.receive(0) is None  # its capacity is used up
+        assert server.num_queued == 7 and client.receive(0) is None  # its capacity is used up
         for one in received:
             assert_same(one.frame, frame(one.sequence))
             client.acknowledge(one)
         received = receive(server, client, 3)
-        assert server.queued == 4 and server.acknowledged == 3
+        assert server.num_queued == 4 and server.acknowledged == 3
         for one in received:
             client.acknowledge(one)
         (dropped,) = receive(server, client, 1)
         assert dropped.frame == DroppedFrame("blurred.png", "blurred: its edges are 9 px wide")
         client.acknowledge(dropped)
-        settle(server, client, lambda: server.queued == 0)
-        assert server.queued == 0 and client.duplicates == client.refused == server.refused == 0
+        settle(server, client, lambda: server.num_queued == 0)
+        assert server.num_queued == 0 and client.duplicates == client.refused == server.refused == 0
 
 
 def test_a_new_recon_gets_what_the_old_one_had_not_acknowledged(tmp_path):
@@ -112,11 +112,11 @@ def test_a_new_recon_gets_what_the_old_one_had_not_acknowledged(tmp_path):
         with KeyframeClient(network) as killed:
             first, second, _third = receive(server, killed, 3)
             killed.acknowledge(first)
-            settle(server, killed, lambda: server.queued == 2)
+            settle(server, killed, lambda: server.num_queued == 2)
         with KeyframeClient(network, seen=[first.key, second.key]) as client:  # the checkpoint also holds the second
             assert [one.sequence for one in receive(server, client, 1)] == [2]
-            settle(server, client, lambda: client.duplicates and server.queued == 1)
-            assert client.duplicates == 1 and server.queued == 1
+            settle(server, client, lambda: client.duplicates and server.num_queued == 1)
+            assert client.duplicates == 1 and server.num_queued == 1
 
 
 def test_a_restarted_capture_does_not_send_again_what_recon_holds(tmp_path):
@@ -134,12 +134,12 @@ def test_a_restarted_capture_does_not_send_again_what_recon_holds(tmp_path):
             assert client.duplicates == 0
             for one in (*held, new):
                 client.acknowledge(one)
-            settle(server, client, lambda: server.queued == 0)
+            settle(server, client, lambda: server.num_queued == 0)
 
 
 KILLED = """
 import os, pathlib, sys, numpy
-from splatnode.capture.process.lock import Held
+from splatnode.capture.process.lock import LockHeld
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframes import KeyframeServer
 from splatnode.capture.messaging.network import Network
@@ -167,7 +167,7 @@ def test_one_process_offers_keyframes(tmp_path):
     with KeyframeServer(ipc(tmp_path), open_spool(tmp_path)):
         with pytest.raises(AlreadyRunning):
             KeyframeServer(ipc(tmp_path), open_spool(tmp_path / "other"))
-        with pytest.raises(Held):
+        with pytest.raises(LockHeld):
             open_spool(tmp_path)
     open_spool(tmp_path / "other").close()  # the one that came too late has let go of its spool
 
@@ -197,7 +197,7 @@ def unusual_stamp(**parts):
 
 def unusual_pose(**parts):
     """A pose that no process of ours gives."""
-    made = given_pose(MOVED)
+    made = make_given_pose(MOVED)
     for name, part in parts.items():
         object.__setattr__(made, name, part)
     return made
@@ -268,8 +268,8 @@ def test_what_is_no_keyframe_is_refused_by_its_number_and_the_next_is_taken(tmp_
     network = ipc(tmp_path)
     with KeyframeClient(network) as client, impostor_of_capture(network, client) as send:
         for _ in range(2):  # a refused one that comes again is known
-            send(delivered(KEY, parts))
-        send(delivered(Key("0" * 32, 1), encode(changed(HEADER, sequence=1), [IMAGE])))
+            send(add_delivery(KEY, parts))
+        send(add_delivery(Key("0" * 32, 1), encode(changed(HEADER, sequence=1), [IMAGE])))
         received = client.receive(30)
         assert received.key.sequence == 1 and client.refused == 1
         client.receive(0.1)
@@ -290,7 +290,7 @@ def test_what_does_not_say_which_frame_it_is_is_counted_and_the_journal_is_not_f
         ]
         for parts in rubbish:
             send(parts)
-        send(delivered(KEY, encode(HEADER, [IMAGE])))
+        send(add_delivery(KEY, encode(HEADER, [IMAGE])))
         assert client.receive(30).frame.name == "a.png"
         assert client.refused == len(rubbish)
     told = [record for record in caplog.records if "refused a keyframe" in record.message]
@@ -327,7 +327,7 @@ def test_refused_keyframes_make_way_and_are_named(tmp_path):
                 elif one is not None:
                     client.acknowledge(one)
                     taken.append(one.sequence)
-                return server.queued == 0
+                return server.num_queued == 0
 
             wait_for(done)
             assert taken == [index for index in range(30) if index % 3]
@@ -342,11 +342,11 @@ def test_eight_frames_that_recon_refuses_block_no_queue(tmp_path):
     network, spool = ipc(tmp_path), open_spool(tmp_path)
     for index in range(8):
         header = changed(HEADER, sequence=index, stamp_ns=5 * 10**18, name=f"{index}.png")
-        spool.put(Key(header.session, index), encode(header, [IMAGE]))
+        spool.store(Key(header.session, index), encode(header, [IMAGE]))
     with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
         server.offer(frame(0))
         (received,) = receive(server, client, 1)
-        assert received.frame.name == "0.png" and server.queued == 1
+        assert received.frame.name == "0.png" and server.num_queued == 1
         assert {each.name for each in spool.quarantine.newest(9)} == {f"{index}.png" for index in range(8)}
         assert "stamp_ns" in spool.quarantine.newest(1)[0].reason
 
@@ -365,7 +365,7 @@ def test_what_is_larger_than_recon_allows_is_set_aside_without_being_sent(tmp_pa
 
 def test_what_version_1_spooled_is_delivered(tmp_path):
     network, spool = ipc(tmp_path), open_spool(tmp_path)
-    spool.put(KEY, [b"SPLAT\x01", *encode(HEADER, [IMAGE])[1:]])
+    spool.store(KEY, [b"SPLAT\x01", *encode(HEADER, [IMAGE])[1:]])
     with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
         assert receive(server, client, 1)[0].frame.name == "a.png"
 
@@ -387,21 +387,21 @@ def test_too_large_is_said_before_it_is_spooled(tmp_path):
     with KeyframeServer(network, open_spool(tmp_path)) as server:
         with pytest.raises(WireError, match="max_message_mb"):
             server.offer(frame(0, size=(700, 700)))
-        assert server.queued == 0
+        assert server.num_queued == 0
 
 
 def test_the_spool_is_bounded(tmp_path):
     spool = open_spool(tmp_path, max_frames=2)
-    spool.put(KEY, [b"a"])
-    spool.put(KEY._replace(sequence=1), [b"b"])
+    spool.store(KEY, [b"a"])
+    spool.store(KEY._replace(sequence=1), [b"b"])
     with pytest.raises(SpoolFull, match="is splatnode recon running"):
-        spool.put(KEY._replace(sequence=2), [b"c"])
+        spool.store(KEY._replace(sequence=2), [b"c"])
     spool.remove(KEY)
-    spool.put(KEY._replace(sequence=2), [b"c"])
+    spool.store(KEY._replace(sequence=2), [b"c"])
     assert [key.sequence for key in spool] == [1, 2]
     small = Spool(Config(tmp_path / "other", max_mb=1))
     with pytest.raises(SpoolFull):
-        small.put(KEY, [bytes(1 << 20)])
+        small.store(KEY, [bytes(1 << 20)])
 
 
 def test_a_full_disk_is_a_full_spool_and_leaves_nothing(tmp_path, monkeypatch):
@@ -412,14 +412,14 @@ def test_a_full_disk_is_a_full_spool_and_leaves_nothing(tmp_path, monkeypatch):
 
     monkeypatch.setattr("splatnode.capture.process.durable.os.fsync", no_space)
     with pytest.raises(SpoolFull, match="No space left"):
-        spool.put(KEY, [b"a"])
+        spool.store(KEY, [b"a"])
     assert len(spool) == 0 and [path.name for path in spool.directory.iterdir()] == ["lock"]
 
 
 def test_damaged_files_are_put_aside(tmp_path):
     spool = open_spool(tmp_path)
     for sequence in range(4):
-        spool.put(KEY._replace(sequence=sequence), [b"content", b"of the message"])
+        spool.store(KEY._replace(sequence=sequence), [b"content", b"of the message"])
     paths = sorted(spool.directory.glob("*.frame"))
     paths[0].write_bytes(paths[0].read_bytes()[:-1])
     flipped = bytearray(paths[2].read_bytes())
@@ -444,7 +444,7 @@ def test_a_frame_that_the_disk_loses_does_not_block_the_others(tmp_path):
         server.offer(frame(1))
         next(iter(spool.directory.glob("000000000000-*"))).write_bytes(b"rot")
         assert [one.sequence for one in receive(server, client, 1)] == [1]
-        assert server.queued == 1
+        assert server.num_queued == 1
 
 
 def test_where_the_spool_is(tmp_path, monkeypatch):
@@ -454,7 +454,7 @@ def test_where_the_spool_is(tmp_path, monkeypatch):
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "service"))
     assert spool_directory(Config()) == Path(tmp_path, "service", "spool")
     holder = Spool(Config())
-    with pytest.raises(Held, match=f"held by process {os.getpid()}"):
+    with pytest.raises(LockHeld, match=f"held by process {os.getpid()}"):
         Spool(Config())
     holder.close()
 
@@ -475,20 +475,20 @@ def test_where_the_spool_is(tmp_path, monkeypatch):
 )
 def test_what_is_no_file_of_the_spool_is_left_alone(tmp_path, make, name):
     spool = open_spool(tmp_path)
-    spool.put(KEY, [b"content"])
+    spool.store(KEY, [b"content"])
     spool.close()
     stray = spool.directory / name.format(session=KEY.session, many="9" * 60)
     make(stray)
     again = open_spool(tmp_path)
     assert list(again) == [KEY] and os.path.lexists(stray)
-    again.put(KEY._replace(sequence=9), [b"more"])
+    again.store(KEY._replace(sequence=9), [b"more"])
     assert [key.sequence for key in again] == [KEY.sequence, 9]
     again.close()
 
 
 def test_a_copy_and_a_file_larger_than_the_bound_are_left_alone(tmp_path, caplog):
     spool = open_spool(tmp_path)
-    spool.put(KEY, [b"content"])
+    spool.store(KEY, [b"content"])
     (path,) = spool.directory.glob("*.frame")
     spool.close()
     path.with_name(f"000000000004{path.name[12:]}").write_bytes(path.read_bytes())

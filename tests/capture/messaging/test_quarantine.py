@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from splatnode.capture.messaging.quarantine import Config, Quarantine, SetAside
+from splatnode.capture.messaging.quarantine import Config, Quarantine, QuarantinedKeyframe
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_what_is_set_aside_is_there_after_a_restart_with_its_reason(tmp_path, wa
     for each in (quarantine, open_quarantine(tmp_path)):
         assert len(each) == each.unseen == 3
         newest, _ = each.newest(2)
-        assert newest == SetAside("2.png", "too\\nlarge: 2", f"{2:012d}-{'0' * 32}-2.frame")
+        assert newest == QuarantinedKeyframe("2.png", "too\\nlarge: 2", f"{2:012d}-{'0' * 32}-2.frame")
         assert each.newest(0) == ()
     assert all(path.stat().st_mode & 0o077 == 0 for path in quarantine.directory.iterdir() if path.suffix == ".json")
 
@@ -43,7 +43,7 @@ def test_what_is_set_aside_is_there_after_a_restart_with_its_reason(tmp_path, wa
 def test_what_was_seen_is_not_told_again_also_after_a_restart(tmp_path, waiting):
     quarantine = open_quarantine(tmp_path)
     quarantine.take(waiting(0), "a", "b")
-    quarantine.seen()
+    quarantine.mark_seen()
     for each in (quarantine, open_quarantine(tmp_path)):
         assert (len(each), each.unseen) == (1, 0)
     quarantine.take(waiting(1), "c", "d")
@@ -95,7 +95,7 @@ def test_a_disk_that_takes_nothing_costs_no_more_than_the_reason(tmp_path, waiti
     monkeypatch.setattr("splatnode.capture.messaging.quarantine.write_whole", full)
     quarantine.take(waiting(0), "a", "b")
     assert quarantine.newest(1)[0].reason == "b"
-    quarantine.seen()
+    quarantine.mark_seen()
     assert quarantine.unseen == 0
     path = waiting(1)
     path.unlink()

@@ -9,7 +9,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.messaging.keys import KeyFileError
 from splatnode.capture.messaging.network import NotAllowed
-from splatnode.capture.process.after_ready import Failed, after_ready
+from splatnode.capture.process.after_ready import FailedAfterReady, wrap_late_errors
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.conftest import ROOT
@@ -30,10 +30,10 @@ def final() -> set[int]:
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 def test_no_error_after_ready_needs_a_human(error, final):
     manager = ServiceManager()
-    with pytest.raises(type(error)), after_ready(manager):
+    with pytest.raises(type(error)), wrap_late_errors(manager):
         raise error
     manager.ready()
-    with pytest.raises((Failed, CameraUnavailable, MemoryError)) as caught, after_ready(manager):
+    with pytest.raises((FailedAfterReady, CameraUnavailable, MemoryError)) as caught, wrap_late_errors(manager):
         raise error
     assert command_line.exit_code(caught.value) not in final
 
@@ -41,6 +41,6 @@ def test_no_error_after_ready_needs_a_human(error, final):
 def test_a_clean_end_is_one(final):
     manager = ServiceManager()
     manager.ready()
-    with pytest.raises(SystemExit), after_ready(manager):
+    with pytest.raises(SystemExit), wrap_late_errors(manager):
         raise SystemExit(0)
     assert 0 not in final

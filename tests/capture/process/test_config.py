@@ -5,7 +5,7 @@ import pytest
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.process.config import ConfigError, load_config, merged, parse_changes
+from splatnode.capture.process.config import ConfigError, load_config, merge_config, parse_changes
 
 FOLDER = "camera: {kind: folder, folder: photos}"
 SYNTHETIC = "camera: {kind: synthetic}"
@@ -98,7 +98,7 @@ def test_changes_are_yaml_values():
 
 def test_merging_leaves_its_arguments_alone():
     base = {"a": {"b": 1, "c": 2}, "d": 3}
-    assert merged(base, {"a": {"b": 9}, "d": {"e": 1}}) == {"a": {"b": 9, "c": 2}, "d": {"e": 1}}
+    assert merge_config(base, {"a": {"b": 9}, "d": {"e": 1}}) == {"a": {"b": 9, "c": 2}, "d": {"e": 1}}
     assert base == {"a": {"b": 1, "c": 2}, "d": 3}
 
 

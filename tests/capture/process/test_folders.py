@@ -8,43 +8,43 @@ import signal
 
 import pytest
 
-from splatnode.capture.process.folders import LOCK, claimed, made
-from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.folders import LOCK, claim_folder, make_folder
+from splatnode.capture.process.lock import LockHeld, exclusive
 
 
 def test_a_folder_that_stays_empty_is_removed_with_those_above_it(tmp_path):
-    with made(tmp_path / "a" / "b"):
+    with make_folder(tmp_path / "a" / "b"):
         assert (tmp_path / "a" / "b").is_dir()
     assert not any(tmp_path.iterdir())
 
 
 def test_what_is_used_or_was_there_before_stays(tmp_path):
     (tmp_path / "before").mkdir()
-    with made(tmp_path / "before" / "a" / "b"), made(tmp_path / "before"):
+    with make_folder(tmp_path / "before" / "a" / "b"), make_folder(tmp_path / "before"):
         (tmp_path / "before" / "a" / "file").touch()
     assert {path.name for path in (tmp_path / "before").rglob("*")} == {"a", "file"}
 
 
 def test_where_one_cannot_be_made_those_above_it_are_removed(tmp_path):
     long = "x" * 300
-    with pytest.raises(OSError, match="too long"), made(tmp_path / "a" / long):
+    with pytest.raises(OSError, match="too long"), make_folder(tmp_path / "a" / long):
         pytest.fail("cannot be made")
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(NotADirectoryError), made(path):
+        with pytest.raises(NotADirectoryError), make_folder(path):
             pytest.fail("cannot be made")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_second_claim_is_refused_with_the_holder_and_nothing_stays(tmp_path):
-    with claimed(tmp_path / "a"), pytest.raises(Held) as refused, claimed(tmp_path / "a"):
+    with claim_folder(tmp_path / "a"), pytest.raises(LockHeld) as refused, claim_folder(tmp_path / "a"):
         pytest.fail("was claimed twice")
     assert refused.value.pid == os.getpid()
     assert not any(tmp_path.iterdir())
 
 
 def _claim(folder, started):
-    with claimed(folder):
+    with claim_folder(folder):
         started.set()
         signal.pause()
 
@@ -55,13 +55,13 @@ def test_a_killed_process_no_longer_holds_its_folder(tmp_path):
     process = spawned.Process(target=_claim, args=(tmp_path / "a", started))
     process.start()
     assert started.wait(60)
-    with pytest.raises(Held) as refused, claimed(tmp_path / "a"):
+    with pytest.raises(LockHeld) as refused, claim_folder(tmp_path / "a"):
         pytest.fail("was claimed twice")
     assert refused.value.pid == process.pid
     process.kill()
     process.join()
     assert (tmp_path / "a" / LOCK).exists()
-    with claimed(tmp_path / "a"):
+    with claim_folder(tmp_path / "a"):
         pass
 
 
@@ -70,5 +70,5 @@ def test_a_lock_file_that_its_holder_removes_does_not_lock_for_two(tmp_path):
     path = tmp_path / "lock"
     with open(path, "a+"), exclusive(path):
         path.unlink()
-        with exclusive(path), pytest.raises(Held), exclusive(path):
+        with exclusive(path), pytest.raises(LockHeld), exclusive(path):
             pytest.fail("was locked twice")

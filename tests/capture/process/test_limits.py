@@ -15,13 +15,13 @@ from pathlib import Path
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_STATUS
-from splatnode.capture.process.limits import Limited
+from splatnode.capture.process.limits import LimitTooLow
 number = int(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_NOFILE, (number, number))
 with tempfile.TemporaryDirectory() as folder:
     try:
         Publisher(RECON_STATUS, Network(directory=Path(folder) / "run")).close()
-    except Limited as error:
+    except LimitTooLow as error:
         print(error)
     except OSError as error:
         print(f"{error.strerror}")

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from splatnode.capture.process.logs import PlainLines, StructuredLines, TimedLines, event, use_structured_lines
-from splatnode.capture.process.terminal import shown_as_text
+from splatnode.capture.process.terminal import sanitize_output
 from tests.capture.process.test_terminal import Terminal
 from tests.support.hostile import TEXTS, unprintable
 
@@ -86,7 +86,7 @@ def test_on_a_terminal_lines_are_for_people(monkeypatch):
     monkeypatch.setattr(root, "handlers", [])
     for stream, written in ((Terminal(), r"\d\d:\d\d:\d\d keyframe: name a.png"), (io.StringIO(), LINE.pattern)):
         monkeypatch.setattr(sys, "stderr", stream)
-        with shown_as_text():
+        with sanitize_output():
             use_structured_lines()
             event(root, logging.WARNING, "keyframe", name="a.png", why="")
         found = re.fullmatch(written.replace("keyframe:", "warning: keyframe:"), stream.getvalue().strip())

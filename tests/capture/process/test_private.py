@@ -10,15 +10,15 @@ import tempfile
 
 import pytest
 
-from splatnode.capture.process.durable import open_itself, write_whole
+from splatnode.capture.process.durable import open_itself, write_atomically
 from splatnode.capture.process.lock import exclusive
 from splatnode.capture.process.private import (
-    NotPrivate,
+    NotOwnerOnly,
     StrayFile,
-    check_only_ours,
+    check_owner_only,
     check_way,
-    own_files,
-    private_folder,
+    list_own_files,
+    make_owner_only_folder,
     read_own,
     temporary_folder,
 )
@@ -41,9 +41,9 @@ def umask(request):
 
 def test_folders_and_files_are_private_whatever_the_umask(tmp_path, umask):
     folder = tmp_path / "a" / "b"
-    private_folder(folder, INSTEAD, ours=False)
+    make_owner_only_folder(folder, INSTEAD, ours=False)
     assert mode(folder) == mode(folder.parent) == 0o700
-    write_whole(folder / "file", [b"content"])
+    write_atomically(folder / "file", [b"content"])
     assert mode(folder / "file") == 0o600 and read_own(folder / "file", 7) == b"content"
     with exclusive(folder / "lock"):
         assert mode(folder / "lock") & 0o077 == 0
@@ -53,10 +53,10 @@ def test_a_folder_that_was_open_is_closed_if_it_is_ours_and_refused_if_somebody_
     folder = tmp_path / "spool"
     folder.mkdir()
     folder.chmod(0o755)
-    with pytest.raises(NotPrivate, match=f"chmod 700 {folder}.*set {INSTEAD}"):
-        private_folder(folder, INSTEAD, ours=False)
+    with pytest.raises(NotOwnerOnly, match=f"chmod 700 {folder}.*set {INSTEAD}"):
+        make_owner_only_folder(folder, INSTEAD, ours=False)
     assert mode(folder) == 0o755  # it may be /etc
-    private_folder(folder, INSTEAD, ours=True)
+    make_owner_only_folder(folder, INSTEAD, ours=True)
     assert mode(folder) == 0o700
 
 
@@ -64,20 +64,20 @@ def test_a_folder_into_which_everybody_could_write_is_looked_through_first(tmp_p
     folder = tmp_path / "spool"
     folder.mkdir()
     folder.chmod(0o777)
-    with pytest.raises(NotPrivate, match="chmod 700"):
-        private_folder(folder, INSTEAD, ours=True)
+    with pytest.raises(NotOwnerOnly, match="chmod 700"):
+        make_owner_only_folder(folder, INSTEAD, ours=True)
     folder.chmod(0o700)
-    private_folder(folder, INSTEAD, ours=True)
+    make_owner_only_folder(folder, INSTEAD, ours=True)
 
 
 def test_a_way_that_everybody_may_change_is_no_way(tmp_path):
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
-    with pytest.raises(NotPrivate, match=f"chmod go-w {tmp_path / 'open'}"):
-        private_folder(tmp_path / "open" / "spool", INSTEAD, ours=True)
+    with pytest.raises(NotOwnerOnly, match=f"chmod go-w {tmp_path / 'open'}"):
+        make_owner_only_folder(tmp_path / "open" / "spool", INSTEAD, ours=True)
     assert not list((tmp_path / "open").iterdir())
     (tmp_path / "open").chmod(0o1777)  # as /tmp is: nobody can rename what is another one's
-    private_folder(tmp_path / "open" / "spool", INSTEAD, ours=True)
+    make_owner_only_folder(tmp_path / "open" / "spool", INSTEAD, ours=True)
 
 
 MODES = {0o775: "chmod go-w", 0o757: "chmod go-w", 0o2770: "chmod go-w", 0o1777: None, 0o1775: None, 0o755: None}
@@ -94,19 +94,19 @@ def test_a_way_is_taken_as_sshd_takes_one(tmp_path, where, found, remedy):
     changed = {"folder": way / "a" / "b", "behind a link": way / "a"}.get(where, way)
     changed.chmod(found)
     uses = (
-        lambda: private_folder(spool, INSTEAD, ours=True),
+        lambda: make_owner_only_folder(spool, INSTEAD, ours=True),
         lambda: check_way(spool),
-        lambda: check_only_ours(spool),
+        lambda: check_owner_only(spool),
         lambda: read_own(spool / "file", 10, only_ours=True),
     )
     if remedy is None:
         uses[0]()
-        write_whole(spool / "file", [b"content"])
+        write_atomically(spool / "file", [b"content"])
         for use in uses[1:]:
             use()
         return
     for use in uses:
-        with pytest.raises(NotPrivate, match=f"{changed} must be .* mode {found:04o}: .*run: {remedy} {changed}"):
+        with pytest.raises(NotOwnerOnly, match=f"{changed} must be .* mode {found:04o}: .*run: {remedy} {changed}"):
             use()
     os.system(f"{remedy} {changed}")
     uses[0]()
@@ -116,8 +116,8 @@ def test_a_way_of_another_user_is_none(shared_tmp):  # noqa: F811
     as_other("os.mkdir(sys.argv[1], 0o755)", shared_tmp / "theirs")
     as_other("os.symlink(sys.argv[1], sys.argv[2])", "/", shared_tmp / "link")
     for name, remedy in {"theirs": "chown", "link": "chown -h"}.items():
-        with pytest.raises(NotPrivate, match=f"user {OTHER} .*run: {remedy} {os.geteuid()} {shared_tmp / name}"):
-            private_folder(shared_tmp / name / "tmp" / "spool", INSTEAD, ours=True)
+        with pytest.raises(NotOwnerOnly, match=f"user {OTHER} .*run: {remedy} {os.geteuid()} {shared_tmp / name}"):
+            make_owner_only_folder(shared_tmp / name / "tmp" / "spool", INSTEAD, ours=True)
 
 
 def test_temporary_files_lie_where_nobody_else_can_change_them(tmp_path, monkeypatch):
@@ -126,7 +126,7 @@ def test_temporary_files_lie_where_nobody_else_can_change_them(tmp_path, monkeyp
         assert mode(folder) == 0o700
     assert not folder.exists()
     tmp_path.chmod(0o777)
-    with pytest.raises(NotPrivate, match=r"chmod go-w.*\$TMPDIR"), temporary_folder("a-"):
+    with pytest.raises(NotOwnerOnly, match=r"chmod go-w.*\$TMPDIR"), temporary_folder("a-"):
         pass
     tmp_path.chmod(0o1777)
     with temporary_folder("a-") as folder:
@@ -147,16 +147,16 @@ def test_a_link_is_not_written_through(tmp_path, opens):
 def test_own_links_are_followed(tmp_path):
     (tmp_path / "disk").mkdir(mode=0o700)
     (tmp_path / "state").symlink_to("disk")
-    private_folder(tmp_path / "state" / "spool", INSTEAD, ours=True)
+    make_owner_only_folder(tmp_path / "state" / "spool", INSTEAD, ours=True)
     assert mode(tmp_path / "disk" / "spool") == 0o700
     (tmp_path / "here").symlink_to(tmp_path / "state")
-    private_folder(tmp_path / "here", INSTEAD, ours=False)
+    make_owner_only_folder(tmp_path / "here", INSTEAD, ours=False)
     (tmp_path / "circle").symlink_to("circle")
     with pytest.raises(OSError):
-        private_folder(tmp_path / "circle", INSTEAD, ours=True)
+        make_owner_only_folder(tmp_path / "circle", INSTEAD, ours=True)
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(NotADirectoryError):
-        private_folder(tmp_path / "file", INSTEAD, ours=True)
+        make_owner_only_folder(tmp_path / "file", INSTEAD, ours=True)
 
 
 @pytest.mark.parametrize("stray", STRAYS.values(), ids=STRAYS)
@@ -168,7 +168,7 @@ def test_what_is_no_file_is_neither_read_nor_waited_for(tmp_path, stray, caplog)
     (tmp_path / "2.frame").write_bytes(b"a")
     (tmp_path / "copy of 2.frame").write_bytes(b"a")
     with caplog.at_level(logging.WARNING):
-        assert [path.name for path in own_files(tmp_path, re.compile(r"[0-9]+\.frame"), ".frame")] == [
+        assert [path.name for path in list_own_files(tmp_path, re.compile(r"[0-9]+\.frame"), ".frame")] == [
             "2.frame",
             "10.frame",
         ]

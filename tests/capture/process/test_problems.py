@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatnode.capture.process.problems import Problems, is_said
+from splatnode.capture.process.problems import Problems, is_logged
 
 
 def test_problems_are_told_until_seen_and_then_only_what_is_new():
@@ -13,7 +13,7 @@ def test_problems_are_told_until_seen_and_then_only_what_is_new():
     assert str(problems) == "2 frames, the last: second\\n\\x1b"
     problems.count("commands", 3, "rubbish")
     assert str(problems).endswith("; 3 commands, the last: rubbish")
-    problems.seen()
+    problems.mark_seen()
     assert str(problems) == ""
     problems.count("commands", 3, "rubbish")
     assert str(problems) == ""
@@ -29,4 +29,4 @@ def test_what_is_told_is_bounded():
 
 
 def test_a_journal_is_not_filled():
-    assert [count for count in range(1, 1000) if is_said(count)] == [1, 2, 4, 8, 16, 32, 64, 128, 256, 512]
+    assert [count for count in range(1, 1000) if is_logged(count)] == [1, 2, 4, 8, 16, 32, 64, 128, 256, 512]

@@ -10,8 +10,8 @@ import time
 import pytest
 
 from splatnode.capture.process import progress
-from splatnode.capture.process.progress import Step, Told, counted, telling, waiting
-from splatnode.capture.process.terminal import shown_as_text
+from splatnode.capture.process.progress import ProgressPrinter, ProgressStep, report_items, show_progress, show_waiting
+from splatnode.capture.process.terminal import sanitize_output
 from tests.capture.process.test_terminal import Terminal
 
 
@@ -22,11 +22,11 @@ def printed(monkeypatch):
     def run(stream: io.StringIO) -> str:
         monkeypatch.setattr(sys, "stdout", stream)
         monkeypatch.setattr(sys, "stderr", stream)
-        with shown_as_text():
-            tell = Told()
-            assert list(counted("ab", tell, "reading", 2, "photograph")) == ["a", "b"]
+        with sanitize_output():
+            tell = ProgressPrinter()
+            assert list(report_items("ab", tell, "reading", 2, "photograph")) == ["a", "b"]
             tell("1 of 2: a is sharp")
-            tell(Step("thinking"))
+            tell(ProgressStep("thinking"))
         return stream.getvalue()
 
     return run
@@ -47,10 +47,10 @@ def test_a_terminal_is_written_to_ten_times_a_second_at_most_and_at_the_end_of_a
     monkeypatch.setattr(sys, "stderr", screen)
     now = iter([0.0, 0.05, 0.15, 0.16, 0.17])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
-    with shown_as_text():
-        tell = Told()
+    with sanitize_output():
+        tell = ProgressPrinter()
         for done in range(1, 6):
-            tell(Step("refining", done, 5, "step"))
+            tell(ProgressStep("refining", done, 5, "step"))
     assert [part.split()[1] for part in screen.getvalue().split("\r")[1:]] == ["1", "3", "5"]
 
 
@@ -70,10 +70,10 @@ def test_a_step_tells_how_long_the_rest_will_take(done, of, now_s, said, monkeyp
     monkeypatch.setattr(sys, "stderr", screen)
     now = iter([0.0, now_s])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
-    with shown_as_text():
-        tell = Told()
-        tell(Step("refining", 0, of, "step"))
-        tell(Step("refining", done, of, "step"))
+    with sanitize_output():
+        tell = ProgressPrinter()
+        tell(ProgressStep("refining", 0, of, "step"))
+        tell(ProgressStep("refining", done, of, "step"))
     assert screen.getvalue().split("\r")[-1].strip().endswith(said)
 
 
@@ -81,9 +81,9 @@ def test_a_step_that_ends_early_leaves_no_time_behind(monkeypatch):
     with shown_on_terminal(monkeypatch, tick_s=60.0) as screen:
         now = iter([0.0, 5.0, 5.0, 5.0])
         monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
-        tell = Told()
-        tell(Step("matching", 1, 4, "pair"))
-        tell(Step("matching", 2, 4, "pair"))
+        tell = ProgressPrinter()
+        tell(ProgressStep("matching", 1, 4, "pair"))
+        tell(ProgressStep("matching", 2, 4, "pair"))
         tell("found")
     assert screen.getvalue().endswith("(5 s, about 5 s left)\rmatching: 2 of 4 pairs (5 s)                \nfound\n")
 
@@ -95,7 +95,7 @@ def shown_on_terminal(monkeypatch, tick_s=0.01):
     monkeypatch.setattr(progress, "_TICK_S", tick_s)
     monkeypatch.setattr(sys, "stdout", screen)
     monkeypatch.setattr(sys, "stderr", screen)
-    with shown_as_text():
+    with sanitize_output():
         yield screen
 
 
@@ -107,36 +107,36 @@ def shown_within(screen: Terminal, text: str, limit_s: float = 10.0) -> bool:
 
 
 def test_the_seconds_of_a_step_go_on_while_it_is_not_heard_of(monkeypatch):
-    with shown_on_terminal(monkeypatch) as screen, telling() as tell:
-        tell(Step("thinking"))
+    with shown_on_terminal(monkeypatch) as screen, show_progress() as tell:
+        tell(ProgressStep("thinking"))
         assert shown_within(screen, "\rthinking (0 s)\rthinking (0 s)")
         tell("found")
         after = len(screen.getvalue())
         time.sleep(0.1)
         assert len(screen.getvalue()) == after  # what was printed since stands there
-        tell(Step("counting", 2, 2, "sheep"))
+        tell(ProgressStep("counting", 2, 2, "sheep"))
         after = len(screen.getvalue())
         time.sleep(0.1)
         assert len(screen.getvalue()) == after  # it is done
 
 
 def test_with_quiet_nobody_is_told(monkeypatch):
-    with shown_on_terminal(monkeypatch) as screen, telling(quiet=True) as tell:
-        tell(Step("thinking"))
+    with shown_on_terminal(monkeypatch) as screen, show_progress(quiet=True) as tell:
+        tell(ProgressStep("thinking"))
         tell("found")
     assert not screen.getvalue()
 
 
 def test_what_is_waited_for_is_shown_meanwhile_and_then_taken_away(monkeypatch):
     with shown_on_terminal(monkeypatch) as screen:
-        with waiting("loading"):
+        with show_waiting("loading"):
             assert shown_within(screen, "loading (0 s)")
         print("there")
     assert screen.getvalue().endswith("\r" + " " * len("loading (0 s)") + "\rthere\n")
 
 
 def test_what_is_soon_there_is_not_waited_for(monkeypatch):
-    with shown_on_terminal(monkeypatch, tick_s=60.0) as screen, waiting("loading"):
+    with shown_on_terminal(monkeypatch, tick_s=60.0) as screen, show_waiting("loading"):
         pass
     assert not screen.getvalue()
 
@@ -144,10 +144,10 @@ def test_what_is_soon_there_is_not_waited_for(monkeypatch):
 @pytest.mark.parametrize(
     ("step", "said", "announced"),
     [
-        (Step("matching", 3, 10, "pair"), "matching: 3 of 10 pairs", "matching: 10 pairs"),
-        (Step("choosing", 7, 0, "frame"), "choosing: 7 frames", "choosing"),
-        (Step("matching", 1, 1, "pair"), "matching: 1 of 1 pair", "matching: 1 pair"),
-        (Step("writing"), "writing", "writing"),
+        (ProgressStep("matching", 3, 10, "pair"), "matching: 3 of 10 pairs", "matching: 10 pairs"),
+        (ProgressStep("choosing", 7, 0, "frame"), "choosing: 7 frames", "choosing"),
+        (ProgressStep("matching", 1, 1, "pair"), "matching: 1 of 1 pair", "matching: 1 pair"),
+        (ProgressStep("writing"), "writing", "writing"),
     ],
 )
 def test_a_step_in_words(step, said, announced):

@@ -40,7 +40,7 @@ def test_an_isolated_python_does_not_either(tmp_path, monkeypatch, told):
     trace = make_hostile(tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    assert subprocess.run(python.isolated(*told)).returncode == 0 and not trace.exists()
+    assert subprocess.run(python.make_isolated_command(*told)).returncode == 0 and not trace.exists()
 
 
 def test_python_m_leaves_the_current_folder_before_it_imports_anything(tmp_path, monkeypatch):

@@ -28,7 +28,7 @@ from splatnode.capture.messaging.spool import Spool
 from splatnode.capture.process import apart, memory, memory_shortage
 from splatnode.capture.process.memory_shortage import is_shortage, may_be_shortage, outlast
 from splatnode.capture.process.unfailing import Unfailing
-from splatnode.capture.reader import State
+from splatnode.capture.reader import ReaderState
 from splatnode.recon.daemon.checkpoint.ledger import read_ledger
 from splatnode.recon.daemon.checkpoint.store import Store
 from tests.capture.messaging.test_sockets import wait_for
@@ -111,7 +111,7 @@ def test_a_photograph_that_asks_for_too_much_memory_is_dropped_in_the_end(tmp_pa
     def greedy(data, *_):
         raise UnusableImage("damaged") from MemoryError()
 
-    monkeypatch.setattr(folder, "decode_photograph", greedy)
+    monkeypatch.setattr(folder, "decode_any_image", greedy)
     items = list(folder.stream(folder.Config(folder=tmp_path)))
     assert [type(item) for item in items] == [DroppedFrame] * 2
 
@@ -120,7 +120,7 @@ def test_a_keyframe_waits_in_the_spool_and_is_never_set_aside(tmp_path):
     network, spool = Network(directory=tmp_path / "run"), Spool(SpoolConfig(directory=tmp_path))
     with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
         keys = [server.offer(frame(index)) for index in range(2)]
-        wait_for(lambda: client.receive(0.01) or server.serve(0.01) or server.connected)
+        wait_for(lambda: client.receive(0.01) or server.serve(0.01) or server.is_connected)
         with starved():
             for _ in range(20):
                 server.serve(0.01)
@@ -202,30 +202,30 @@ def capturing(place):
 def test_capture_keeps_a_frame_that_cannot_be_written_for_want_of_files(tmp_path):
     with capturing(tmp_path) as session:
         with starved():
-            session.handle(frame(), State.STREAMING)
+            session.handle(frame(), ReaderState.STREAMING)
             assert session.is_waiting and session.waits(0.01) and session.not_taken == 0
         assert not session.waits(0.01) and not session.is_waiting
-        assert session.keyframes == session.frames == session._server.queued == 1
+        assert session.keyframes == session.frames == session._server.num_queued == 1
 
 
 def test_capture_keeps_a_frame_that_memory_lacks_for(tmp_path, monkeypatch):
     with capturing(tmp_path) as session:
         with monkeypatch.context() as short:
             short.setattr(selection, "assess", lambda image: (_ for _ in ()).throw(MemoryError()))
-            session.handle(frame(), State.STREAMING)
+            session.handle(frame(), ReaderState.STREAMING)
             assert session.waits(0.01) and session.frames == 0
         assert not session.waits(0.01) and session.keyframes == session.frames == 1
 
 
 def test_a_heartbeat_that_cannot_be_made_ends_nothing(tmp_path, monkeypatch):
     with capturing(tmp_path) as session:
-        reader = SimpleNamespace(state=State.STREAMING, why="", skipped=0)
+        reader = SimpleNamespace(state=ReaderState.STREAMING, why="", skipped=0)
         sent = []
         monkeypatch.setattr(session._heartbeats, "send", sent.append)
         with starved():
-            session.beat(reader)
+            session.send_heartbeat(reader)
         assert sent[0].rss_mb == 0
         session._next_beat = 0
         monkeypatch.setattr(daemon, "resident_mb", lambda: (_ for _ in ()).throw(MemoryError()))
-        session.beat(reader)
+        session.send_heartbeat(reader)
         assert len(sent) == 1

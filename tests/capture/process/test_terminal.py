@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from splatnode.capture.process.terminal import beneath, progress, say, shown_as_text
+from splatnode.capture.process.terminal import beneath, progress, sanitize_output, say
 from tests.conftest import ROOT
 from tests.support.hostile import TEXTS, unprintable
 
@@ -25,7 +25,7 @@ def test_what_is_printed_only_shows(monkeypatch, text):
     out, err = io.StringIO(), io.StringIO()
     monkeypatch.setattr(sys, "stdout", out)
     monkeypatch.setattr(sys, "stderr", err)
-    with shown_as_text():
+    with sanitize_output():
         print("left out:", text)
         print(text, file=sys.stderr)
     assert not unprintable(out.getvalue() + err.getvalue())
@@ -37,7 +37,7 @@ def test_plain_text_and_json_stay_as_they_are(monkeypatch):
     out = io.StringIO()
     monkeypatch.setattr(sys, "stdout", out)
     said = json.dumps({"name": "Küche\n\x1b", "a": [1, "<0>"]}, indent=1)
-    with shown_as_text():
+    with sanitize_output():
         print(said)
         print("Küche ±0.5 °, 日本", "<a>", "x <0>")
     assert out.getvalue() == f"{said}\nKüche ±0.5 °, 日本 <a> x <0>\n"
@@ -46,7 +46,7 @@ def test_plain_text_and_json_stay_as_they_are(monkeypatch):
 def test_progress_is_for_a_terminal_and_goes_back_to_the_begin_of_its_line(monkeypatch):
     for stream, expected in ((Terminal(), "\ra\\x1b: 1 MB\n"), (io.StringIO(), "")):
         monkeypatch.setattr(sys, "stderr", stream)
-        with shown_as_text():
+        with sanitize_output():
             progress("a\x1b: 1 MB")
             progress("")
             assert not sys.stderr.isatty() and beneath(sys.stderr) is stream
@@ -58,7 +58,7 @@ def test_what_is_printed_after_progress_begins_a_line_of_its_own(monkeypatch):
     monkeypatch.setattr(sys, "stdout", screen)
     monkeypatch.setattr(sys, "stderr", screen)
     monkeypatch.setenv("COLUMNS", "12")
-    with shown_as_text():
+    with sanitize_output():
         progress("a: 1 of 10 photographs")
         progress("a: 2 of 10")
         progress("b")
@@ -69,7 +69,7 @@ def test_what_is_printed_after_progress_begins_a_line_of_its_own(monkeypatch):
 
 def test_a_process_without_standard_output_prints_nothing(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
-    with shown_as_text():
+    with sanitize_output():
         print("nobody hears")
         progress("")
 

@@ -18,13 +18,13 @@ from tests.support.located import PLACE, turned
 
 
 def picture(camera: Camera, seed: int) -> bytes:
-    return encode_png(synthetic.photograph(PLACE, camera, seed))
+    return encode_png(synthetic.render_image(PLACE, camera, seed))
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two cameras: the left one is turned before the third recording, the right one sees nothing in the second."""
-    folder, (left, *_, right) = tmp_path_factory.mktemp("station"), synthetic.held_out_cameras(PLACE)
+    folder, (left, *_, right) = tmp_path_factory.mktemp("station"), synthetic.evaluation_cameras(PLACE)
     visits = [folder / day for day in ("monday", "tuesday", "wednesday")]
     for day, visit in enumerate(visits):
         visit.mkdir()
@@ -54,7 +54,7 @@ def test_the_camera_that_moved_is_named_with_when_and_by_how_much(result, record
 
 
 def test_a_camera_that_moves_within_a_recording_is_not_compared(result, tmp_path, capsys):
-    left, *_ = synthetic.held_out_cameras(PLACE)
+    left, *_ = synthetic.evaluation_cameras(PLACE)
     shifted = left[0].copy(), left[1]
     shifted[0][:3, 3] += 0.05 * left[0][:3, 0]
     for day, later in (("monday", turned(left, 2.0)), ("tuesday", shifted)):

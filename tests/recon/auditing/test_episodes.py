@@ -18,13 +18,13 @@ from tests.support.mcap_files import calibration, compressed, write
 pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
 pa = pytest.importorskip("pyarrow", reason="needs pyarrow")
 
-LEFT, *_, RIGHT = synthetic.held_out_cameras(PLACE)
+LEFT, *_, RIGHT = synthetic.evaluation_cameras(PLACE)
 
 
 @lru_cache
 def seen(name: str, degrees: float, seed: int) -> np.ndarray:
     """What a camera of the station sees, once it has turned by so much."""
-    return synthetic.photograph(PLACE, turned({"left": LEFT, "right": RIGHT}[name], degrees), seed)
+    return synthetic.render_image(PLACE, turned({"left": LEFT, "right": RIGHT}[name], degrees), seed)
 
 
 def episode(left_turned_deg: float, seed: int) -> dict[str, list[np.ndarray]]:

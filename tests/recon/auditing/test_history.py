@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.auditing.history import Move, Period, extended, moves
-from splatnode.recon.auditing.motion import MIN_COMMON, motion
-from splatnode.recon.auditing.sighting import Sighting
+from splatnode.recon.auditing.history import Move, Period, extend_history, find_moves
+from splatnode.recon.auditing.motion import MIN_COMMON, measure_motion
+from splatnode.recon.auditing.sighting import CameraSighting
 from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
 from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.locate import Placed
-from splatnode.recon.locating.outcome import Claim, Located
+from splatnode.recon.locating.locate import Localization
+from splatnode.recon.locating.outcome import LocalizationBounds, Located
 
 LENS = Lens(500.0, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
 SIZE = (640, 480)
@@ -28,7 +28,7 @@ def rigid(turn_deg=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)) -> np.ndarray:
     return T
 
 
-def placed(T_world_camera: np.ndarray, seed: int, count: int = 300) -> Placed:
+def placed(T_world_camera: np.ndarray, seed: int, count: int = 300) -> Localization:
     """A photograph of `count` of the same points, each seen with noise of its own."""
     points = np.random.default_rng(0).uniform([-0.8, -0.6, 0.7], [0.8, 0.6, 1.6], (300, 3))[:count]
     inverse = np.linalg.inv(T_world_camera)
@@ -37,26 +37,26 @@ def placed(T_world_camera: np.ndarray, seed: int, count: int = 300) -> Placed:
     number, zero = np.arange(count), np.zeros((count, 3, 3))
     seen = Correspondences(camera.project(points)[0] + noise, number, points, zero, number, number, points)
     covariance = 1e-6 * np.eye(6)
-    located = Located(T_world_camera, np.eye(3), covariance, Claim(0.1, 0.01, 1.0, 1.0), count, False)
-    return Placed(located, camera, seen, SIZE, spread=1.0)
+    located = Located(T_world_camera, np.eye(3), covariance, LocalizationBounds(0.1, 0.01, 1.0, 1.0), count, False)
+    return Localization(located, camera, seen, SIZE, spread=1.0)
 
 
-def history(*Ts: np.ndarray, first_seed: int = 1) -> dict[int, Sighting]:
-    return {i: Sighting(f"{i}.png", placed(T, first_seed + i)) for i, T in enumerate(Ts)}
+def history(*Ts: np.ndarray, first_seed: int = 1) -> dict[int, CameraSighting]:
+    return {i: CameraSighting(f"{i}.png", placed(T, first_seed + i)) for i, T in enumerate(Ts)}
 
 
-def periods(sightings: dict[int, Sighting]) -> list[Period]:
+def periods(sightings: dict[int, CameraSighting]) -> list[Period]:
     found: list[Period] = []
     for number, sighting in sightings.items():
-        found = extended(found, number, sighting)
+        found = extend_history(found, number, sighting)
     return found
 
 
 def test_noise_moves_nothing():
     T = rigid((3.0, -5.0, 2.0), LEFT)
     for seed in range(200):
-        found = motion(placed(T, 2 * seed), placed(T, 2 * seed + 1))
-        assert found.common == 300 and not found.significant
+        found = measure_motion(placed(T, 2 * seed), placed(T, 2 * seed + 1))
+        assert found.common == 300 and not found.is_significant
 
 
 @pytest.mark.parametrize(
@@ -64,8 +64,8 @@ def test_noise_moves_nothing():
 )
 def test_a_move_is_measured(turn, shift):
     T, move = rigid((3.0, -5.0, 2.0), LEFT), rigid(turn, shift)
-    found = motion(placed(T, 1), placed(T @ move, 2))
-    assert found.significant
+    found = measure_motion(placed(T, 1), placed(T @ move, 2))
+    assert found.is_significant
     assert np.degrees(Rotation.from_matrix(move[:3, :3]).magnitude()) == pytest.approx(found.degrees, abs=0.06)
     assert np.linalg.norm(found.T_before_after[:3, 3] - shift) < 0.001
     assert found.degrees_sigma < 0.1 and found.distance_sigma < 0.003
@@ -76,30 +76,33 @@ def test_a_camera_that_zoomed_has_not_moved():
     before, after = placed(T, 1), placed(T, 2)
     zoomed = replace(after.seen, pixels=1.3 * after.seen.pixels)
     located = replace(after.located, K=np.diag([1.3, 1.3, 1.0]))
-    found = motion(before, replace(after, seen=zoomed, located=located))
-    assert found.common == 0 and not found.significant  # by their common points it moved forward by a third
+    found = measure_motion(before, replace(after, seen=zoomed, located=located))
+    assert found.common == 0 and not found.is_significant  # by their common points it moved forward by a third
 
 
 def test_a_move_is_known_the_less_the_closer_the_cameras_of_the_scene_stand_together():
     T = rigid((3.0, -5.0, 2.0), LEFT)
     move = rigid((0.0, 1.0, 0.0), (0.03, 0.0, 0.0))
     sigmas = [
-        motion(replace(placed(T, 1), spread=spread), placed(T @ move, 2)).degrees_sigma for spread in (1.0, 0.1, 0.0)
+        measure_motion(replace(placed(T, 1), spread=spread), placed(T @ move, 2)).degrees_sigma
+        for spread in (1.0, 0.1, 0.0)
     ]
     assert sigmas[0] < sigmas[1] < sigmas[2] < 0.1  # where they stand at one place, all that is wrong counts
 
 
 def test_what_is_the_least_to_be_noticed_is_noticed_and_half_of_it_is_not():
     T = rigid((3.0, -5.0, 2.0), LEFT)
-    least = motion(placed(T, 1), placed(T, 2)).least_shift
-    shifted = [motion(placed(T, 3), placed(T @ rigid(shift=(0.0, 0.0, factor * least)), 4)) for factor in (1.5, 0.3)]
-    assert [each.significant for each in shifted] == [True, False]
+    least = measure_motion(placed(T, 1), placed(T, 2)).least_shift
+    shifted = [
+        measure_motion(placed(T, 3), placed(T @ rigid(shift=(0.0, 0.0, factor * least)), 4)) for factor in (1.5, 0.3)
+    ]
+    assert [each.is_significant for each in shifted] == [True, False]
 
 
 def test_with_few_common_points_each_photograph_stands_for_itself():
     T = rigid((3.0, -5.0, 2.0), LEFT)
-    found = motion(placed(T, 1), placed(T @ rigid((0.0, 5.0, 0.0)), 2, count=MIN_COMMON - 1))
-    assert found.common == 0 and found.significant and found.degrees == pytest.approx(5.0, abs=1e-6)
+    found = measure_motion(placed(T, 1), placed(T @ rigid((0.0, 5.0, 0.0)), 2, count=MIN_COMMON - 1))
+    assert found.common == 0 and found.is_significant and found.degrees == pytest.approx(5.0, abs=1e-6)
 
 
 def test_periods_end_where_the_camera_moves_and_slow_drift_adds_up():
@@ -119,10 +122,10 @@ def test_cameras_that_move_alike_in_the_world_moved_as_one():
         "left": periods(history(left, left, body @ left)),
         "right": periods(history(right, right, body @ right, first_seed=50)),
     }
-    assert moves(together) == [Move(1, 2, ("left", "right"))]
+    assert find_moves(together) == [Move(1, 2, ("left", "right"))]
     apart = together | {"right": periods(history(right, right, right @ body, first_seed=50))}
-    assert moves(apart) == [Move(1, 2, ("left",)), Move(1, 2, ("right",))]
+    assert find_moves(apart) == [Move(1, 2, ("left",)), Move(1, 2, ("right",))]
     one_only = together | {"right": periods(history(right, right, right, first_seed=50))}
-    assert moves(one_only) == [Move(1, 2, ("left",))]
+    assert find_moves(one_only) == [Move(1, 2, ("left",))]
     at_another_time = together | {"right": periods(history(right, body @ right, body @ right, first_seed=50))}
-    assert moves(at_another_time) == [Move(0, 1, ("right",)), Move(1, 2, ("left",))]
+    assert find_moves(at_another_time) == [Move(0, 1, ("right",)), Move(1, 2, ("left",))]

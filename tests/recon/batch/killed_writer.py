@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.recon.batch import command
-from splatnode.recon.batch.sources import Recording, recordings
-from splatnode.recon.batch.write_back import WrittenBack, write_back
+from splatnode.recon.batch.sources import BatchRecording, recordings
+from splatnode.recon.batch.write_back import WriteBackOutcome, write_back
 from tests.support.recordings import options
 
 NEVER, BEFORE, AFTER = 0, -1, -2  # moments; any other is the number of a call
 
 
-def copied(result: str, _: Recording, folder: Path) -> list[str]:
+def copied(result: str, _: BatchRecording, folder: Path) -> list[str]:
     return ["cp", "-r", result, str(folder)]
 
 
@@ -36,7 +36,7 @@ class Watched:
     def __init__(self, moment: int) -> None:
         self.moment, self.calls = moment, 0
 
-    def __call__(self, *arguments: Any) -> Iterator[WrittenBack]:
+    def __call__(self, *arguments: Any) -> Iterator[WriteBackOutcome]:
         sys.setprofile(self.look)
         try:
             yield from write_back(*arguments)

@@ -13,10 +13,10 @@ import pytest
 import splatnode.recon.batch
 from splatnode import command_line
 from splatnode.capture.process.printable import cell
-from splatnode.recon.batch.answer import without_answer
+from splatnode.recon.batch.answer import make_failed_outcome
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
 from splatnode.recon.batch.ledger import LEDGER, Ledger, OtherBatch
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.batch.tables import CSV, write_csv
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.jobs.child import NOT_RUN
@@ -24,13 +24,13 @@ from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs
 
 
-def ran(out: Path, *found: Recording, command: tuple[str, ...] = ("act",), **changed) -> int:
+def ran(out: Path, *found: BatchRecording, command: tuple[str, ...] = ("act",), **changed) -> int:
     return run_batch(options(out, **changed), list(found), simulated, list(command))
 
 
-def counted(name: str, tally: Path, then: str = GOOD) -> Recording:
+def counted(name: str, tally: Path, then: str = GOOD) -> BatchRecording:
     """A recording that writes its name into a file each time that it is run."""
-    return Recording(name, f"echo {name} >> '{tally}'; {then}")
+    return BatchRecording(name, f"echo {name} >> '{tally}'; {then}")
 
 
 def table(out: Path) -> list[dict[str, str]]:
@@ -40,7 +40,12 @@ def table(out: Path) -> list[dict[str, str]]:
 
 def test_tables_and_page_show_every_recording(tmp_path, capsys):
     out = tmp_path / "out"
-    found = [Recording("good", GOOD), Recording("other", GOOD), Recording("no", REFUSED), Recording("bad", "exit 9")]
+    found = [
+        BatchRecording("good", GOOD),
+        BatchRecording("other", GOOD),
+        BatchRecording("no", REFUSED),
+        BatchRecording("bad", "exit 9"),
+    ]
     assert ran(out, *found) == EXIT_SOME_FAILED
     said = capsys.readouterr().out
     assert "OK: 2; FAILED: 1; NO_OVERLAP: 1" in said and "4 of 4" in said and "bad: FAILED" in said
@@ -59,7 +64,7 @@ def test_tables_and_page_show_every_recording(tmp_path, capsys):
 
 def test_parquet_has_the_same_rows(tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
-    assert ran(tmp_path / "out", Recording("good", GOOD), Recording("bad", "exit 9")) == EXIT_SOME_FAILED
+    assert ran(tmp_path / "out", BatchRecording("good", GOOD), BatchRecording("bad", "exit 9")) == EXIT_SOME_FAILED
     rows = parquet.read_table(tmp_path / "out" / "batch.parquet").to_pylist()
     assert {row["name"]: row["gaussians"] for row in rows} == {"good": 1000, "bad": None}
     assert [row["verdict"] for row in rows] == [row["verdict"] for row in table(tmp_path / "out")]
@@ -69,14 +74,16 @@ def test_without_pyarrow_it_is_said_and_the_rest_is_there(tmp_path, capsys, monk
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     monkeypatch.delitem(sys.modules, "splatnode.recon.batch.pyarrow", raising=False)
     monkeypatch.delattr(splatnode.recon.batch, "pyarrow", raising=False)
-    assert ran(tmp_path / "out", Recording("good", GOOD)) == EXIT_GOOD
+    assert ran(tmp_path / "out", BatchRecording("good", GOOD)) == EXIT_GOOD
     assert "no batch.parquet: pyarrow is not installed. Run: pip install 'splatnode[batch]'" in capsys.readouterr().out
     assert (tmp_path / "out" / "index.html").exists() and not (tmp_path / "out" / "batch.parquet").exists()
 
 
 def test_the_page_shows_names_and_nothing_that_they_would_do(tmp_path):
     name = "<script>alert(1)</script>"
-    assert ran(tmp_path / "out", Recording(name.replace("/", "_"), GOOD), Recording("b", f"echo '{name}'; exit 9"))
+    assert ran(
+        tmp_path / "out", BatchRecording(name.replace("/", "_"), GOOD), BatchRecording("b", f"echo '{name}'; exit 9")
+    )
     page = (tmp_path / "out" / "index.html").read_text()
     assert "<script" not in page and "&lt;script&gt;alert(1)&lt;/script&gt;" in page
 
@@ -120,31 +127,31 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     out = tmp_path / "out"
     (out / "a").mkdir(parents=True)
     with pytest.raises(ValueError, match="must be a new or an empty folder, .* holds a; give another"):
-        ran(out, Recording("a", GOOD))
+        ran(out, BatchRecording("a", GOOD))
     with pytest.raises(ValueError, match="new or an empty"):
-        ran(out, Recording("a", GOOD), resume=True)
+        ran(out, BatchRecording("a", GOOD), resume=True)
     assert [path.name for path in out.iterdir()] == ["a"]
 
 
 def test_a_batch_is_not_begun_twice_nor_gone_on_with_otherwise(tmp_path):
     out = tmp_path / "out"
-    ran(out, Recording("a", GOOD))
+    ran(out, BatchRecording("a", GOOD))
     with pytest.raises(ValueError, match="holds a batch already; --resume goes on"):
-        ran(out, Recording("a", GOOD))
+        ran(out, BatchRecording("a", GOOD))
     with pytest.raises(OtherBatch, match="of a batch with other options: act. Now they are act --size 64"):
-        ran(out, Recording("a", GOOD), resume=True, command=("act", "--size", "64"))
+        ran(out, BatchRecording("a", GOOD), resume=True, command=("act", "--size", "64"))
     (out / LEDGER).write_text("[]\n")
     with pytest.raises(OtherBatch, match="is not the ledger of a batch"):
-        ran(out, Recording("a", GOOD), resume=True)
+        ran(out, BatchRecording("a", GOOD), resume=True)
 
 
 def test_there_are_no_more_cores_than_there_are(tmp_path):
     with pytest.raises(ValueError, match="--cores must be at most [0-9]+, .* got 100000"):
-        ran(tmp_path / "out", Recording("a", GOOD), cores=100_000)
+        ran(tmp_path / "out", BatchRecording("a", GOOD), cores=100_000)
 
 
 def test_programs_get_the_counts(tmp_path, capsys):
-    assert ran(tmp_path / "out", Recording("a", GOOD), Recording("b", REFUSED), json=True) == EXIT_GOOD
+    assert ran(tmp_path / "out", BatchRecording("a", GOOD), BatchRecording("b", REFUSED), json=True) == EXIT_GOOD
     assert json.loads(capsys.readouterr().out) == {"recordings": 2, "verdicts": {"NO_OVERLAP": 1, "OK": 1}}
 
 
@@ -180,7 +187,7 @@ def test_folders_of_photographs_become_results(tmp_path, capsys):
 
 @pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1"])
 def test_a_table_has_no_formula(tmp_path, name):
-    write_csv(tmp_path / CSV, [without_answer(Recording(name, "/a"), NOT_RUN, "=cmd()")])
+    write_csv(tmp_path / CSV, [make_failed_outcome(BatchRecording(name, "/a"), NOT_RUN, "=cmd()")])
     with (tmp_path / CSV).open(newline="", encoding="utf-8") as file:
         (row,) = csv.DictReader(file)
     assert row["name"] == f"'{name}" and row["message"] == "'=cmd()" and row["source"] == "/a"

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY
-from splatnode.recon.batch.answer import without_answer
+from splatnode.recon.batch.answer import make_failed_outcome
 from splatnode.recon.batch.engine import Plan, run_all
 from splatnode.recon.batch.keeping import LOG
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import NOT_RUN, Limits
 from tests.conftest import ROOT
 from tests.support.recordings import GOOD, REFUSED, simulated
@@ -25,7 +25,7 @@ CORES = tuple(sorted(os.sched_getaffinity(0)))
 
 
 def outcomes(out: Path, limits: Limits = UNLIMITED, cores: tuple[int, ...] = CORES[:1], **commands: str):
-    todo = [Recording(name, command) for name, command in commands.items()]
+    todo = [BatchRecording(name, command) for name, command in commands.items()]
     return {found.name: found for found in run_all(todo, simulated, Plan(out, cores, limits))}
 
 
@@ -35,7 +35,7 @@ def test_a_result_is_read_kept_and_has_its_log(tmp_path):
     assert (good.verdict, good.published, good.photographs, good.left_out, good.gaussians) == ("OK", True, 3, 0, 1000)
     assert (good.rotation_deg, good.centre_percent, good.reconstruction_s) == (0.1234, 1.5, 0.5)
     assert good.memory_mb >= 12.5 and good.exit_code == 0
-    assert (found["refused"].verdict, found["refused"].published, found["refused"].failed) == (
+    assert (found["refused"].verdict, found["refused"].published, found["refused"].has_failed) == (
         "NO_OVERLAP",
         False,
         False,
@@ -58,14 +58,14 @@ def test_a_result_is_read_kept_and_has_its_log(tmp_path):
 )
 def test_a_failure_has_its_reason_and_costs_only_itself(tmp_path, command, said):
     found = outcomes(tmp_path, bad=f'mkdir "$OUT".x; {command}', good=GOOD)
-    assert found["bad"].failed and said in found["bad"].message
+    assert found["bad"].has_failed and said in found["bad"].message
     assert found["good"].verdict == "OK"
     assert {path.name for path in tmp_path.iterdir() if path.name[0] != "."} == {"bad.log", "good"}
 
 
 def test_what_cannot_be_run_is_told(tmp_path):
     plan = Plan(tmp_path, CORES[:1], Limits())
-    (found,) = run_all([Recording("a", "b")], lambda recording, folder: ["/nowhere/at/all"], plan)
+    (found,) = run_all([BatchRecording("a", "b")], lambda recording, folder: ["/nowhere/at/all"], plan)
     assert found.message == "/nowhere/at/all cannot be run: No such file or directory"
 
 
@@ -94,8 +94,8 @@ def test_what_a_batch_can_do_about_a_want_of_memory_is_told(tmp_path):
     found = outcomes(tmp_path, short=short, killed="kill -9 $$")
     assert found["short"].message.startswith(SHORT_OF_MEMORY)
     assert all("fewer --cores, or --max-memory, leave more" in each.message for each in found.values())
-    lost = without_answer(
-        Recording("a", "b"), NOT_RUN, "its worker was lost 6 times: the node is running low on memory"
+    lost = make_failed_outcome(
+        BatchRecording("a", "b"), NOT_RUN, "its worker was lost 6 times: the node is running low on memory"
     )
     assert lost.message.endswith("in a batch fewer --cores, or --max-memory, leave more of it")
 
@@ -119,7 +119,7 @@ def test_a_result_that_is_made_again_takes_the_place_of_the_old_one(tmp_path):
 
 
 def test_who_stops_reading_ends_what_runs_and_leaves_nothing(tmp_path):
-    todo = [Recording("a", GOOD), Recording("b", 'mkdir "$OUT"; echo $$ > "$OUT/pid"; exec sleep 60')]
+    todo = [BatchRecording("a", GOOD), BatchRecording("b", 'mkdir "$OUT"; echo $$ > "$OUT/pid"; exec sleep 60')]
     plan = Plan(tmp_path, CORES[:1], Limits())
     running = run_all(todo, simulated, plan)
     assert next(running).name == "a"

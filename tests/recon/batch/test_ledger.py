@@ -7,7 +7,7 @@ import json
 import pytest
 
 from splatnode.recon.batch.ledger import LEDGER, Ledger, OtherBatch
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 
 ROW = {"name": "a", "source": "/a", "verdict": "OK", "message": "", "published": True, "photographs": 3}
 ROW |= {"left_out": 0, "rotation_deg": 0.1, "centre_percent": 0.1, "focal_percent": 0.1, "gaussians": 10}
@@ -20,14 +20,14 @@ def test_a_row_has_finite_numbers(tmp_path, number):
     text = "".join(json.dumps(line) + "\n" for line in lines)
     (tmp_path / LEDGER).write_text(text.replace('"focal_percent": 0.1', f'"focal_percent": {number}'))
     with Ledger(tmp_path, ["replay"]) as ledger:
-        assert ledger.verdict(Recording("a", "/a")) is None
-        assert list(ledger.rows([Recording("a", "/a")])) == []
+        assert ledger.verdict(BatchRecording("a", "/a")) is None
+        assert list(ledger.rows([BatchRecording("a", "/a")])) == []
 
 
 def test_a_row_with_finite_numbers_counts(tmp_path):
     (tmp_path / LEDGER).write_text("".join(json.dumps(line) + "\n" for line in [{"batch": 1, "command": []}, ROW]))
     with Ledger(tmp_path, []) as ledger:
-        assert ledger.verdict(Recording("a", "/a")) == "OK"
+        assert ledger.verdict(BatchRecording("a", "/a")) == "OK"
 
 
 def test_the_options_of_another_batch_are_told_on_one_line(tmp_path):

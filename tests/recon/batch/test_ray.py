@@ -12,8 +12,8 @@ import pytest
 from splatnode.batch import reconstruct_dataset, recordings
 from splatnode.recon.batch.command import EXIT_SOME_FAILED, run_batch
 from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import Recording
-from splatnode.recon.jobs.call import packed
+from splatnode.recon.batch.sources import BatchRecording
+from splatnode.recon.jobs.call import pack_call
 from splatnode.recon.jobs.calls import Task, engine
 from splatnode.recon.jobs.child import Limits
 from tests.support.hostile_folder import make_hostile
@@ -21,7 +21,7 @@ from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs
 
 ray = pytest.importorskip("ray", reason="needs ray")
-FOUND = [Recording("good", GOOD), Recording("no", REFUSED), Recording("bad", "echo why; exit 9")]
+FOUND = [BatchRecording("good", GOOD), BatchRecording("no", REFUSED), BatchRecording("bad", "echo why; exit 9")]
 
 
 def test_a_batch_is_as_on_one_machine(tmp_path, capsys):
@@ -36,7 +36,7 @@ def test_workers_run_no_module_of_the_current_folder(tmp_path, monkeypatch):
     """Ray adds the driver's folder to the places of modules of its workers."""
     trace = make_hostile(tmp_path / "photos")
     monkeypatch.chdir(tmp_path / "photos")
-    tasks = iter([Task("cwd", packed(os.getcwd))])
+    tasks = iter([Task("cwd", pack_call(os.getcwd))])
     with engine(1, "") as on:
         ((_, answer),) = on.answers(lambda: next(tasks, None), Limits(), tmp_path / "calls")
     assert answer.value() == str(tmp_path / "photos") and not trace.exists()

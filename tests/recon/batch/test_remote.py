@@ -13,7 +13,7 @@ import pytest
 
 from splatnode.recon.batch import command
 from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import Limits
 from splatnode.recon.jobs.cores import free_core
 from splatnode.recon.jobs.version import own_version
@@ -30,15 +30,15 @@ def visible(folder: Path) -> list[str]:
 
 def test_a_result_is_in_the_folder_and_nothing_else(tmp_path):
     out = tmp_path / "out"
-    assert run_recording(Recording("good", f"echo told; {GOOD}"), job(out)).verdict == "OK"
-    assert run_recording(Recording("no", REFUSED), job(out)).verdict == "NO_OVERLAP"
-    failed = run_recording(Recording("bad", "echo why >&2; exit 9"), job(out))
+    assert run_recording(BatchRecording("good", f"echo told; {GOOD}"), job(out)).verdict == "OK"
+    assert run_recording(BatchRecording("no", REFUSED), job(out)).verdict == "NO_OVERLAP"
+    failed = run_recording(BatchRecording("bad", "echo why >&2; exit 9"), job(out))
     assert (failed.verdict, failed.message) == ("FAILED", "why")
     assert visible(out) == ["bad.log", "good/replay.log", "good/report.json", "no/replay.log", "no/report.json"]
 
 
 def test_a_recording_that_is_run_again_has_one_whole_result(tmp_path):
-    runs = [Recording("same", f"sleep 0.{number}; {GOOD}") for number in range(4)]
+    runs = [BatchRecording("same", f"sleep 0.{number}; {GOOD}") for number in range(4)]
     outcomes = []
     threads = [
         threading.Thread(target=lambda each=each: outcomes.append(run_recording(each, job(tmp_path)))) for each in runs
@@ -52,22 +52,24 @@ def test_a_recording_that_is_run_again_has_one_whole_result(tmp_path):
 
 
 def test_limits_hold_on_a_worker(tmp_path):
-    found = run_recording(Recording("slow", "sleep 60"), job(tmp_path, timeout_s=0.3))
+    found = run_recording(BatchRecording("slow", "sleep 60"), job(tmp_path, timeout_s=0.3))
     assert found.message == "took longer than the 0.3 s that --timeout-s allows"
 
 
 def test_results_go_to_a_store(tmp_path):
     store = f"file://{tmp_path / 'bucket' / 'run'}"
-    assert run_recording(Recording("good", f'{GOOD}; mkdir "$OUT/colmap"; touch "$OUT/colmap/a"'), job(store)).published
-    assert run_recording(Recording("bad", "exit 9"), job(store)).failed
+    assert run_recording(
+        BatchRecording("good", f'{GOOD}; mkdir "$OUT/colmap"; touch "$OUT/colmap/a"'), job(store)
+    ).published
+    assert run_recording(BatchRecording("bad", "exit 9"), job(store)).has_failed
     there = visible(tmp_path / "bucket" / "run")
     assert there == ["bad.log", "good/colmap/a", "good/replay.log", "good/report.json"]
 
 
 def test_a_worker_with_another_splatnode_says_so(tmp_path):
     other = Job(simulated, str(tmp_path), Limits(), "0.0.1 (12345678)")
-    found = run_recording(Recording("a", GOOD), other)
-    assert found.failed and f"has splatnode {own_version()}, the work was begun with 0.0.1" in found.message
+    found = run_recording(BatchRecording("a", GOOD), other)
+    assert found.has_failed and f"has splatnode {own_version()}, the work was begun with 0.0.1" in found.message
     assert found.message.endswith("install the same on all machines") and not visible(tmp_path)
 
 
@@ -81,7 +83,7 @@ def test_each_recording_has_a_core_while_there_are_some():
 
 def test_what_is_sent_to_a_worker_can_be_pickled():
     sent = Job(partial(command.replay, ("--views", "6")), "s3://bucket/run", Limits(500, None), own_version())
-    command_line = pickle.loads(pickle.dumps(sent)).work(Recording("a", "/b"), Path("/c"))
+    command_line = pickle.loads(pickle.dumps(sent)).work(BatchRecording("a", "/b"), Path("/c"))
     assert command_line[2:] == ["splatnode", "replay", "/b", "--out", "/c", "--views", "6"]
 
 

@@ -15,10 +15,10 @@ from mcap.writer import Writer
 
 from splatnode import command_line
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.lerobot.data_set import parts
+from splatnode.capture.lerobot.data_set import list_parts
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
-from splatnode.recon.batch.sources import Recording, recordings
+from splatnode.recon.batch.sources import BatchRecording, recordings
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support import lerobot_sets, mcap_files
@@ -42,7 +42,7 @@ def camera(stem: str, index: int) -> CameraEstimate:
 def placed(tmp_path: Path, *refused: str):
     """The work of a batch: the cameras of frames 0 and 2, or a refusal for recordings of these names."""
 
-    def work(recording: Recording, folder: Path) -> list[str]:
+    def work(recording: BatchRecording, folder: Path) -> list[str]:
         made = tmp_path / "made" / recording.name
         made.mkdir(parents=True, exist_ok=True)
         (made / "report.json").write_text(json.dumps(REFUSAL if recording.name in refused else REPORT))
@@ -99,7 +99,7 @@ def test_in_place_the_tables_get_columns_and_keep_theirs(tmp_path, data_set):
     assert after.select(before.column_names) == before and len(after.column_names) == len(before.column_names) + 22
     row = after.to_pylist()[1]
     assert row["splatnode/top/frame_index"] == [0, 2] and row["splatnode/side/verdict"] == "OK"
-    assert len(parts(data_set)) == 4, "it is a data set as before"
+    assert len(list_parts(data_set)) == 4, "it is a data set as before"
 
 
 def test_a_log_gets_another_one_beside_it(tmp_path, drive):
@@ -156,7 +156,7 @@ def test_what_cannot_be_written_is_said_and_the_rest_goes_on(tmp_path, data_set,
 
 def test_photographs_have_nothing_to_be_written_back_to(tmp_path, capsys):
     out = tmp_path / "out"
-    assert run_batch(options(out, write_back=True), [Recording("a", "/x")], placed(tmp_path), ["act"]) == EXIT_GOOD
+    assert run_batch(options(out, write_back=True), [BatchRecording("a", "/x")], placed(tmp_path), ["act"]) == EXIT_GOOD
     assert "nothing to write back to" in capsys.readouterr().out
 
 

@@ -32,12 +32,12 @@ def test_the_table_has_a_line_for_each_artefact_in_columns():
 
 
 def test_a_scene_that_is_not_published_or_not_measured_fails_the_trial():
-    assert trial.verdict_of(REPORT) == "OK, 33.1 dB, 20 s"
+    assert trial.format_verdict(REPORT) == "OK, 33.1 dB, 20 s"
     refused = {"verdict": {"code": "TOO_FEW", "message": "of one", "publishable": False}}
     with pytest.raises(TrialFailed, match="the demo's verdict is TOO_FEW: of one"):
-        trial.verdict_of({**REPORT, **refused})
+        trial.format_verdict({**REPORT, **refused})
     with pytest.raises(TrialFailed, match="OK"):
-        trial.verdict_of({key: value for key, value in REPORT.items() if key != "held_out"})
+        trial.format_verdict({key: value for key, value in REPORT.items() if key != "held_out"})
 
 
 def test_nothing_of_this_environment_reaches_the_trial():
@@ -48,8 +48,8 @@ def test_nothing_of_this_environment_reaches_the_trial():
         "SPLATNODE_ISA": "avx2",
         "CXX": "g++",
     }
-    assert trial.clean(here, None) == {"PATH": "/usr/bin", "CXX": "g++"}
-    assert trial.clean(here, Path("/e/bin")) == {"PATH": "/e/bin"}
+    assert trial.clean_environment(here, None) == {"PATH": "/usr/bin", "CXX": "g++"}
+    assert trial.clean_environment(here, Path("/e/bin")) == {"PATH": "/e/bin"}
 
 
 def test_links_count_as_themselves(tmp_path):
@@ -68,9 +68,9 @@ The wheel references external versioned symbols
 
 
 def test_the_tag_that_a_wheel_deserves_is_read_across_line_breaks():
-    assert release.least_system(SAID.format("manylinux_2_17_x86_64")) == "manylinux_2_17_x86_64"
+    assert release.find_required_platform(SAID.format("manylinux_2_17_x86_64")) == "manylinux_2_17_x86_64"
     with pytest.raises(RuntimeError, match="does not say"):
-        release.least_system("nothing of the kind")
+        release.find_required_platform("nothing of the kind")
 
 
 def test_a_wheel_that_needs_a_newer_system_than_its_name_says_is_refused(monkeypatch, tmp_path):
@@ -86,7 +86,7 @@ def test_an_artefact_that_does_not_install_fails_loudly(monkeypatch, tmp_path, c
     """The real trial, of a file that is no wheel: pip refuses it at once."""
     wheel = tmp_path / "splatnode-0.1.0-py3-none-any.whl"
     wheel.write_bytes(b"no wheel")
-    row = release.on_trial(wheel.name, wheel)
+    row = release.run_trial(wheel.name, wheel)
     assert not row.good and row.cells == (wheel.name, "0.0 MB", "-", "-", "FAILED")
     assert "pip install" in capsys.readouterr().err
 

@@ -25,22 +25,22 @@ from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.process.folders import LOCK
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import PREVIEW
-from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import membership, worker
-from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.control import Answer, RemoveKeyframe
 from splatnode.recon.daemon.daemon import Daemon
-from splatnode.recon.daemon.tracking import Config as Tracking
+from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.locating.locate import locate
+from splatnode.recon.locating.locate import localize_image
 from splatnode.recon.locating.outcome import Located
 from splatnode.recon.optimize import refinement
-from splatnode.recon.result.bounds_in_words import of_cameras
+from splatnode.recon.result.bounds_in_words import format_widest_bounds
 from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.folder import FolderInUse
 from splatnode.recon.result.landmarks_file import read_landmarks
-from splatnode.recon.result.message import LiveScene, SceneHeader, from_message
+from splatnode.recon.result.message import LiveScene, SceneHeader, decode_snapshot
 from splatnode.recon.result.scale import RELATIVE
 from splatnode.recon.result.verdict import Code
 from tests.capture.messaging.test_sockets import wait_for
@@ -49,15 +49,15 @@ from tests.support.synthetic import photographs, places
 QUICK = Reconstruction(
     size=160,
     preview=replace(PREVIEW, iterations=2),
-    optimize=refinement.Config(iterations=20, checkpoints=(10,)),
+    optimize=refinement.RefinementConfig(iterations=20, checkpoints=(10,)),
 )
 PATIENCE_S = 120.0
 
 
 @pytest.fixture
-def config(tmp_path) -> Config:
+def config(tmp_path) -> DaemonConfig:
     (tmp_path / "run").mkdir(mode=0o700)
-    return Config(
+    return DaemonConfig(
         network=Network(directory=tmp_path / "run"),
         reconstruction=QUICK,
         tracking=Tracking(every_s=0),
@@ -69,7 +69,7 @@ def config(tmp_path) -> Config:
 
 
 @contextmanager
-def running(config: Config) -> Iterator[None]:
+def running(config: DaemonConfig) -> Iterator[None]:
     """The daemon in a thread of its own, until the block ends."""
     stopping, errors = threading.Event(), []
 
@@ -90,7 +90,7 @@ def running(config: Config) -> Iterator[None]:
     assert not thread.is_alive() and not errors, errors
 
 
-def index(config: Config) -> list[dict]:
+def index(config: DaemonConfig) -> list[dict]:
     return json.loads((config.out / "places.json").read_text())["places"]
 
 
@@ -101,7 +101,7 @@ def report(folder: Path) -> dict:
 class Peer:
     """Capture and viewer at once: offers keyframes and hears scenes."""
 
-    def __init__(self, config: Config, folder: Path) -> None:
+    def __init__(self, config: DaemonConfig, folder: Path) -> None:
         self.server = KeyframeServer(config.network, Spool(SpoolConfig(directory=folder)))
         self.client = StateClient(RECON_SCENE, config.network, SceneHeader)
         self.heard: list[LiveScene] = []
@@ -117,7 +117,7 @@ class Peer:
             self.server.serve(0.01)
             message = self.client.poll(0.02)
             if message is not None:
-                self.heard.append(from_message(message))
+                self.heard.append(decode_snapshot(message))
                 if until(self.heard[-1]):
                     return self.heard[-1]
         raise AssertionError(
@@ -126,9 +126,9 @@ class Peer:
 
     def wait_for_acknowledgements(self) -> None:
         deadline = time.monotonic() + PATIENCE_S
-        while self.server.queued and time.monotonic() < deadline:
+        while self.server.num_queued and time.monotonic() < deadline:
             self.server.serve(0.02)
-        assert self.server.queued == 0
+        assert self.server.num_queued == 0
 
 
 @pytest.fixture
@@ -158,20 +158,20 @@ def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_
             Daemon(config, threading.Event())
         status = heartbeats(config.network)["recon"]
         assert status["keyframes"] == 4
-        assert status["bounds"] == of_cameras(scene.snapshot.cameras, RELATIVE) != ""
+        assert status["bounds"] == format_widest_bounds(scene.snapshot.cameras, RELATIVE) != ""
     exported = read_cameras(config.out / "scene-0001" / "cameras.json")
     assert [camera.name for camera in exported] == [frame.name for frame in frames]
     landmarks = read_landmarks(config.out / "scene-0001")
-    assert isinstance(locate(landmarks, frames[1].image), Located)
+    assert isinstance(localize_image(landmarks, frames[1].image), Located)
     assert set(read_depths(config.out / "scene-0001")) == {frame.name for frame in frames}
 
     with running(config):
         again = peer.wait(lambda scene: scene.session != first.session, "a new session")
         assert again.snapshot.final and again.snapshot.iterations == 20
         assert len(again.snapshot.gaussians) == len(scene.snapshot.gaussians)
-        answer = ask(RECON_CONTROL, config.network, Retract("nobody.png"), Answer)
+        answer = ask(RECON_CONTROL, config.network, RemoveKeyframe("nobody.png"), Answer)
         assert not answer.done and frames[0].name in answer.message
-        assert ask(RECON_CONTROL, config.network, Retract(frames[3].name), Answer).done
+        assert ask(RECON_CONTROL, config.network, RemoveKeyframe(frames[3].name), Answer).done
         less = peer.wait(finished(3), "three cameras, refined again")
         assert [dropped.name for dropped in less.snapshot.dropped] == [frames[3].name]
 
@@ -206,7 +206,7 @@ def test_a_result_that_could_not_be_written_is_written_by_the_next_process(confi
 
 
 def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, peer):
-    wild = replace(QUICK.optimize, rates=refinement.Rates(means=1.0, means_unit="depth", log_scales=1.0))
+    wild = replace(QUICK.optimize, rates=refinement.LearningRates(means=1.0, means_unit="depth", log_scales=1.0))
     config = replace(config, reconstruction=replace(QUICK, optimize=wild))
     for frame in photographs()[:3]:
         peer.server.offer(frame)

@@ -10,11 +10,11 @@ import pytest
 from splatnode.capture.messaging.commands import Answer
 from splatnode.recon.daemon import final_result, worker
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.control import Retract
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.control import RemoveKeyframe
 from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.final_result import AGAIN_S, FinalResult
-from splatnode.recon.daemon.inbox import CAPACITY, Inbox, LeftOut
+from splatnode.recon.daemon.inbox import CAPACITY, Inbox, RemovedFrame
 
 FINAL = SimpleNamespace(final=True)
 WORK = SimpleNamespace(names=["a.png", "b.png"])
@@ -46,12 +46,12 @@ def test_what_the_disk_refused_is_written_once_it_takes_it(clock):
     result = FinalResult(SimpleNamespace(names={"a.png", "b.png"}), disk)
     assert not result.write(FINAL, WORK) and not result.names
     disk.full = False
-    assert not result.write_refused(FINAL, WORK, at_once=False)  # it was tried just now
+    assert not result.retry_write(FINAL, WORK, at_once=False)  # it was tried just now
     clock.s += AGAIN_S
-    assert result.write_refused(FINAL, WORK, at_once=False)
+    assert result.retry_write(FINAL, WORK, at_once=False)
     assert result.names == set(WORK.names) and disk.saved == [False, True]
     clock.s += AGAIN_S
-    assert not result.write_refused(FINAL, WORK, at_once=True) and disk.exported == 1
+    assert not result.retry_write(FINAL, WORK, at_once=True) and disk.exported == 1
 
 
 def test_at_the_end_it_is_tried_at_once_and_what_is_not_final_is_left_alone(clock):
@@ -60,8 +60,8 @@ def test_at_the_end_it_is_tried_at_once_and_what_is_not_final_is_left_alone(cloc
     result.write(FINAL, WORK)
     disk.full = False
     for shown in (None, SimpleNamespace(final=False)):
-        assert not result.write_refused(shown, WORK, at_once=True)
-    assert result.write_refused(FINAL, WORK, at_once=True)
+        assert not result.retry_write(shown, WORK, at_once=True)
+    assert result.retry_write(FINAL, WORK, at_once=True)
 
 
 @pytest.fixture
@@ -74,9 +74,9 @@ def working(tmp_path, monkeypatch):
         place.owed, place.settled = [], True
 
     place.take_in = take_in
-    monkeypatch.setattr(worker, "PresentPlace", lambda *_: place)
+    monkeypatch.setattr(worker, "ActiveSubmap", lambda *_: place)
     node = worker.Worker(
-        Config(out=tmp_path / "out"), Store(tmp_path / "store"), Inbox(), lambda _: None, threading.Event()
+        DaemonConfig(out=tmp_path / "out"), Store(tmp_path / "store"), Inbox(), lambda _: None, threading.Event()
     )
     return node, place
 
@@ -101,7 +101,7 @@ def test_a_step_that_memory_or_disk_did_not_suffice_for_is_tried_again(working, 
 def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
     inbox, forgotten = Inbox(), []
     for index in range(CAPACITY):
-        inbox.put(LeftOut(str(index)), threading.Event())
+        inbox.enqueue(RemovedFrame(str(index)), threading.Event())
     daemon = SimpleNamespace(
         _worker=SimpleNamespace(scenes_left_with=lambda _: []),
         _store=SimpleNamespace(names={"a.png"}, forget=lambda *what: forgotten.append(what)),
@@ -109,7 +109,9 @@ def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
         _stopping=threading.Event(),
     )
     answers: list[Answer] = []
-    asking = threading.Thread(target=lambda: answers.append(Daemon._answer(daemon, Retract("a.png"))), daemon=True)
+    asking = threading.Thread(
+        target=lambda: answers.append(Daemon._answer(daemon, RemoveKeyframe("a.png"))), daemon=True
+    )
     asking.start()
     asking.join(60)
     assert answers and answers[0].done and forgotten == [("a.png", "retracted")]

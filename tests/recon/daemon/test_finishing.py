@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from splatnode.recon.config import PRESETS, Config
+from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.daemon import finishing
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.modelling import Shown
+from splatnode.recon.modelling import SceneWithVerdict
 from splatnode.recon.optimize import refinement
 from splatnode.recon.pipeline import reconstruct
 from tests.support.synthetic import photographs
@@ -22,25 +22,29 @@ class Work:
     """What finishing needs of an IncrementalReconstruction."""
 
     begun: str = "begun"
-    asked: list[refinement.Config] = field(default_factory=list)
+    asked: list[refinement.RefinementConfig] = field(default_factory=list)
 
     def rebuild(self, pause: Callable[[], None]) -> None:
         pause()
 
-    def refine(self, scene: str, steps: refinement.Config, pause: Callable[[], None]) -> Iterator[Shown]:
+    def refine(
+        self, scene: str, steps: refinement.RefinementConfig, pause: Callable[[], None]
+    ) -> Iterator[SceneWithVerdict]:
         assert scene == self.begun
         self.asked.append(steps)
         for _ in range(steps.steps):
             pause()
-        yield Shown()
+        yield SceneWithVerdict()
 
 
 def test_the_scene_is_that_of_an_offline_run_to_the_bit():
     frames = photographs()[1:4]
-    config = Config(size=160, optimize=refinement.Config(iterations=refinement.MIN_SOFT, checkpoints=()))
+    config = ReconstructionConfig(
+        size=160, optimize=refinement.RefinementConfig(iterations=refinement.MIN_SOFT, checkpoints=())
+    )
     work = IncrementalReconstruction(config)
     for frame in frames:
-        work.take(frame)
+        work.add_frame(frame)
     *_, live = finishing.refine(work, config, lambda: None)
     *_, offline = reconstruct(frames, config)
     assert live.scene is not None and len(offline.gaussians) > 1000

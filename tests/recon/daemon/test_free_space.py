@@ -11,17 +11,17 @@ from msgspec.structs import replace
 
 import splatnode
 from splatnode.recon.daemon import free_space
-from splatnode.recon.daemon.free_space import NOT_FINAL, Config, FreeSpace
+from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyConfig, OccupancyMapper
 from splatnode.recon.daemon.present_place import Abandoned
-from splatnode.recon.daemon.status import State
-from splatnode.recon.daemon.watcher import Finished
+from splatnode.recon.daemon.status import ReconState
+from splatnode.recon.daemon.watcher import FinalScene
 from splatnode.recon.occupancy.occupancy_map import OccupancyMap
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.recon.daemon.test_daemon import PATIENCE_S, Peer, config, finished, peer, running  # noqa: F401
 from tests.support.occupied import room_snapshot
 from tests.support.synthetic import photographs, places
 
-LIVE = Config(live=True)
+LIVE = OccupancyConfig(live=True)
 
 
 def map_when(peer: Peer, node: splatnode.Node, ready) -> splatnode.NodeMap:  # noqa: F811
@@ -72,7 +72,7 @@ def test_a_restarted_node_sends_the_map_again_and_none_where_it_is_not_configure
             first = peer.wait(finished(3), "a final scene")
             peer.wait_for_acknowledgements()
             assert "map.live" in node.wait_for_map(0.5).why
-        with running(replace(config, map=Config(live=True, voxel=0.05))):
+        with running(replace(config, map=OccupancyConfig(live=True, voxel=0.05))):
             told = map_when(peer, node, lambda told: told.occupancy is not None)
             saved = splatnode.load(config.out / "scene-0001").map(voxel=0.05)
             assert told.scene_id == first.scene_id and np.array_equal(told.occupancy.states, saved.states)
@@ -89,21 +89,24 @@ def test_a_refusal_is_told_with_its_reason(config, peer):  # noqa: F811
 
 
 def test_a_map_is_abandoned_for_a_keyframe_and_made_afterwards(tmp_path):
-    scene, calls = Finished(room_snapshot(), ()), iter(range(100))
+    scene, calls = FinalScene(room_snapshot(), ()), iter(range(100))
 
     def interrupted() -> None:
         if next(calls) == 2:
             raise Abandoned
 
-    space = FreeSpace(LIVE)
+    space = OccupancyMapper(LIVE)
     with pytest.raises(Abandoned):
-        space.make(scene, State.IDLE, tmp_path, interrupted)
-    assert space.current(scene, State.IDLE) == NOT_FINAL
-    assert space.make(scene, State.IDLE, tmp_path, interrupted)
-    assert not space.make(scene, State.IDLE, tmp_path, interrupted)
-    found = space.current(scene, State.IDLE)
+        space.map_scene(scene, ReconState.IDLE, tmp_path, interrupted)
+    assert space.find_current_map(scene, ReconState.IDLE) == NOT_FINAL
+    assert space.map_scene(scene, ReconState.IDLE, tmp_path, interrupted)
+    assert not space.map_scene(scene, ReconState.IDLE, tmp_path, interrupted)
+    found = space.find_current_map(scene, ReconState.IDLE)
     assert not isinstance(found, str) and found.occupancy is not None
-    assert space.current(scene, State.LOST) == free_space.LOST and space.current(None, State.GROWING) == NOT_FINAL
+    assert (
+        space.find_current_map(scene, ReconState.LOST) == free_space.LOST
+        and space.find_current_map(None, ReconState.GROWING) == NOT_FINAL
+    )
 
 
 def test_rough_cameras_and_voxels_that_are_too_many_give_no_map_but_a_reason(tmp_path):
@@ -111,7 +114,7 @@ def test_rough_cameras_and_voxels_that_are_too_many_give_no_map_but_a_reason(tmp
     rough = changed(room, verdict=Verdict(Code.OK_ROUGH, "Rough.", "Take more.", publishable=True))
     cases = ((rough, None, "could call free what is solid"), (room, 1e-6, "give a voxel of at least"))
     for snapshot, voxel, why in cases:
-        space, scene = FreeSpace(Config(live=True, voxel=voxel)), Finished(snapshot, ())
-        assert space.make(scene, State.IDLE, tmp_path, lambda: None)
-        found = space.current(scene, State.IDLE)
+        space, scene = OccupancyMapper(OccupancyConfig(live=True, voxel=voxel)), FinalScene(snapshot, ())
+        assert space.map_scene(scene, ReconState.IDLE, tmp_path, lambda: None)
+        found = space.find_current_map(scene, ReconState.IDLE)
         assert not isinstance(found, str) and found.occupancy is None and why in found.why

@@ -29,8 +29,8 @@ from splatnode.recon.result.message import SceneHeader
 
 SCHEMAS = [
     keyframe_messages.FrameHeader, keyframe_messages.DroppedHeader, keyframe_messages.Delivery,
-    keyframe_messages.Served, keyframe_messages.Ready, keyframe_messages.Acknowledge, keyframe_messages.Refuse,
-    preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.Seen, commands.Answer, control.Retract,
+    keyframe_messages.ConsumerStatus, keyframe_messages.Ready, keyframe_messages.Acknowledge, keyframe_messages.Refuse,
+    preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.MarkProblemsSeen, commands.Answer, control.RemoveKeyframe,
     Want, ReconStatus, SceneHeader, MapHeader, DepthHeader,
 ]  # fmt: skip
 # Their __post_init__ knows all their bounds.

@@ -114,11 +114,11 @@ def test_of_a_batch_only_the_keyframe_that_does_not_fit_at_once_is_set_aside():
 
 def test_keyframes_that_only_all_together_have_a_place_join_the_scene():
     work = reconstruction("0", "1", "2")
-    assert come(work, "3-late") == {"3-late"} and membership.connected(work)
-    assert membership.join(work, ["3-late"]) and named(membership.strangers(work)) == ["3-late"]
-    assert come(work, "4-late") == {"4-late"} and named(membership.strangers(work)) == ["3-late", "4-late"]
+    assert come(work, "3-late") == {"3-late"} and membership.has_links_to_deferred(work)
+    assert membership.join(work, ["3-late"]) and named(membership.find_untracked(work)) == ["3-late"]
+    assert come(work, "4-late") == {"4-late"} and named(membership.find_untracked(work)) == ["3-late", "4-late"]
     assert membership.join(work, named(work.aside))
-    assert work.names == ["0", "1", "2", "3-late", "4-late"] and membership.strangers(work) == []
+    assert work.names == ["0", "1", "2", "3-late", "4-late"] and membership.find_untracked(work) == []
 
 
 def test_what_was_refused_once_is_not_estimated_again_and_stays_aside():
@@ -143,31 +143,33 @@ def test_only_the_last_strangers_in_a_row_count_and_those_before_contradict_the_
     come(work, "3-bad")
     come(work, "4")
     come(work, "5-other")
-    assert named(membership.strangers(work)) == ["5-other"] and named(membership.contradicting(work)) == ["3-bad"]
+    assert named(membership.find_untracked(work)) == ["5-other"] and named(membership.find_contradicting(work)) == [
+        "3-bad"
+    ]
 
 
 def test_no_pair_leads_to_another_place():
     work = reconstruction("0", "1", "2")
     come(work, "3-other")
-    assert not membership.connected(work) and named(work.aside) == ["3-other"]
+    assert not membership.has_links_to_deferred(work) and named(work.aside) == ["3-other"]
     come(work, "4-bad")
-    assert membership.connected(work)
+    assert membership.has_links_to_deferred(work)
 
 
 def test_what_was_added_for_now_and_spoils_the_scene_is_found_when_all_is_proven():
     work = reconstruction("0", "1", "2")
     assert come(work, "3", "4-worse", "5") == set()
-    membership.prove(work)
+    membership.verify_provisional(work)
     assert work.names == ["0", "1", "2", "3", "5"] and named(work.aside) == ["4-worse"]
-    assert named(membership.contradicting(work)) == ["4-worse"]
+    assert named(membership.find_contradicting(work)) == ["4-worse"]
 
 
 def test_proof_brings_in_what_only_all_together_have_a_place_for():
     work = reconstruction("0", "1", "2")
     come(work, "3-late")
     come(work, "4-late")
-    membership.prove(work)
-    assert membership.strangers(work) == [] and not work.aside
+    membership.verify_provisional(work)
+    assert membership.find_untracked(work) == [] and not work.aside
 
 
 def test_proof_that_is_abandoned_changes_nothing():
@@ -178,14 +180,14 @@ def test_proof_that_is_abandoned_changes_nothing():
     come(work, "3-worse")
     come(work, "4-bad")
     with pytest.raises(InterruptedError):
-        membership.prove(work, pause)
+        membership.verify_provisional(work, pause)
     assert work.names == ["0", "1", "2", "3-worse"] and named(work.aside) == ["4-bad"]
 
 
 def test_a_scene_that_was_never_proven_is_not_taken_apart():
     work = reconstruction()
     come(work, "0", "1", "2-worse")
-    membership.prove(work)
+    membership.verify_provisional(work)
     assert work.names == ["0", "1", "2-worse"]
 
 
@@ -200,23 +202,23 @@ def test_a_scene_that_was_never_proven_is_not_taken_apart():
 )
 def test_the_older_of_the_two_most_alike_is_given_up(matches, spared):
     pairs: Any = {pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()}
-    graph = ViewGraph(matching.Config(), tuple(keyframe(str(i)) for i in range(6)), pairs)
-    assert membership.most_redundant(graph) == spared
+    graph = ViewGraph(matching.MatchingConfig(), tuple(keyframe(str(i)) for i in range(6)), pairs)
+    assert membership.find_most_redundant(graph) == spared
 
 
 def test_keyframes_that_only_each_other_join_are_a_place_of_their_own():
     work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
-    assert [named(group) for group in membership.apart(work)] == [["3-other", "4-other", "5-other"]]
-    assert membership.apart(reconstruction("0", "1", "2", "3-other", "4-other")) == []
+    assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
+    assert membership.find_separate_groups(reconstruction("0", "1", "2", "3-other", "4-other")) == []
 
 
 def test_of_those_that_were_set_aside_too():
     work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
     work.set_aside(["4-other", "5-other"])
-    assert [named(group) for group in membership.apart(work)] == [["3-other", "4-other", "5-other"]]
+    assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
     assert work.names == ["0", "1", "2", "3-other"]
 
 
 def test_without_a_scene_what_most_keyframes_show_stays():
     work = reconstruction("0-bad", "1", "2", "3-other", "4-other", "5-other", "6")
-    assert [named(group) for group in membership.apart(work)] == [["3-other", "4-other", "5-other"]]
+    assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]

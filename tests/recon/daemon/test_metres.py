@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.given_pose import given_pose
+from splatnode.capture.given_pose import make_given_pose
 from splatnode.capture.status import heartbeats
-from splatnode.recon.daemon.metres import Metres
+from splatnode.recon.daemon.metres import MetricScaler
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.metric.config import Config as Metric
+from splatnode.recon.metric.config import MetricConfig as Metric
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.cameras import decode_scale
 from tests.recon.daemon.test_daemon import config, finished, peer, running  # noqa: F401
@@ -36,7 +36,8 @@ def with_poses(factor: float = 1.0):
     for T in moved:
         T[:3, 3] *= factor
     return [
-        replace(frame, given_pose=given_pose(T, 0.01, 1.0)) for frame, T in zip(photographs()[:3], moved, strict=False)
+        replace(frame, given_pose=make_given_pose(T, 0.01, 1.0))
+        for frame, T in zip(photographs()[:3], moved, strict=False)
     ]
 
 
@@ -95,7 +96,7 @@ def test_a_marker_is_looked_for_once_in_a_keyframe(monkeypatch):
     frames = photographs()[:2]
     none = Features.__new__(Features)
     keyframes = [Keyframe(frame, frame.image, none) for frame in frames]
-    metres = Metres(Metric(marker_m=0.1))
+    metres = MetricScaler(Metric(marker_m=0.1))
     for known in (keyframes[:1], keyframes, keyframes):
-        metres.told_by(known)
+        metres.collect_evidence(known)
     assert asked == [frame.name for frame in frames]

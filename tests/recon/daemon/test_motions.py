@@ -13,11 +13,11 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.odometry import Config as Odometry
 from splatnode.capture.frame import Frame
 from splatnode.capture.recording import Recorder
-from splatnode.recon.daemon.free_space import Config as FreeSpace
+from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
 from tests.recon.daemon.test_daemon import config, finished, peer, running  # noqa: F401
 from tests.support.synthetic import SMALL, photographs
 
-MEASURED = synthetic.measured_motions(changed(SMALL, odometry=Odometry(drift=0.02, noise_deg=2.0)))
+MEASURED = synthetic.simulate_odometry(changed(SMALL, odometry=Odometry(drift=0.02, noise_deg=2.0)))
 TRUE = [T for T, _ in synthetic.scene_cameras(SMALL)]
 
 

@@ -13,11 +13,11 @@ from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import WireError
 from splatnode.recon.daemon.daemon import Daemon
-from splatnode.recon.daemon.free_space import Config as FreeSpace
-from splatnode.recon.daemon.free_space import Mapped
-from splatnode.recon.daemon.output import Published
+from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
+from splatnode.recon.daemon.free_space import OccupancyResult
+from splatnode.recon.daemon.output import PublishedSnapshot
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.daemon.watcher import Finished
+from splatnode.recon.daemon.watcher import FinalScene
 from splatnode.recon.occupancy.message import MapHeader
 from splatnode.recon.result.message import SceneHeader
 from tests.recon.daemon.test_daemon import config  # noqa: F401
@@ -39,11 +39,11 @@ def test_scenes_maps_and_heartbeats_are_each_numbered_without_gaps_in_one_sessio
     with Daemon(replace(config, map=FreeSpace(live=True)), threading.Event()) as daemon:
         for fits[0] in (True, False, True):
             for _ in range(2):
-                daemon._heartbeat.send(daemon._status())
-            shown = Published(changed(made, images=images), "scene-0001")
-            daemon._newest.put(shown)
+                daemon._heartbeat.send(daemon._make_status())
+            shown = PublishedSnapshot(changed(made, images=images), "scene-0001")
+            daemon._newest.update(shown)
             daemon._publish()
-            daemon._tell_map(Mapped(Finished(shown.snapshot, ()), small_map(np.zeros((2, 2, 2)))))
+            daemon._publish_map(OccupancyResult(FinalScene(shown.snapshot, ()), small_map(np.zeros((2, 2, 2)))))
     for kind, count in ((SceneHeader, 3), (MapHeader, 6), (ReconStatus, 6)):
         assert [header.sequence for header in sent[kind]] == list(range(count))
     assert len({header.session for headers in sent.values() for header in headers}) == 1

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.frame import DroppedFrame, Frame, renamed
+from splatnode.capture.frame import DroppedFrame, Frame, rename_frame
 from splatnode.capture.messaging.commands import Answer, ask
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon import left_places
-from splatnode.recon.daemon.atlas.atlas import Atlas
+from splatnode.recon.daemon.atlas.atlas import LoopDetector
 from splatnode.recon.daemon.checkpoint import checkpoint, left
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.control import Retract
-from splatnode.recon.daemon.inbox import BATCH, Arrived, Inbox
-from splatnode.recon.daemon.left_places import LeftPlaces
+from splatnode.recon.daemon.control import RemoveKeyframe
+from splatnode.recon.daemon.inbox import BATCH, ArrivedKeyframe, Inbox
+from splatnode.recon.daemon.left_places import InactiveSubmaps
 from splatnode.recon.daemon.output import Output
-from splatnode.recon.daemon.places import Places, State, described
-from splatnode.recon.daemon.present_place import PresentPlace
+from splatnode.recon.daemon.places import SubmapIndex, SubmapState, make_submap_record
+from splatnode.recon.daemon.present_place import ActiveSubmap
 from splatnode.recon.result.export import read_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import (
@@ -108,7 +108,7 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
     told |= {dropped["name"] for place in (first, second) for dropped in place["frames_dropped"]}
     assert told == {frame.name for frame in frames}
     assert not report(config.out / "scene-0001")["verdict"]["provisional"]
-    assert not (config.out / "scene-0001-provisional").exists() and left.folders(config.checkpoint) == []
+    assert not (config.out / "scene-0001-provisional").exists() and left.list_left_folders(config.checkpoint) == []
 
 
 def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
@@ -121,19 +121,19 @@ def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
         for frame in mirrored:
             peer.server.offer(frame)
         peer.wait(lambda scene: scene.scene_id == "scene-0002" and finished(3)(scene), "another place, finished")
-        wait_for(lambda: left.finished(config.checkpoint), PATIENCE_S)
+        wait_for(lambda: left.list_finished_folders(config.checkpoint), PATIENCE_S)
         name = here[3].name
-        answer = ask(RECON_CONTROL, config.network, Retract(name), Answer)
+        answer = ask(RECON_CONTROL, config.network, RemoveKeyframe(name), Answer)
         assert answer.done and "scene-0001, which the camera has left" in answer.message
         wait_for(lambda: name not in index(config)[0]["frames_used"], PATIENCE_S)
         wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
-        assert not ask(RECON_CONTROL, config.network, Retract("nothing.png"), Answer).done
+        assert not ask(RECON_CONTROL, config.network, RemoveKeyframe("nothing.png"), Answer).done
     first, second = index(config)
     assert {each["name"]: each["reason"] for each in first["frames_dropped"]} == {name: "retracted"}
     assert first["state"] == "finished" and not first["provisional"] and second["state"] == "here"
     kept = [camera.name for camera in read_cameras(config.out / "scene-0001" / "cameras.json")]
     assert kept == [frame.name for frame in here[:3]]
-    assert left.folders(config.checkpoint) == [] and len(left.finished(config.checkpoint)) == 1
+    assert left.list_left_folders(config.checkpoint) == [] and len(left.list_finished_folders(config.checkpoint)) == 1
 
 
 def replace_image(frame, index):
@@ -145,17 +145,17 @@ def replace_image(frame, index):
 def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, monkeypatch):
     frames = places(seeds=(0, 1))
     with monkeypatch.context() as patch, running(replace(moving, lost_after=3)):
-        patch.setattr(LeftPlaces, "judge_next", never)
-        patch.setattr(LeftPlaces, "finish_next", never)
+        patch.setattr(InactiveSubmaps, "judge_next", never)
+        patch.setattr(InactiveSubmaps, "finish_next", never)
         offer_when_three_are_shown(peer, frames)
         peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
         peer.wait_for_acknowledgements()
     assert report(moving.out / "scene-0001-provisional")["verdict"]["provisional"]
-    assert index(moving)[0]["state"] == "left" and len(left.folders(moving.checkpoint)) == 1
+    assert index(moving)[0]["state"] == "left" and len(left.list_left_folders(moving.checkpoint)) == 1
 
     with running(replace(moving, settle_s=0.2, lost_after=3)):
         wait_for((moving.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
-        wait_for(lambda: not left.folders(moving.checkpoint), PATIENCE_S)
+        wait_for(lambda: not left.list_left_folders(moving.checkpoint), PATIENCE_S)
     kept = read_cameras(moving.out / "scene-0001" / "cameras.json")
     assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
     assert report(moving.out / "scene-0001")["iterations"] == moving.reconstruction.optimize.iterations
@@ -171,13 +171,13 @@ def test_a_place_whose_finishing_was_killed_is_finished_by_the_next_process(conf
         pytest.raises(AssertionError, match="SystemExit"),
         running(replace(config, lost_after=3)),
     ):
-        patch.setattr(left_places, "_last", die)
+        patch.setattr(left_places, "_refine_to_end", die)
         offer_when_three_are_shown(peer, frames)
         wait_for(lambda: peer.server.serve(0.02) or heartbeats(config.network, 0.5)["recon"] is None, PATIENCE_S)
     assert (config.out / "scene-0001-provisional").exists() and not (config.out / "scene-0001").exists()
 
     with running(replace(config, lost_after=3)):
-        wait_for(lambda: not left.folders(config.checkpoint), PATIENCE_S)
+        wait_for(lambda: not left.list_left_folders(config.checkpoint), PATIENCE_S)
     assert [(place["state"], place["provisional"]) for place in index(config)] == [("finished", False), ("here", False)]
 
 
@@ -186,7 +186,7 @@ def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, mo
         raise ArithmeticError("for the test")
 
     frames = places(seeds=(0, 1))
-    monkeypatch.setattr(left_places, "_last", fail)
+    monkeypatch.setattr(left_places, "_refine_to_end", fail)
     with running(replace(config, lost_after=3)):
         offer_when_three_are_shown(peer, frames)
         wait_for(
@@ -200,7 +200,7 @@ def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, mo
 
 def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer, monkeypatch):
     begun, shown = threading.Event(), threading.Event()
-    last = left_places._last
+    last = left_places._refine_to_end
 
     def slow(work, recipe, pause):
         begun.set()
@@ -209,7 +209,7 @@ def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer
             time.sleep(0.01)
         return last(work, recipe, pause)
 
-    monkeypatch.setattr(left_places, "_last", slow)
+    monkeypatch.setattr(left_places, "_refine_to_end", slow)
     frames = places(msgspec.structs.replace(SMALL, views=8))
     with running(replace(config, lost_after=3)):
         offer_when_three_are_shown(peer, [*frames[:3], *frames[4:7]])
@@ -225,9 +225,9 @@ def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer
 def test_keyframes_are_worked_in_a_few_at_a_time():
     inbox, stopping = Inbox(), threading.Event()
     for number in range(2 * BATCH + 1):
-        inbox.put(Arrived(None, float(number)), stopping)  # pyright: ignore[reportArgumentType]
+        inbox.enqueue(ArrivedKeyframe(None, float(number)), stopping)  # pyright: ignore[reportArgumentType]
     assert inbox.oldest_s == 0.0
-    assert [len(inbox.get(0)) for _ in range(4)] == [BATCH, BATCH, 1, 0]
+    assert [len(inbox.dequeue(0)) for _ in range(4)] == [BATCH, BATCH, 1, 0]
     assert inbox.oldest_s is None
 
 
@@ -238,7 +238,7 @@ def test_room_is_made_only_for_what_fits(moving, peer):
             peer.server.offer(frame)
         peer.wait(lambda scene: len(scene.snapshot.cameras) == 4, "four cameras")
         for number, frame in enumerate(others):
-            peer.server.offer(renamed(frame, 4 + number, f"other{number}.png", 4 + number))
+            peer.server.offer(rename_frame(frame, 4 + number, f"other{number}.png", 4 + number))
         wait_for(lambda: peer.server.serve(0.02) or heartbeats(moving.network)["recon"]["state"] == "lost", PATIENCE_S)
     (place,) = index(moving)
     assert place["frames_used"] == [frame.name for frame in ours]
@@ -254,7 +254,7 @@ def test_a_scene_that_is_full_goes_on_as_the_next_one_and_both_are_linked(config
                     lambda scene, frame=frame: frame.name in {each.name for each in scene.snapshot.cameras}, frame.name
                 )
         peer.wait_for_acknowledgements()
-        wait_for(lambda: not left.folders(config.checkpoint) and final(config) == 2, PATIENCE_S)
+        wait_for(lambda: not left.list_left_folders(config.checkpoint) and final(config) == 2, PATIENCE_S)
     first, second = index(config)
     names = [frame.name for frame in frames]
     assert set(first["frames_used"]) | set(second["frames_used"]) == set(names)
@@ -274,11 +274,11 @@ def test_a_scene_that_is_full_goes_on_as_the_next_one_and_both_are_linked(config
 
 def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, peer, monkeypatch):
     ours, (stranger, *_) = photographs(), places(seeds=(0, 1))[3:]
-    came = [*ours[:3], renamed(stranger, 3, "stranger.png", 3)]
-    came += [renamed(frame, 4 + number, frame.name, 4 + number) for number, frame in enumerate(ours[3:])]
+    came = [*ours[:3], rename_frame(stranger, 3, "stranger.png", 3)]
+    came += [rename_frame(frame, 4 + number, frame.name, 4 + number) for number, frame in enumerate(ours[3:])]
     aside: list[list[str]] = []
     monkeypatch.setattr(
-        PresentPlace, "export_provisionally", lambda place: aside.append([each.name for each in place._work.aside])
+        ActiveSubmap, "export_provisionally", lambda place: aside.append([each.name for each in place._work.aside])
     )
     with running(replace(moving, max_views=5, export_every_s=NEVER_S)):
         for count, frame in enumerate(came, 1):
@@ -296,8 +296,8 @@ def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, pee
     assert aside == [[]]  # at the stop
     with closing(Store(moving.checkpoint)) as store:
         assert store.scene_id == "scene-0002" and store.names == {frame.name for frame in ours[3:]}
-        assert checkpoint.restore(store, moving.reconstruction).work.remembered() is not None
-    with closing(Store(left.folder_of(moving.checkpoint, "scene-0001"))) as store:
+        assert checkpoint.restore(store, moving.reconstruction).work.find_reconstruction() is not None
+    with closing(Store(left.find_folder(moving.checkpoint, "scene-0001"))) as store:
         assert "stranger.png" in store.names
 
 
@@ -306,19 +306,19 @@ def test_a_place_that_turns_out_to_be_two_becomes_two(config):
     with closing(Store(config.checkpoint)) as store:
         frames = places(seeds=(0, 1))
         for number, frame in enumerate(frames):
-            store.put(ReceivedFrame("0" * 32, number, frame))
-        store.leave_place(len(frames))
+            store.add_frame(ReceivedFrame("0" * 32, number, frame))
+        store.leave_submap(len(frames))
         output = Output(config, store, lambda _: None, pytest.fail)
-        atlas = Atlas(store.directory, config.reconstruction, output.places)
-        waiting = LeftPlaces(store, config.reconstruction, output, atlas)
-        assert waiting.judge_next(lambda: None)
-        first, part = [folder.name for folder in left.folders(config.checkpoint)]
+        atlas = LoopDetector(store.directory, config.reconstruction, output.places)
+        waiting = InactiveSubmaps(store, config.reconstruction, output, atlas)
+        assert waiting.verify_next(lambda: None)
+        first, part = [folder.name for folder in left.list_left_folders(config.checkpoint)]
         ours, other = by_id(config)
         assert first == ours["scene_id"] == "scene-0001" and part == other["scene_id"] and ours["judged"]
         assert {each["reason"] for each in ours["frames_dropped"]} == {f"it shows another place: {part}"}
         assert {each["name"] for each in ours["frames_dropped"]} == {each["name"] for each in other["frames_dropped"]}
         assert not other["judged"]
-        assert waiting.judge_next(lambda: None) and not waiting.judge_next(lambda: None)
+        assert waiting.verify_next(lambda: None) and not waiting.verify_next(lambda: None)
         ours, other = by_id(config)
         names = [frame.name for frame in frames]
         assert other["judged"] and sorted([ours["frames_used"], other["frames_used"]]) == [names[:3], names[3:]]
@@ -335,12 +335,16 @@ def final(config) -> int:
 
 
 def test_an_index_of_another_checkpoint_or_a_damaged_one_begins_anew(tmp_path):
-    place = described("scene-0001", State.HERE, "scene-0001", make_snapshot(), [], [DroppedFrame("a.png", "blurred")])
-    Places(tmp_path, "one").tell(place)
-    Places(tmp_path, "one").finished("scene-0001")
+    place = make_submap_record(
+        "scene-0001", SubmapState.HERE, "scene-0001", make_snapshot(), [], [DroppedFrame("a.png", "blurred")]
+    )
+    SubmapIndex(tmp_path, "one").update(place)
+    SubmapIndex(tmp_path, "one").mark_finished("scene-0001")
     assert '"finished"' in (tmp_path / "places.json").read_text()
-    Places(tmp_path, "other").tell(described("scene-0007", State.HERE, None, make_snapshot(), [], []))
+    SubmapIndex(tmp_path, "other").update(
+        make_submap_record("scene-0007", SubmapState.HERE, None, make_snapshot(), [], [])
+    )
     assert "scene-0001" not in (tmp_path / "places.json").read_text()
     (tmp_path / "places.json").write_bytes(np.random.default_rng(0).bytes(100))
-    Places(tmp_path, "one").tell(place)
+    SubmapIndex(tmp_path, "one").update(place)
     assert "blurred" in (tmp_path / "places.json").read_text()

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging import keys
 from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.commands import Answer, Seen, ask
+from splatnode.capture.messaging.commands import Answer, MarkProblemsSeen, ask
 from splatnode.capture.messaging.keyframe_messages import FrameHeader
 from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_CONTROL
@@ -24,15 +24,15 @@ from splatnode.capture.preview import Config as PreviewConfig
 from splatnode.capture.preview import encode_preview
 from splatnode.capture.process.problems import Problems
 from splatnode.capture.status import heartbeats
-from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import intake, previews, watcher
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.control import Retract
-from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.control import RemoveKeyframe
+from splatnode.recon.daemon.inbox import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.daemon.intake import Intake
-from splatnode.recon.daemon.tracking import Config as Tracking
-from splatnode.recon.daemon.watcher import Finished, Watcher
+from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
+from splatnode.recon.daemon.watcher import FinalScene, Watcher
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.recon.daemon.test_daemon import config, peer, running  # noqa: F401
 from tests.support.synthetic import photographs
@@ -72,7 +72,7 @@ class Taking:
 
         def come():
             self.server.serve(0.01)
-            found.extend(self.inbox.get(0))
+            found.extend(self.inbox.dequeue(0))
             return len(found) >= count
 
         wait_for(come)
@@ -110,7 +110,7 @@ def impatient(monkeypatch):
 
 def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plain, impatient):
     with taking(ipc(tmp_path), tmp_path) as node:
-        put, failures = node.store.put, [OSError(28, "No space left"), OSError(5, "Input/output error")]
+        put, failures = node.store.add_frame, [OSError(28, "No space left"), OSError(5, "Input/output error")]
         monkeypatch.setattr(node.store, "put", lambda one: _raise(failures.pop()) if failures else put(one))
         node.server.offer(frame(0))
         node.until(lambda: node.server.acknowledged == 1)
@@ -119,7 +119,7 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plai
 
 def test_what_cannot_be_stored_is_refused_and_told_until_seen(tmp_path, monkeypatch, plain):
     with taking(ipc(tmp_path), tmp_path) as node:
-        put = node.store.put
+        put = node.store.add_frame
         monkeypatch.setattr(
             node.store, "put", lambda one: _raise(ArithmeticError("odd")) if one.frame.name == "0.png" else put(one)
         )
@@ -137,7 +137,7 @@ def test_what_cannot_be_used_is_left_out_also_where_the_checkpoint_cannot_be_cha
         monkeypatch.setattr(node.store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
         for index in range(3):
             node.server.offer(frame(index))
-        assert node.events(3) == [LeftOut(f"{index}.png") for index in range(3)]
+        assert node.events(3) == [RemovedFrame(f"{index}.png") for index in range(3)]
         assert "3 keyframes that cannot be used, the last: 2.png: for the test" in str(node.problems)
 
 
@@ -146,7 +146,9 @@ def test_what_the_camera_could_not_give_is_remembered_and_disturbs_no_scene(tmp_
         node.server.offer(DroppedFrame("blurred.png", "blurred"))
         node.server.offer(frame(0))
         (arrived,) = node.events(1)
-        assert arrived.keyframe.name == "0.png" and node.store.dropped == [DroppedFrame("blurred.png", "blurred")]
+        assert arrived.keyframe.name == "0.png" and node.store.frames_dropped == [
+            DroppedFrame("blurred.png", "blurred")
+        ]
 
 
 def test_what_there_is_no_memory_for_waits_until_there_is(tmp_path, monkeypatch, plain, impatient):
@@ -169,7 +171,7 @@ def test_two_frames_of_one_name_and_names_that_look_like_ours(tmp_path, plain):
     with taking(ipc(tmp_path), tmp_path) as node:
         for index, name in enumerate(names):
             node.server.offer(frame(index, name))
-        taken = [each.keyframe.name for each in node.events(len(names)) if isinstance(each, Arrived)]
+        taken = [each.keyframe.name for each in node.events(len(names)) if isinstance(each, ArrivedKeyframe)]
         assert len(set(taken)) == len(names) and max(map(len, taken)) == 255
         assert node.store.names == set(taken)
 
@@ -177,7 +179,7 @@ def test_two_frames_of_one_name_and_names_that_look_like_ours(tmp_path, plain):
 def test_another_recon_is_told_that_it_is_not_served(tmp_path, plain):
     network = ipc(tmp_path)
     with taking(network, tmp_path) as node, KeyframeClient(network) as other:
-        node.until(lambda: node.server.connected)
+        node.until(lambda: node.server.is_connected)
         wait_for(lambda: node.server.serve(0.01) or other.receive(0.01) or other.served is False)
         node.server.offer(frame(0))
         node.until(lambda: node.server.acknowledged == 1)
@@ -216,10 +218,12 @@ def test_a_preview_that_makes_tracking_fail_is_one_preview(tmp_path, monkeypatch
             tracked.append(image.shape)
             raise ArithmeticError("for the test")
 
-    monkeypatch.setattr(watcher, "landmarks", lambda *_: _raise(IndexError("none")) if where == "landmarks" else None)
+    monkeypatch.setattr(
+        watcher, "compute_landmarks", lambda *_: _raise(IndexError("none")) if where == "landmarks" else None
+    )
     monkeypatch.setattr(watcher, "Tracker", Failing)
     camera = SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)
-    finished = Finished(SimpleNamespace(cameras=[camera]), [])
+    finished = FinalScene(SimpleNamespace(cameras=[camera]), [])
     watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems, stopping)
     thread = threading.Thread(target=watching.run)
     thread.start()
@@ -242,7 +246,7 @@ def test_a_stored_frame_that_cannot_be_used_costs_no_other(tmp_path, monkeypatch
     prepare = checkpoint.prepare
     with KeyframeServer(ipc(tmp_path), Spool(SpoolConfig(directory=tmp_path / "state"))):
         for index in range(3):
-            store.put(SimpleNamespace(session="0" * 32, sequence=index, frame=frame(index)))
+            store.add_frame(SimpleNamespace(session="0" * 32, sequence=index, frame=frame(index)))
     store.close()
     monkeypatch.setattr(
         checkpoint,
@@ -252,14 +256,14 @@ def test_a_stored_frame_that_cannot_be_used_costs_no_other(tmp_path, monkeypatch
     store = Store(tmp_path / "checkpoint")
     restored = checkpoint.restore(store, Reconstruction())
     assert [keyframe.name for keyframe in restored.new] == ["0.png", "2.png"]
-    assert store.names == {"0.png", "2.png"} and store.dropped[0].name == "1.png"
+    assert store.names == {"0.png", "2.png"} and store.frames_dropped[0].name == "1.png"
     store.close()
 
 
 def test_while_a_checkpoint_is_loaded_the_status_says_so(config, monkeypatch):  # noqa: F811
     with contextlib.closing(Store(config.checkpoint)) as store:
         for index in range(2):
-            store.put(SimpleNamespace(session="0" * 32, sequence=index, frame=frame(index)))
+            store.add_frame(SimpleNamespace(session="0" * 32, sequence=index, frame=frame(index)))
     restore, go_on = checkpoint.restore, threading.Event()
     monkeypatch.setattr(checkpoint, "restore", lambda *given: go_on.wait(60) and restore(*given))
     with running(config):
@@ -271,13 +275,13 @@ def test_while_a_checkpoint_is_loaded_the_status_says_so(config, monkeypatch):  
 
 def test_a_checkpoint_that_there_is_no_memory_for_is_left_as_it_is(tmp_path, monkeypatch):
     store = Store(tmp_path / "checkpoint")
-    store.put(SimpleNamespace(session="0" * 32, sequence=0, frame=frame(0)))
+    store.add_frame(SimpleNamespace(session="0" * 32, sequence=0, frame=frame(0)))
     store.close()
     monkeypatch.setattr(checkpoint, "prepare", lambda *_: _raise(MemoryError()))
     store = Store(tmp_path / "checkpoint")
     with pytest.raises(MemoryError):
         checkpoint.restore(store, Reconstruction())
-    assert store.names == {"0.png"} and not store.dropped
+    assert store.names == {"0.png"} and not store.frames_dropped
     store.close()
 
 
@@ -294,10 +298,10 @@ def test_the_running_daemon_tells_what_was_refused_and_answers_what_fails(config
             return heartbeats(config.network)["recon"]["problem"]
 
         wait_for(lambda: "8 keyframes that were refused" in problem())
-        assert ask(RECON_CONTROL, config.network, Seen(), Answer).done
+        assert ask(RECON_CONTROL, config.network, MarkProblemsSeen(), Answer).done
         wait_for(lambda: problem() == "")
         monkeypatch.setattr(Store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
-        answer = ask(RECON_CONTROL, config.network, Retract(taken.name), Answer)
+        answer = ask(RECON_CONTROL, config.network, RemoveKeyframe(taken.name), Answer)
         assert not answer.done and "Read-only" in answer.message
         monkeypatch.setattr("shutil.disk_usage", lambda _: _raise(OSError(5, "Input/output error")))
         wait_for(lambda: "does not tell how much is free" in problem())

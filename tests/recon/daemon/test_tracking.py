@@ -11,37 +11,44 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import opencv
-from splatnode.recon.daemon.tracking import Config, Landmarks, Tracker, landmarks, locate, motion
+from splatnode.recon.daemon.tracking import (
+    KeyframeLandmarks,
+    Tracker,
+    TrackingConfig,
+    compute_landmarks,
+    localize,
+    measure_motion,
+)
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.synthetic import SMALL, photographs, renumbered
 
-CONFIG = Config()
+CONFIG = TrackingConfig()
 PLACE = synthetic.Config(views=3, width=480, height=360)
 
 
 @pytest.fixture(scope="module")
-def known() -> list[Landmarks]:
+def known() -> list[KeyframeLandmarks]:
     """What three keyframes know of the place, with the depth that is true."""
     found = []
     for index, (frame, camera) in enumerate(zip(photographs(PLACE), synthetic.scene_cameras(PLACE), strict=True)):
         T_world_camera, K = camera
-        feature = features.extract(frame.image, features.Config(num_features=3000))
+        feature = features.extract(frame.image, features.FeatureConfig(num_features=3000))
         depth = synthetic.depth(PLACE, index)
         column, row = feature.points.astype(int).T
         z = depth[np.clip(row, 0, PLACE.height - 1), np.clip(column, 0, PLACE.width - 1)].astype(float)
         rays = np.c_[feature.points, np.ones(len(z))] @ np.linalg.inv(K).T
         good = np.isfinite(z)
         points = (rays * z[:, None])[good] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        found.append(Landmarks(frame.name, points, feature.descriptors[good]))
+        found.append(KeyframeLandmarks(frame.name, points, feature.descriptors[good]))
     return found
 
 
 def stand() -> tuple[np.ndarray, np.ndarray]:
     """Where the camera stands: beside the second keyframe."""
-    return synthetic.held_out_cameras(PLACE)[1]
+    return synthetic.evaluation_cameras(PLACE)[1]
 
 
 def moved(turn_deg: float = 0.0, step: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -53,7 +60,7 @@ def moved(turn_deg: float = 0.0, step: float = 0.0) -> tuple[np.ndarray, np.ndar
 
 
 def preview(camera=None, seed: int = 1) -> np.ndarray:
-    return synthetic.photograph(PLACE, camera or stand(), seed)
+    return synthetic.render_image(PLACE, camera or stand(), seed)
 
 
 def darker(image: np.ndarray) -> np.ndarray:
@@ -63,7 +70,7 @@ def darker(image: np.ndarray) -> np.ndarray:
 
 
 def test_a_preview_is_placed_where_it_was_taken(known):
-    position = locate(preview(), stand()[1], known, CONFIG)
+    position = localize(preview(), stand()[1], known, CONFIG)
     T_world_camera, _ = stand()
     assert (
         np.linalg.norm(position.T_world_camera[:3, 3] - T_world_camera[:3, 3]) < 0.03
@@ -96,7 +103,7 @@ def test_a_shift_of_some_pixels_is_found_and_measured(known, turn_deg, step):
     assert found.certainty > 0.999
     assert found.rotation_deg == pytest.approx(abs(turn_deg), abs=0.4)
     depth = (
-        np.median(locate(preview(), K, known, CONFIG).points @ np.linalg.inv(stand()[0])[2, :3])
+        np.median(localize(preview(), K, known, CONFIG).points @ np.linalg.inv(stand()[0])[2, :3])
         + (np.linalg.inv(stand()[0])[2, 3])
     )
     assert found.translation_rel == pytest.approx(step / depth, abs=0.015)
@@ -114,20 +121,20 @@ def test_what_no_camera_could_have_seen_is_not_known(known):
     (other,) = photographs(synthetic.Config(views=1, width=PLACE.width, height=PLACE.height, seed=5))
     mirrored = np.ascontiguousarray(preview()[:, ::-1])
     for image in (mirrored, other.image, np.zeros_like(mirrored)):
-        assert locate(image, stand()[1], known, CONFIG) is None
+        assert localize(image, stand()[1], known, CONFIG) is None
         assert Tracker(known, CONFIG).track(image, stand()[1]) == (None, None)
 
 
 def test_the_same_position_has_not_moved(known):
-    position = locate(preview(), stand()[1], known, CONFIG)
-    found = motion(position, replace(position), CONFIG)
+    position = localize(preview(), stand()[1], known, CONFIG)
+    found = measure_motion(position, replace(position), CONFIG)
     assert found.certainty < 0.01 and found.shift_px == 0 and not found.moved
 
 
 def test_landmarks_lie_on_what_the_gaussians_show():
     """One large Gaussian, flat and opaque, 2 in front of the camera: every feature is there."""
     (frame,) = renumbered([photographs(SMALL)[0].image])
-    keyframe = Keyframe(frame, frame.image, features.extract(frame.image, features.Config(num_features=500)))
+    keyframe = Keyframe(frame, frame.image, features.extract(frame.image, features.FeatureConfig(num_features=500)))
     wall = GaussianArrays(
         means=np.array([[0, 0, 2]], np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),
@@ -140,7 +147,7 @@ def test_landmarks_lie_on_what_the_gaussians_show():
     camera = CameraEstimate(frame.name, 0, np.eye(4), K, 320, 240)
     verdict = Verdict(Code.OK, "", "", publishable=True)
     snapshot = Snapshot(1, verdict, (camera,), wall, {frame.name: frame.image}, (), 0)
-    (found,) = landmarks(snapshot, [keyframe], CONFIG)
+    (found,) = compute_landmarks(snapshot, [keyframe], CONFIG)
     assert len(found.points) == len(found.descriptors) > 100
     np.testing.assert_allclose(found.points[:, 2], 2.0, rtol=1e-3)
     projected = found.points[:, :2] / found.points[:, 2:] * 300 + [160, 120]
@@ -149,7 +156,7 @@ def test_landmarks_lie_on_what_the_gaussians_show():
     large = replace(frame, image=np.repeat(np.repeat(frame.image, 2, 0), 2, 1))
     plain = keyframe.features
     keyframe = Keyframe(large, frame.image, replace(plain, points=2 * plain.points))  # as it was photographed
-    (found,) = landmarks(replace(snapshot, cameras=(replace(camera, lens=lens),)), [keyframe], CONFIG)
+    (found,) = compute_landmarks(replace(snapshot, cameras=(replace(camera, lens=lens),)), [keyframe], CONFIG)
     rays = opencv.unproject(keyframe.features.points, lens)
     expected = 2.0 * rays[:, :2] / rays[:, 2:]
     np.testing.assert_allclose(found.points[0, :2], expected[plain.point_of[plain.tilt == 1.0]][0], rtol=1e-3)

@@ -8,23 +8,23 @@ import pytest
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.frame import Frame, reduced
-from splatnode.recon.config import Config
-from splatnode.recon.daemon.tracking import Config as Tracking
-from splatnode.recon.daemon.tracking import Tracker, landmarks
-from splatnode.recon.daemon.watcher import preview_intrinsics
+from splatnode.capture.frame import Frame, reduce_image
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.daemon.tracking import Tracker, compute_landmarks
+from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
+from splatnode.recon.daemon.watcher import scale_intrinsics
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.optimize import refinement
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.preparation import prepare
 
-QUICK = replace(Config(), size=256, optimize=refinement.Config(iterations=10))
+QUICK = replace(ReconstructionConfig(), size=256, optimize=refinement.RefinementConfig(iterations=10))
 
 
 def preview(frame: Frame, gain: float, seed: int) -> np.ndarray:
     """As capture sends it: small, a JPEG; by another light, with noise of its own."""
-    small = reduced(frame.image, 480)
+    small = reduce_image(frame.image, 480)
     noise = np.random.default_rng(seed).normal(0, 3, small.shape)
     lit = np.clip(gain * small + noise, 0, 255).astype(np.uint8)
     _, jpeg = cv2.imencode(".jpg", lit, [cv2.IMWRITE_JPEG_QUALITY, 75])
@@ -38,13 +38,13 @@ def test_a_camera_that_stands_in_a_real_place_and_then_moves(shared, name):
     split = load_split(folder, list(scene.paths), 6)
     frames = list(scene.frames(split.train[:4]))
     *_, snapshot = reconstruct(frames, QUICK)
-    watch = Tracker(landmarks(snapshot, [prepare(frame, QUICK) for frame in frames], Tracking()), Tracking())
+    watch = Tracker(compute_landmarks(snapshot, [prepare(frame, QUICK) for frame in frames], Tracking()), Tracking())
     stood, went = (next(iter(scene.frames((each,)))) for each in split.train[1:3])
 
     def look(frame: Frame, gain: float, seed: int):
         image = preview(frame, gain, seed)
         height, width = image.shape[:2]
-        return watch.track(image, preview_intrinsics(snapshot.cameras[0], width, height))
+        return watch.track(image, scale_intrinsics(snapshot.cameras[0], width, height))
 
     for seed, gain in enumerate((1.0, 0.7, 1.1)):
         position, motion = look(stood, gain, seed)

@@ -16,18 +16,18 @@ import pytest
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.status import heartbeats
 from splatnode.recon import incremental
-from splatnode.recon.config import Config as Recipe
-from splatnode.recon.daemon.atlas.atlas import Atlas
+from splatnode.recon.config import ReconstructionConfig as Recipe
+from splatnode.recon.daemon.atlas.atlas import LoopDetector
 from splatnode.recon.daemon.checkpoint import checkpoint, left
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.inbox import BATCH, Arrived, Inbox
-from splatnode.recon.daemon.left_places import LeftPlaces
+from splatnode.recon.daemon.inbox import BATCH, ArrivedKeyframe, Inbox
+from splatnode.recon.daemon.left_places import InactiveSubmaps
 from splatnode.recon.daemon.output import Output
-from splatnode.recon.daemon.present_place import PresentPlace
-from splatnode.recon.daemon.status import State
+from splatnode.recon.daemon.present_place import ActiveSubmap
+from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.ladder.ladder import fallback_key
+from splatnode.recon.ladder.ladder import make_fallback_key
 from splatnode.recon.preparation import prepare
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, index, running
@@ -71,10 +71,13 @@ class Node:
     def __init__(self, config, store, recipe=None) -> None:
         self.store, self.recipe = store, recipe or config.reconstruction
         self.output = Output(config, store, lambda _: None, pytest.fail)
-        self.place = PresentPlace(config, self.recipe, store, self.output, lambda until_s: None)
+        self.place = ActiveSubmap(config, self.recipe, store, self.output, lambda until_s: None)
 
-    def keyframes(self, frames) -> list[Arrived]:
-        return [Arrived(prepare(each.frame, self.recipe), time.monotonic()) for each in store_all(self.store, frames)]
+    def keyframes(self, frames) -> list[ArrivedKeyframe]:
+        return [
+            ArrivedKeyframe(prepare(each.frame, self.recipe), time.monotonic())
+            for each in store_all(self.store, frames)
+        ]
 
 
 def test_keyframes_of_several_places_that_come_together_after_a_scene_begin_one_place_each(config):
@@ -82,36 +85,36 @@ def test_keyframes_of_several_places_that_come_together_after_a_scene_begin_one_
     with closing(Store(config.checkpoint)) as store:
         node = Node(config, store)
         arrived = node.keyframes(frames)
-        node.place.take_in(arrived[:3])
-        node.place.take_in(arrived[3:])
+        node.place.add_keyframes(arrived[:3])
+        node.place.add_keyframes(arrived[3:])
         assert node.place.owed == node.place.under_way == []
         assert (store.scene_id, store.names) == ("scene-0003", {frame.name for frame in frames[6:]})
     for at, scene in enumerate(("scene-0001", "scene-0002")):
-        with closing(Store(left.folder_of(config.checkpoint, scene))) as store:
+        with closing(Store(left.find_folder(config.checkpoint, scene))) as store:
             assert store.names == {frame.name for frame in frames[3 * at : 3 * at + 3]}
 
 
 def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(config, monkeypatch):
     """Such as one whose first keyframes made no scene until the camera was elsewhere."""
     monkeypatch.setattr("splatnode.recon.daemon.membership.is_split", lambda *_: False)
-    monkeypatch.setattr("splatnode.recon.daemon.membership.strangers", lambda *_: [])
+    monkeypatch.setattr("splatnode.recon.daemon.membership.find_untracked", lambda *_: [])
     frames = places(msgspec.structs.replace(SMALL, views=8), (0, 1))
     names = [frame.name for frame in frames]
     with closing(Store(config.checkpoint)) as store:
         node = Node(config, store)
-        node.place.take_in(node.keyframes(frames))
-        node.place.settle()
-        assert node.place.state is State.IDLE
+        node.place.add_keyframes(node.keyframes(frames))
+        node.place.finalize()
+        assert node.place.state is ReconState.IDLE
         here = store.names
         assert sorted(here) in (names[:4], names[4:])
     with closing(Store(config.checkpoint)) as store:  # the next process
-        (part,) = left.folders(config.checkpoint)
+        (part,) = left.list_left_folders(config.checkpoint)
         assert store.names == here and part.name.startswith("scene-0001-")
         output = Output(config, store, lambda _: None, pytest.fail)
-        waiting = LeftPlaces(
-            store, config.reconstruction, output, Atlas(store.directory, config.reconstruction, output.places)
+        waiting = InactiveSubmaps(
+            store, config.reconstruction, output, LoopDetector(store.directory, config.reconstruction, output.places)
         )
-        while waiting.judge_next(lambda: None) or waiting.finish_next(lambda: None):
+        while waiting.verify_next(lambda: None) or waiting.finalize_next(lambda: None):
             pass
     assert submaps(config) == [names[:4], names[4:]]
 
@@ -126,13 +129,13 @@ def rounds(monkeypatch) -> list[list[str]]:
         message = f"{estimate.verdict.message} Also tried: nothing."
         return replace(estimate, verdict=replace(estimate.verdict, message=message))
 
-    monkeypatch.setattr(incremental, "climbed", climbed)
+    monkeypatch.setattr(incremental, "run_fallbacks", climbed)
     return found
 
 
 def forgetful(work: IncrementalReconstruction) -> IncrementalReconstruction:
     """The same keyframes and matches, of which no estimate is remembered."""
-    known = work.known
+    known = work.state
     return IncrementalReconstruction(work.config, replace(known, memory=replace(known.memory, recent=())))
 
 
@@ -144,12 +147,12 @@ def test_fallbacks_that_gained_nothing_are_not_repeated_for_the_same_keyframes_a
             assert each is not None
         work = IncrementalReconstruction(recipe)
         for frame in frames[:4]:
-            work.add(prepare(frame, recipe))
+            work.add_keyframe(prepare(frame, recipe))
         message = work.estimate_thoroughly().verdict.message
         again = forgetful(work)
         assert again.estimate_thoroughly().verdict.message == message and message.endswith("Also tried: nothing.")
         assert len(rounds) == 1
-        again.add(prepare(frames[4], recipe))
+        again.add_keyframe(prepare(frames[4], recipe))
         again.estimate_thoroughly()
         assert len(rounds) == 2  # another keyframe, other matches
         checkpoint.save(store, again, final=False)
@@ -157,23 +160,23 @@ def test_fallbacks_that_gained_nothing_are_not_repeated_for_the_same_keyframes_a
         restored = checkpoint.restore(store, recipe).work
         assert forgetful(restored).estimate_thoroughly().verdict.message.endswith("Also tried: nothing.")
         assert len(rounds) == 2
-        assert fallback_key(restored.graph, recipe) == fallback_key(again.graph, recipe)
+        assert make_fallback_key(restored.graph, recipe) == make_fallback_key(again.graph, recipe)
         longer = msgspec.structs.replace(recipe, ladder=msgspec.structs.replace(recipe.ladder, work=9.0))
-        assert fallback_key(restored.graph, longer) != fallback_key(restored.graph, recipe)
+        assert make_fallback_key(restored.graph, longer) != make_fallback_key(restored.graph, recipe)
 
 
 def test_what_gained_nothing_is_kept_as_soon_as_a_scene_was_judged(config, rounds):
     with closing(Store(config.checkpoint)) as store:
         node = Node(config, store)
-        node.place.take_in(node.keyframes(places(seeds=(0, 1))[:4]))
-        node.place.settle()
+        node.place.add_keyframes(node.keyframes(places(seeds=(0, 1))[:4]))
+        node.place.finalize()
         tried = len(rounds)
     with closing(Store(config.checkpoint)) as store:
         found = checkpoint.restore(store, config.reconstruction)
         again = Node(config, store)
-        again.place.go_on(found)
+        again.place.resume(found)
         again.place.settled = False
-        again.place.settle()
+        again.place.finalize()
     assert tried > 0 and len(rounds) == tried
 
 
@@ -192,21 +195,21 @@ def test_making_a_scene_final_takes_no_more_fallbacks_than_its_budget(config, mo
     frames = photographs()[:3]
     with closing(Store(config.checkpoint)) as store:
         node = Node(msgspec.structs.replace(config, fallback_s=0.3), store)
-        node.place.take_in(node.keyframes(frames))
+        node.place.add_keyframes(node.keyframes(frames))
         for at in range(2):  # what does not belong to the scene, and is tried with it in several ways
             frame = replace(places(seeds=(0, 1))[3 + at], name=f"other{at}.png", frame_id=10 + at)
-            node.place._work.add(prepare(frame, node.recipe))
-            node.place._work.set_aside([frame.name])
-        monkeypatch.setattr(incremental, "climbed", climb_for_ever)
-        node.place.settle()
-        assert node.place.state in (State.IDLE, State.LOST)
+            node.place._work.add_keyframe(prepare(frame, node.recipe))
+            node.place._work.defer_keyframes([frame.name])
+        monkeypatch.setattr(incremental, "run_fallbacks", climb_for_ever)
+        node.place.finalize()
+        assert node.place.state in (ReconState.IDLE, ReconState.LOST)
     assert spent and sum(spent) < 0.5
 
 
 def test_a_pause_does_not_count_as_fallback_time(monkeypatch):
     work = IncrementalReconstruction(Recipe(quick=False))
     for frame in photographs()[:2]:
-        work.add(prepare(frame, work.config))
+        work.add_keyframe(prepare(frame, work.config))
     done = []
 
     def climbed(estimate, rejected, recipe, pause):
@@ -214,7 +217,7 @@ def test_a_pause_does_not_count_as_fallback_time(monkeypatch):
         done.append(True)
         return estimate
 
-    monkeypatch.setattr(incremental, "climbed", climbed)
+    monkeypatch.setattr(incremental, "run_fallbacks", climbed)
     with work.fallback_budget(0.2):
         work.estimate_thoroughly(lambda: time.sleep(0.25))
     assert done
@@ -224,14 +227,14 @@ def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_a
     with closing(Store(config.checkpoint)) as store:
         recipe, inbox = config.reconstruction, Inbox()
         stored = store_all(store, photographs())
-        keyframes = [Arrived(prepare(each.frame, recipe), time.monotonic()) for each in stored]
+        keyframes = [ArrivedKeyframe(prepare(each.frame, recipe), time.monotonic()) for each in stored]
         node = Worker(config, store, inbox, lambda _: None, threading.Event())
         node.loading = 0
         node._backlog = keyframes[:5]
-        inbox.put(keyframes[5], threading.Event())
+        inbox.enqueue(keyframes[5], threading.Event())
         taken = []
         monkeypatch.setattr(node.place, "take_in", taken.append)
         assert node.delay[0] > 0
         for _ in range(3):
-            node._turn(0.0)
+            node._process_events(0.0)
     assert taken == [keyframes[:BATCH], keyframes[BATCH:5], keyframes[5:]]

@@ -19,8 +19,8 @@ from splatnode.capture.preview import encode_preview
 from splatnode.capture.process.problems import Problems
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.daemon import previews, watcher
-from splatnode.recon.daemon.tracking import Config as Tracking
-from splatnode.recon.daemon.watcher import Finished, Watcher
+from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
+from splatnode.recon.daemon.watcher import FinalScene, Watcher
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 
 CAPTURED_AT = Stamp(1_714_989_607_250_000_001, Clock.UTC)
@@ -39,10 +39,10 @@ class Standing:
 @contextmanager
 def watching_a_scene(network, monkeypatch, tracker=Standing, problems=None):
     """A watcher in its thread."""
-    monkeypatch.setattr(watcher, "landmarks", lambda *_: None)
+    monkeypatch.setattr(watcher, "compute_landmarks", lambda *_: None)
     monkeypatch.setattr(watcher, "Tracker", tracker)
     stopping = threading.Event()
-    finished = Finished(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)]), [])
+    finished = FinalScene(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)]), [])
     watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems or Problems(), stopping)
     thread = threading.Thread(target=watching.run)
     thread.start()

@@ -10,43 +10,43 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
-from splatnode.recon.config import Config as Recipe
-from splatnode.recon.config import Ladder
+from splatnode.recon.config import FallbackConfig
+from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.daemon import worker
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.inbox import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.preparation import prepare
 
 
 @pytest.mark.parametrize(("asked", "seconds"), [(None, worker.LADDER_S), (20.0, 20.0)])
 def test_more_matches_are_looked_for_within_seconds_since_keyframes_wait(asked, seconds, tmp_path, monkeypatch):
     recipes: list[Recipe] = []
-    monkeypatch.setattr(worker, "PresentPlace", lambda config, recipe, *rest: recipes.append(recipe))
-    config = Config(reconstruction=Recipe(ladder=Ladder(most_s=asked)), out=tmp_path / "out")
+    monkeypatch.setattr(worker, "ActiveSubmap", lambda config, recipe, *rest: recipes.append(recipe))
+    config = DaemonConfig(reconstruction=Recipe(ladder=FallbackConfig(most_s=asked)), out=tmp_path / "out")
     worker.Worker(config, Store(tmp_path / "checkpoint"), Inbox(), lambda found: None, threading.Event())
-    assert recipes[0].ladder == Ladder(work=Ladder().work, most_s=seconds)
+    assert recipes[0].ladder == FallbackConfig(work=FallbackConfig().work, most_s=seconds)
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["retracted", "retracted, and another of its name came"])
 def test_what_was_retracted_before_it_was_prepared_is_not_taken_in(again, tmp_path, monkeypatch):
-    taken: list[list[Arrived]] = []
+    taken: list[list[ArrivedKeyframe]] = []
     place = SimpleNamespace(settled=True, owed=[], take_in=taken.append, leave_out=lambda names: None)
-    monkeypatch.setattr(worker, "PresentPlace", lambda *_: place)
+    monkeypatch.setattr(worker, "ActiveSubmap", lambda *_: place)
     store, inbox = Store(tmp_path / "checkpoint"), Inbox()
-    node = worker.Worker(Config(out=tmp_path / "out"), store, inbox, lambda found: None, threading.Event())
+    node = worker.Worker(DaemonConfig(out=tmp_path / "out"), store, inbox, lambda found: None, threading.Event())
     image = np.zeros((48, 64, 3), np.uint8)
-    stored = [store.put(ReceivedFrame("a" * 32, n, Frame(n, f"{n}.png", n, image, None))) for n in range(2)]
+    stored = [store.add_frame(ReceivedFrame("a" * 32, n, Frame(n, f"{n}.png", n, image, None))) for n in range(2)]
     store.forget("0.png", "retracted")
     if again:
         store._names["0.png"] = 2  # once a thousand others were dropped, or in another place
-    inbox.put_at_once(LeftOut("0.png"))
-    arrived = [Arrived(prepare(each.frame, Recipe()), 0.0) for each in stored if each is not None]
+    inbox.enqueue_now(RemovedFrame("0.png"))
+    arrived = [ArrivedKeyframe(prepare(each.frame, Recipe()), 0.0) for each in stored if each is not None]
     for each in arrived:
-        inbox.put(each, threading.Event())
+        inbox.enqueue(each, threading.Event())
     while len(inbox):
-        node._turn(0.0)
+        node._process_events(0.0)
     assert taken == [arrived[1:]]
-    inbox.put(arrived[0], threading.Event())
-    node._turn(0.0)
+    inbox.enqueue(arrived[0], threading.Event())
+    node._process_events(0.0)
     assert taken == [arrived[1:]]  # nor is there anything to be made better

@@ -17,19 +17,19 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.command_line import build_parser
-from splatnode.recon.config import PRESETS, Config
-from splatnode.recon.evaluate.bench import Entrants, Plan, run_bench, run_line
+from splatnode.recon.config import PRESETS, ReconstructionConfig
+from splatnode.recon.evaluate.bench import MethodRunner, Plan, format_run, run_bench
 from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import no_networks
+from splatnode.recon.evaluate.perceptual import create_empty_networks
 from splatnode.recon.evaluate.protocol import Row, Settings
-from splatnode.recon.evaluate.schedule import Planned
-from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
-from splatnode.recon.evaluate.timing import untimed
+from splatnode.recon.evaluate.schedule import PlannedRun
+from splatnode.recon.evaluate.start import Start, continue_reconstruction, extract_start_config, find_start
+from splatnode.recon.evaluate.timing import explain_missing_seconds
 from splatnode.recon.jobs.alone import ALONE
 from splatnode.recon.jobs.calls import Engine, engine
 from splatnode.recon.jobs.child import Limits
 from splatnode.recon.jobs.cores import usable_cores
-from splatnode.recon.optimize.refinement import Config as Optimize
+from splatnode.recon.optimize.refinement import RefinementConfig as Optimize
 from splatnode.recon.pipeline import reconstruct as pipeline
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
@@ -77,9 +77,9 @@ def without_costs(row: Row) -> Row:
     return replace(row, seconds={}, peak_rss_mb=None, cores=None, processor=None, others=None)
 
 
-def shared_by(beginning: str) -> Callable[[str], Config | None]:
+def shared_by(beginning: str) -> Callable[[str], ReconstructionConfig | None]:
     """Methods whose names begin so start from the same cameras and points."""
-    return lambda name: Config() if beginning and name.startswith(beginning) else None
+    return lambda name: ReconstructionConfig() if beginning and name.startswith(beginning) else None
 
 
 def bench(
@@ -94,8 +94,8 @@ def bench(
     device: str = "cpu",
 ) -> list[Row]:
     """Methods whose names begin with `shared`, if it is given, start from the same cameras and points."""
-    entrants = Entrants(reconstruct, shared_by(shared), device)
-    scoring = Scoring(rasterize, no_networks, settings, by_region)
+    entrants = MethodRunner(reconstruct, shared_by(shared), device)
+    scoring = Scoring(rasterize, create_empty_networks, settings, by_region)
     on = on or in_this_process()
     return list(run_bench(plan, entrants, out, scoring=scoring, command="bench", resume=resume, engine=on).rows)
 
@@ -249,13 +249,13 @@ def test_a_driver_that_is_killed_loses_no_run_that_ended(scene_folder, tmp_path,
 
     def answers(take, limits: Limits, folder: Path):
         for about, answer in here.answers(take, limits, folder):
-            if isinstance(about, Planned) and about.about.method == "shared-b":
+            if isinstance(about, PlannedRun) and about.about.method == "shared-b":
                 shutil.copytree(tmp_path / "out", tmp_path / "killed")  # what is on the disk as this run works
             yield about, answer
 
     def noted(take, limits: Limits, folder: Path):
         for about, answer in here.answers(take, limits, folder):
-            methods.append(about.about.method if isinstance(about, Planned) else "start")
+            methods.append(about.about.method if isinstance(about, PlannedRun) else "start")
             yield about, answer
 
     whole = bench(plan, tmp_path / "out", shared="shared", on=Engine(here.cores_each, answers))
@@ -271,7 +271,7 @@ def test_a_driver_that_is_killed_loses_no_run_that_ended(scene_folder, tmp_path,
 def test_methods_that_share_cameras_and_points_have_them_found_once(scene_folder, tmp_path, monkeypatch, alone):
     calls = []
 
-    def find(frames: Sequence[Frame], config: Config) -> Start:
+    def find(frames: Sequence[Frame], config: ReconstructionConfig) -> Start:
         calls.append((len(frames), config.seed))
         return find_start(frames, config)
 
@@ -292,8 +292,8 @@ def test_seconds_are_those_of_runs_that_had_their_cores_alone(scene_folder, tmp_
     assert [row.others for row in rows] == [0.3, 0.3, 0.0]
     assert [row.seconds["total"] is None for row in rows] == [True, True, False]
     assert rows[0].seconds.keys() == rows[2].seconds.keys() and rows[0].psnr is not None
-    assert "seconds not reported: others took 30% of its cores" in run_line(rows[0])
-    said = untimed([row.others for row in rows])
+    assert "seconds not reported: others took 30% of its cores" in format_run(rows[0])
+    said = explain_missing_seconds([row.others for row in rows])
     assert said.startswith("seconds are not reported of 2 of 3 runs: others took more than 5% of")
     monkeypatch.setattr("splatnode.recon.evaluate.timing.others_share", lambda since, until: 0.0)
     (row,) = bench(Plan((scene_folder,), (3,), ("own",), timed=False), tmp_path / "gpu")
@@ -325,10 +325,10 @@ def test_what_goes_on_from_shared_points_is_what_would_have_been_found_alone():
     frames = list(photographs()[:4])
     short = Optimize(iterations=10, checkpoints=(5,))
     config = msgspec.structs.replace(PRESETS["balanced"], size=160, optimize=short, seed=3)
-    found = foundation(config)
-    assert found == msgspec.structs.replace(Config(), size=160)
+    found = extract_start_config(config)
+    assert found == msgspec.structs.replace(ReconstructionConfig(), size=160)
     start = find_start(frames, msgspec.structs.replace(found, seed=3))
-    alone, shared = list(pipeline(frames, config)), list(continued(start, config))
+    alone, shared = list(pipeline(frames, config)), list(continue_reconstruction(start, config))
     assert [s.iterations for s in shared] == [0, 5, 10, 10] and [s.iterations for s in alone] == [0, 0, 5, 10, 10]
     for mine, other in zip(shared, alone[1:], strict=True):  # who begins from the photographs shows a first look
         assert (mine.gaussians.means == other.gaussians.means).all() and mine.final == other.final

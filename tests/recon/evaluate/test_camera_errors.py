@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.evaluate.camera_errors import (
-    ate_instantsplat,
-    camera_errors,
-    centre_error_pct,
-)
+from splatnode.recon.evaluate.camera_errors import compare_cameras, compute_ate_instantsplat, compute_centre_error_pct
 from splatnode.recon.geometry import Similarity, angles_deg, exp_se3, umeyama
 
 
@@ -60,7 +56,7 @@ def test_umeyama_never_reflects():
 
 def test_perfect_cameras_in_another_world_have_no_error():
     true = arc()
-    errors = camera_errors(moved(true), true, intrinsics([500] * 6), intrinsics([500] * 6))
+    errors = compare_cameras(moved(true), true, intrinsics([500] * 6), intrinsics([500] * 6))
     assert errors.rotation_deg == pytest.approx(0, abs=1e-10)
     assert errors.rotation_pair_deg == pytest.approx(0, abs=1e-10)
     assert errors.centre_pct == pytest.approx(0, abs=1e-10)
@@ -71,7 +67,7 @@ def test_one_turned_camera_shows_its_angle():
     true = arc()
     estimated = moved(true)
     estimated[2] = estimated[2] @ turn_y(3.0)
-    errors = camera_errors(estimated, true, intrinsics([500] * 6), intrinsics([500] * 6))
+    errors = compare_cameras(estimated, true, intrinsics([500] * 6), intrinsics([500] * 6))
     assert errors.rotation_pair_deg == pytest.approx(3.0)
     assert errors.rotation_deg == pytest.approx(3.0 * 5 / 6, abs=0.01)  # the common rotation takes a sixth of it
     assert errors.centre_pct == pytest.approx(0, abs=1e-10)
@@ -79,36 +75,36 @@ def test_one_turned_camera_shows_its_angle():
 
 def test_focal_error_is_the_mean_of_absolute_relative_errors():
     true = arc(2)
-    errors = camera_errors(true, true, intrinsics([490, 520]), intrinsics([500, 500]))
+    errors = compare_cameras(true, true, intrinsics([490, 520]), intrinsics([500, 500]))
     assert errors.focal_pct == pytest.approx(3.0)
 
 
 def test_centre_error_is_in_percent_of_the_spread():
     true = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])  # RMS spread 1
     estimated = true + 0.05 * np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, -1], [0, 0, -1]])  # no similarity explains this
-    assert centre_error_pct(estimated, true) == pytest.approx(5.0, rel=0.01)
+    assert compute_centre_error_pct(estimated, true) == pytest.approx(5.0, rel=0.01)
 
 
 def test_what_cannot_be_told_is_none():
     still = np.stack([turn_y(0), turn_y(10), turn_y(20)])
-    errors = camera_errors(still, still, intrinsics([500] * 3), intrinsics([500] * 3))
+    errors = compare_cameras(still, still, intrinsics([500] * 3), intrinsics([500] * 3))
     assert errors.centre_pct is None and errors.ate_instantsplat is None
     assert errors.rotation_deg == pytest.approx(0, abs=1e-10)
-    one = camera_errors(still[:1], still[:1], intrinsics([510]), intrinsics([500]))
+    one = compare_cameras(still[:1], still[:1], intrinsics([510]), intrinsics([500]))
     assert (one.rotation_deg, one.centre_pct) == (None, None)
     assert one.focal_pct == pytest.approx(2.0)
-    none = camera_errors(still[:0], still[:0], intrinsics([500])[:0], intrinsics([500])[:0])
+    none = compare_cameras(still[:0], still[:0], intrinsics([500])[:0], intrinsics([500])[:0])
     assert none.focal_pct is None
     with pytest.raises(ValueError, match="come in pairs"):
-        camera_errors(still, still[:2], intrinsics([500] * 3), intrinsics([500] * 3))
+        compare_cameras(still, still[:2], intrinsics([500] * 3), intrinsics([500] * 3))
 
 
 def test_instantsplat_ate_is_not_zero_for_a_perfect_reconstruction():
     true = arc(3)
-    assert ate_instantsplat(true, true) == pytest.approx(0, abs=1e-12)
-    in_another_world = ate_instantsplat(moved(true), true)
+    assert compute_ate_instantsplat(true, true) == pytest.approx(0, abs=1e-12)
+    in_another_world = compute_ate_instantsplat(moved(true), true)
     assert in_another_world is not None and in_another_world > 1e-3
-    assert centre_error_pct(moved(true)[:, :3, 3], true[:, :3, 3]) == pytest.approx(0, abs=1e-10)
+    assert compute_centre_error_pct(moved(true)[:, :3, 3], true[:, :3, 3]) == pytest.approx(0, abs=1e-10)
 
 
 def test_angles_are_exact_where_the_arc_cosine_is_not():

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from splatnode.recon.evaluate.protocol import Row, Settings
-from splatnode.recon.evaluate.records import Bench, bench_files, merged, read_bench
+from splatnode.recon.evaluate.records import Bench, make_bench_files, merge_benches, read_bench
 from splatnode.recon.evaluate.report import redraw
-from splatnode.recon.evaluate.summary import method_means, shared
-from splatnode.recon.evaluate.tables import PSNR, by_views, paired, tables
+from splatnode.recon.evaluate.summary import compute_method_means, select_shared_runs
+from splatnode.recon.evaluate.tables import PSNR, compute_paired_changes, make_tables, make_views_table
 
 pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
 
 from matplotlib.patches import Rectangle
 
-from splatnode.recon.evaluate.charts import ablation, draw, pareto_front, speed_accuracy
+from splatnode.recon.evaluate.charts import draw, draw_ablation, draw_speed_accuracy, find_pareto_front
 
 
 def row(method: str, checkpoint: int | None, psnr: float | None, seconds: float | None, **other) -> Row:
@@ -45,7 +45,7 @@ def bench(*rows: Row) -> Bench:
 
 
 def test_means_are_over_the_same_runs_at_every_point():
-    found = {(p.method, p.checkpoint): p for p in method_means(ROWS)}
+    found = {(p.method, p.checkpoint): p for p in compute_method_means(ROWS)}
     assert list(found) == [("fast", 100), ("fast", None), ("slow", None)]
     assert found["fast", 100].psnr == 22.0  # 20 at the checkpoint, and 24 of the run that was over by then
     assert found["fast", 100].seconds == 2.5
@@ -58,17 +58,17 @@ def test_means_are_over_the_same_runs_at_every_point():
 
 def test_methods_are_compared_on_the_runs_that_all_were_put_to():
     rows = [*ROWS, row("slow", None, 10.0, 1.0, scene="hard"), row("slow", None, 30.0, 1.0, views=6)]
-    assert {r.scene for r in shared(rows) if r.views == 3} == {"a", "b"}
-    assert [r.views for r in shared(rows)].count(6) == 1
+    assert {r.scene for r in select_shared_runs(rows) if r.views == 3} == {"a", "b"}
+    assert [r.views for r in select_shared_runs(rows)].count(6) == 1
     apart = [row("fast", None, 20.0, 1.0), row("slow", None, 30.0, 1.0, scene="b")]
-    assert shared(apart) == apart
+    assert select_shared_runs(apart) == apart
 
 
 def test_pareto_front_keeps_what_nothing_beats():
     pairs = [(1.0, 20.0), (2.0, 19.0), (3.0, 22.0), (3.0, 21.0), (4.0, 22.0)]
-    assert pareto_front(pairs, higher_is_better=True) == [(1.0, 20.0), (3.0, 22.0)]
-    assert pareto_front(pairs, higher_is_better=False) == [(1.0, 20.0), (2.0, 19.0)]
-    assert pareto_front([], higher_is_better=True) == []
+    assert find_pareto_front(pairs, higher_is_better=True) == [(1.0, 20.0), (3.0, 22.0)]
+    assert find_pareto_front(pairs, higher_is_better=False) == [(1.0, 20.0), (2.0, 19.0)]
+    assert find_pareto_front([], higher_is_better=True) == []
 
 
 def test_charts_are_drawn_from_the_rows_alone():
@@ -82,15 +82,15 @@ def test_charts_are_drawn_from_the_rows_alone():
 
 
 def test_every_curve_has_every_moment_and_lpips_only_where_measured():
-    axes = speed_accuracy([p for p in method_means(ROWS) if p.psnr is not None]).axes
+    axes = draw_speed_accuracy([p for p in compute_method_means(ROWS) if p.psnr is not None]).axes
     assert [a.get_ylabel() for a in axes] == ["PSNR (dB)", "SSIM"]
     curves = [tuple(np.asarray(data).tolist() for data in line.get_data()) for line in axes[0].lines]
     assert ([2.5, 3.0], [22.0, 23.0]) in curves and ([10.0], [26.0]) in curves
     measured = [replace(r, lpips_vgg=0.2) for r in ROWS]
-    axes = speed_accuracy(method_means(measured)[:2]).axes
+    axes = draw_speed_accuracy(compute_method_means(measured)[:2]).axes
     assert axes[2].get_ylabel() == "LPIPS VGG (axis turned)" and axes[2].yaxis_inverted()
     ends_alone = [replace(r, lpips_alex=0.1, lpips_vgg=0.2 if r.final else None) for r in ROWS]
-    assert speed_accuracy(method_means(ends_alone)).axes[2].get_ylabel() == "LPIPS Alex (axis turned)"
+    assert draw_speed_accuracy(compute_method_means(ends_alone)).axes[2].get_ylabel() == "LPIPS Alex (axis turned)"
 
 
 ABLATION = [
@@ -105,10 +105,10 @@ ABLATION = [
 
 
 def test_ablation_compares_run_by_run():
-    assert paired(ABLATION, "instantsplat-xl+depth", "instantsplat-xl", PSNR) == [0.5, -1.0]
-    assert paired(ABLATION, "paper-depth", "paper", PSNR) == [pytest.approx(-0.2)]
+    assert compute_paired_changes(ABLATION, "instantsplat-xl+depth", "instantsplat-xl", PSNR) == [0.5, -1.0]
+    assert compute_paired_changes(ABLATION, "paper-depth", "paper", PSNR) == [pytest.approx(-0.2)]
     assert list(draw(ABLATION)) == ["speed_accuracy.png", "parsimony.png", "ablation.png"]
-    chart = ablation(ABLATION).axes[0]
+    chart = draw_ablation(ABLATION).axes[0]
     labels = [label.get_text() for label in chart.get_yticklabels()]
     assert labels == [
         "instantsplat-xl+depth  vs. instantsplat-xl",
@@ -116,7 +116,7 @@ def test_ablation_compares_run_by_run():
         "paper-depth  vs. paper",
     ]
     assert [bar.get_width() for bar in chart.patches if isinstance(bar, Rectangle)] == pytest.approx([-0.25, 1.0, -0.2])
-    told = {table.title: table.body for table in tables(ABLATION)}["Ablation"]
+    told = {table.title: table.body for table in make_tables(ABLATION)}["Ablation"]
     assert ("instantsplat-xl+depth", "instantsplat-xl", "20.75", "-0.25", "0.8000", "+0.0000", "2") in told
 
 
@@ -129,12 +129,12 @@ def test_the_papers_tables():
         row("fast", None, 25.0, 1.0, ssim=0.95, views=6),
         row("slow", None, 21.0, 1.0, ssim=0.7),
     ]
-    told = by_views(rows)
+    told = make_views_table(rows)
     assert told.head[:3] == ("method", "SSIM 3", "SSIM 6")
     cells = dict(zip(told.head, told.body[0], strict=True))
     assert cells["SSIM 3"] == "0.8000 ± 0.1414" and cells["SSIM 6"] == "0.9500"
     assert cells["PSNR 3"] == "22.00 ± 1.41" and cells["ATE 3"] == "0.0300"
-    by_place = {table.title: table for table in tables(rows)}["Scene by scene, 3 views"]
+    by_place = {table.title: table for table in make_tables(rows)}["Scene by scene, 3 views"]
     assert by_place.head == ("measure", "method", "a", "b")
     assert ("PSNR", "fast", "21.50 ± 2.12", "22.00") in by_place.body
     assert ("PSNR", "slow", "21.00", "–") in by_place.body
@@ -163,20 +163,20 @@ def test_everything_is_drawn_again_from_the_file(tmp_path):
 
 def test_pieces_of_a_benchmark_are_put_together():
     first, again = bench(*ROWS), bench(row("fast", 100, 21.0, 1.0), row("fast", None, 22.5, 2.0))
-    rows = merged([first, again]).rows
+    rows = merge_benches([first, again]).rows
     assert [(r.scene, r.method, r.psnr) for r in rows] == [
         *(("b", "fast", 24.0), ("a", "slow", 26.0), ("b", "slow", None)),
         *(("a", "fast", 21.0), ("a", "fast", 22.5)),
     ]
     with pytest.raises(ValueError, match="scored alike"):
-        merged([first, Bench((), Settings(alignment_steps=1), {}, "")])
+        merge_benches([first, Bench((), Settings(alignment_steps=1), {}, "")])
 
 
 def test_rows_of_an_older_benchmark_lack_what_was_measured_later(tmp_path):
-    content = json.loads(bench_files(bench(*ROWS))["bench.json"])
+    content = json.loads(make_bench_files(bench(*ROWS))["bench.json"])
     for record in content["rows"]:
         del record["psnr_with_rim"]
     (tmp_path / "old.json").write_text(json.dumps(content))
-    both = merged([read_bench(tmp_path / "old.json"), bench(row("other", None, 20.0, 1.0, psnr_with_rim=19.0))])
-    lines = bench_files(both)["bench.csv"].decode().splitlines()
+    both = merge_benches([read_bench(tmp_path / "old.json"), bench(row("other", None, 20.0, 1.0, psnr_with_rim=19.0))])
+    lines = make_bench_files(both)["bench.csv"].decode().splitlines()
     assert len(lines) == 1 + len(ROWS) + 1 and "psnr_with_rim" in lines[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.recon.evaluate.contest import SHOWN, WHOLE, case_tables, margins
+from splatnode.recon.evaluate.contest import SHOWN, WHOLE, compute_margins, make_case_tables
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.regions import RegionScore
 
@@ -40,14 +40,14 @@ ROWS = [
 
 
 def test_the_best_other_is_chosen_by_the_measure():
-    (psnr,), (perceptual,) = margins(ROWS, WHOLE[0]), margins(ROWS, WHOLE[2])
+    (psnr,), (perceptual,) = compute_margins(ROWS, WHOLE[0]), compute_margins(ROWS, WHOLE[2])
     assert (psnr.by, psnr.ours, psnr.lead) == ("paper", 25.5, pytest.approx(1.0))
     assert (perceptual.by, perceptual.lead) == ("instantsplat-xl", pytest.approx(-0.02))
 
 
 def test_the_error_of_a_lead_is_that_of_both():
-    (one,) = margins(ROWS, WHOLE[0])
-    (both,) = margins([*ROWS, row("paper", 25.5, seed=1)], WHOLE[0])
+    (one,) = compute_margins(ROWS, WHOLE[0])
+    (both,) = compute_margins([*ROWS, row("paper", 25.5, seed=1)], WHOLE[0])
     assert one.error is None  # the best other has one seed
     assert both.lead == pytest.approx(0.5) and both.error == pytest.approx(
         0.5**0.5
@@ -55,13 +55,13 @@ def test_the_error_of_a_lead_is_that_of_both():
 
 
 def test_regions_are_compared_where_they_were_measured():
-    (shown,) = margins(ROWS, SHOWN[0])
+    (shown,) = compute_margins(ROWS, SHOWN[0])
     assert shown.ours == pytest.approx(26.5) and shown.best == pytest.approx(25.5)
-    assert not margins([r for r in ROWS if r.method in ("balanced", "fast")], SHOWN[0])
+    assert not compute_margins([r for r in ROWS if r.method in ("balanced", "fast")], SHOWN[0])
 
 
 def test_the_table_says_what_is_lost():
-    whole, shown = case_tables(ROWS)
+    whole, shown = make_case_tables(ROWS)
     case, total = whole.body
     assert case[:4] == ("church 6", "25.50", "24.50 paper", "+1.00") and case[-1] == "-0.0200"
     assert total[1] == "1 of 1" and total[-3] == "0 of 1"

@@ -9,7 +9,15 @@ import pytest
 
 from splatnode.recon.config import PRESETS
 from splatnode.recon.evaluate import ablation
-from splatnode.recon.evaluate.methods import CONFIGS, METHODS, PUBLISHED, RIVALS, chosen, method, start_of
+from splatnode.recon.evaluate.methods import (
+    CONFIGS,
+    METHODS,
+    PUBLISHED,
+    RIVALS,
+    expand_method_names,
+    find_method,
+    select_start_config,
+)
 from splatnode.recon.optimize import regularise
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.report import build_report
@@ -22,7 +30,7 @@ def test_every_preset_is_a_method():
         same = msgspec.structs.replace(CONFIGS[name].optimize, checkpoints=config.optimize.checkpoints)
         assert msgspec.structs.replace(CONFIGS[name], optimize=same) == config
     with pytest.raises(ValueError, match="no method 'nerf'; there are: .*paper"):
-        method("nerf")
+        find_method("nerf")
 
 
 def test_the_papers_schedule_and_weights():
@@ -31,39 +39,48 @@ def test_the_papers_schedule_and_weights():
     assert weights == {"point_render": 0.25, "depth": 0.05, "normal": 0.01, "semantic": 0.5}
     assert CONFIGS["paper"].optimize.iterations == 1000
     assert [losses[name].config.at(0.1) > 0 for name in ("point_render", "depth")] == [True, False]
-    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularise.Config())
+    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularise.RegularizerConfig())
     assert without == CONFIGS["instantsplat-xl"].optimize
 
 
 def test_sets_are_spelt_out_once():
-    assert chosen(["fast", "presets", "paper"]) == ("fast", *(name for name in PRESETS if name != "fast"), "paper")
-    assert chosen(["rivals"]) == RIVALS
+    assert expand_method_names(["fast", "presets", "paper"]) == (
+        "fast",
+        *(name for name in PRESETS if name != "fast"),
+        "paper",
+    )
+    assert expand_method_names(["rivals"]) == RIVALS
     with pytest.raises(ValueError, match="and the sets presets, rivals, published, surrounded, ablation"):
-        chosen(["paper", "instantsplat"])
+        expand_method_names(["paper", "instantsplat"])
 
 
 def test_methods_share_a_start_unless_they_look_at_other_sizes_or_find_their_own():
-    assert start_of("paper") == start_of("instantsplat-s") == start_of("balanced") != start_of("preview")
-    assert all(start_of(name) is None for name in (*RIVALS, *PUBLISHED))
+    assert (
+        select_start_config("paper")
+        == select_start_config("instantsplat-s")
+        == select_start_config("balanced")
+        != select_start_config("preview")
+    )
+    assert all(select_start_config(name) is None for name in (*RIVALS, *PUBLISHED))
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_as_published_is_the_same_method_with_another_budget(name, monkeypatch):
     module = import_module(f"splatnode.recon.evaluate.rivals.{name.partition('+')[0].replace('-', '_')}")
     monkeypatch.setattr(module, "reconstruct", lambda frames, seed, config=None: iter([(frames, seed, config)]))
-    assert list(method(name)([], 3)) == [([], 3, module.PUBLISHED)]
-    assert list(method(name.partition("+")[0])([], 3)) == [([], 3, None)]
+    assert list(find_method(name)([], 3)) == [([], 3, module.PUBLISHED)]
+    assert list(find_method(name.partition("+")[0])([], 3)) == [([], 3, None)]
 
 
 def test_a_start_with_surroundings_differs_in_nothing_else():
-    for name in chosen(["surrounded"]):
+    for name in expand_method_names(["surrounded"]):
         plain, around = name.split("+")
         without = msgspec.structs.replace(CONFIGS[name].pixelwise, surroundings="none")
         losses = msgspec.structs.replace(CONFIGS[name].optimize.regularise, min_confidence=0.3)
         optimize = msgspec.structs.replace(CONFIGS[name].optimize, regularise=losses)
         assert msgspec.structs.replace(CONFIGS[name], pixelwise=without, optimize=optimize) == CONFIGS[plain]
         assert CONFIGS[name].pixelwise.surroundings == around
-        assert start_of(name) == start_of(plain) and not ablation.is_variant(name)
+        assert select_start_config(name) == select_start_config(plain) and not ablation.is_variant(name)
 
 
 def test_the_ablation_changes_one_part_at_a_time():
@@ -81,7 +98,7 @@ def test_the_ablation_changes_one_part_at_a_time():
     assert CONFIGS["paper-pseudo-views"].optimize.regularise.pseudo_views == 0
     thick = CONFIGS["paper-down-sampling"]
     assert thick.optimize == whole.optimize and thick.pixelwise != whole.pixelwise
-    assert set(ablation.names()) <= CONFIGS.keys() and ablation.is_variant("paper-depth")
+    assert set(ablation.list_names()) <= CONFIGS.keys() and ablation.is_variant("paper-depth")
     assert not ablation.is_variant("paper")
 
 

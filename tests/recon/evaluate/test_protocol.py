@@ -14,14 +14,14 @@ import pytest
 import torch
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate
 from splatnode.recon.evaluate.regions import UNKNOWN
-from splatnode.recon.evaluate.same_lens import counts_seen_by, mean_intrinsics, seen_by
+from splatnode.recon.evaluate.same_lens import average_intrinsics, undistort_counts, undistort_view
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.places import Photo
-from splatnode.recon.evaluate.stability.warps import distorted
+from splatnode.recon.evaluate.stability.places import TrialImage
+from splatnode.recon.evaluate.stability.warps import distort_image
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames import border
@@ -136,11 +136,11 @@ def test_an_estimated_distortion_is_taken_out_of_held_out_photographs_too(scene_
     shutil.copytree(scene_folder, tmp_path / "blobs")
     shutil.copy(scene_folder.parent / "splits.json", tmp_path)
     for name in NAMES:
-        photo = distorted(Photo(name, scene.image(name), scene.cameras[name]), -0.3)
+        photo = distort_image(TrialImage(name, scene.image(name), scene.cameras[name]), -0.3)
         cv2.imwrite(str(tmp_path / "blobs" / "images" / name), photo.image[..., ::-1])
     focal = photo.camera.K[0, 0]
     lens = Intrinsics(WIDTH, HEIGHT, focal, focal, 48.0, 36.0, "estimated", (-0.3, 0.0, 0.0, 0.0))
-    pinhole = undistorted(Frame(0, "a", 0, photo.image, lens)).intrinsics.K
+    pinhole = undistort_frame(Frame(0, "a", 0, photo.image, lens)).intrinsics.K
     snapshot = perfect_snapshot()
     straight = tuple(replace(camera, K=pinhole, lens=lens) for camera in snapshot.cameras)
     row = score(replace(snapshot, cameras=straight), tmp_path / "blobs")
@@ -160,18 +160,18 @@ def test_what_the_lens_mixes_is_unknown():
     lens = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 48.0, 36.0, "estimated", (-0.3, 0.0, 0.0, 0.0))
     counts = np.full((HEIGHT, WIDTH), 2, np.uint8)
     counts[:, :20] = 1
-    straight = counts_seen_by(lens, counts)
+    straight = undistort_counts(lens, counts)
     mixed = (straight == UNKNOWN).sum(1)
     assert set(np.unique(straight)) == {1, 2, UNKNOWN} and mixed.min() >= 1 and mixed.max() <= 3
-    assert counts_seen_by(None, counts) is counts
-    assert counts_seen_by(replace(lens, model="fisheye"), counts) is None
+    assert undistort_counts(None, counts) is counts
+    assert undistort_counts(replace(lens, model="fisheye"), counts) is None
 
 
 def test_what_a_lens_cuts_off_is_no_mask():
     lens = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 48.0, 36.0, "estimated", (0.05, 0.0, 0.0, 0.0), "fisheye")
     cut = np.ones((HEIGHT, WIDTH), bool)
     cut[0, 0] = False
-    image, used = seen_by(lens, np.zeros((HEIGHT, WIDTH, 3), np.uint8), cut)
+    image, used = undistort_view(lens, np.zeros((HEIGHT, WIDTH, 3), np.uint8), cut)
     assert used.all() and used.shape == image.shape[:2]
 
 
@@ -244,7 +244,7 @@ def test_what_masks_hide_is_neither_given_nor_scored(scene_folder, tmp_path):
     frames = load_scene(folder).frames(SPLIT.train)
     assert all(each.mask is not None and not each.mask[: each.height // 4].any() for each in frames)
     name = SPLIT.test[0]
-    image, mask = load_scene(folder).masked_image(name)
+    image, mask = load_scene(folder).load_masked_image(name)
     assert np.array_equal(image[mask], load_scene(scene_folder).image(name)[mask])
     assert not (image == (255, 0, 255)).all(2).any()
     used = torch.from_numpy(mask)
@@ -276,7 +276,7 @@ def test_a_view_of_which_a_mask_leaves_hardly_anything_is_left_out(scene_folder,
     sliver = np.zeros((HEIGHT, WIDTH), bool)
     sliver[:2] = True  # 3 %
     folder = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: sliver})
-    image, used = load_scene(folder).masked_image(SPLIT.test[0])
+    image, used = load_scene(folder).load_masked_image(SPLIT.test[0])
     assert image.shape == (HEIGHT, WIDTH, 3) and not used.any()
     assert score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[:1])).psnr is None
     assert score(perfect_snapshot(), folder).psnr > 40
@@ -312,7 +312,7 @@ def test_one_camera_cannot_be_aligned(scene_folder):
 def test_intrinsics_are_carried_to_an_image_of_another_size():
     first = CameraEstimate("a", 0, np.eye(4), np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]]), 100, 60)
     second = replace(first, K=np.array([[110.0, 0, 52], [0, 110, 30], [0, 0, 1]]))
-    found = mean_intrinsics([first, second], 200, 120)
+    found = average_intrinsics([first, second], 200, 120)
     assert np.allclose(found, [[210, 0, 102], [0, 210, 60], [0, 0, 1]])
 
 

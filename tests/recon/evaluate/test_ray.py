@@ -6,11 +6,11 @@ from dataclasses import asdict
 
 import pytest
 
-from splatnode.recon.evaluate.bench import Entrants, Plan, run_bench
+from splatnode.recon.evaluate.bench import MethodRunner, Plan, run_bench
 from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import no_networks
+from splatnode.recon.evaluate.perceptual import create_empty_networks
 from splatnode.recon.evaluate.stability import campaign
-from splatnode.recon.evaluate.stability.places import Places
+from splatnode.recon.evaluate.stability.places import ScenesByMotion
 from splatnode.recon.jobs.calls import engine
 from splatnode.recon.rasterize.cpu import rasterize
 from tests.recon.evaluate import test_bench
@@ -32,15 +32,15 @@ def test_windows_on_ray_are_those_of_a_core(tmp_path):
 
 def test_what_comes_of_ray_is_what_comes_of_a_core(tmp_path):
     write_scene(tmp_path / "blobs")
-    rows = (campaign.Row(1, "six", lambda sampler: six_views()),)
+    rows = (campaign.MatrixRow(1, "six", lambda sampler: six_views()),)
     benched, tried = [], []
     for where, address in (("here", None), ("there", "")):
         with engine(1, address) as on:
             trials = campaign.Plan(rows, (0,), ("splatnode",))
-            tried.append(campaign.run_campaign(trials, Places(()), tmp_path / where / "a", "command", on))
+            tried.append(campaign.run_campaign(trials, ScenesByMotion(()), tmp_path / where / "a", "command", on))
             plan = Plan((tmp_path / "blobs",), (3,), ("shared", "broken"))
-            entrants = Entrants(test_bench.reconstruct, test_bench.shared_by("shared"))
-            out, scoring = tmp_path / where / "b", Scoring(rasterize, no_networks, QUICK)
+            entrants = MethodRunner(test_bench.reconstruct, test_bench.shared_by("shared"))
+            out, scoring = tmp_path / where / "b", Scoring(rasterize, create_empty_networks, QUICK)
             benched.append(run_bench(plan, entrants, out, scoring=scoring, command="bench", engine=on))
     assert without_costs(tried[0]) == without_costs(tried[1]) and tried[0][0]["num_gaussians"] > 1000
     here, there = ([asdict(test_bench.without_costs(row)) for row in bench.rows] for bench in benched)

@@ -11,7 +11,7 @@ import pytest
 from splatnode.recon.evaluate.protocol import Row, Settings
 from splatnode.recon.evaluate.records import Bench
 from splatnode.recon.evaluate.renders import FOLDER, PHOTOGRAPH
-from splatnode.recon.evaluate.report import report_files
+from splatnode.recon.evaluate.report import make_report_files
 from tests.support.hostile import TEXTS, unprintable
 
 NAMES = {what: text.replace("\x00", "").replace("/", "_")[:100] for what, text in TEXTS.items()}
@@ -49,7 +49,7 @@ def test_a_hostile_name_is_text(tmp_path, name):
     for picture in (PHOTOGRAPH, "method-0.jpg"):
         (view / picture).write_bytes(b"")
     bench = Bench((row(name, name), row("scene", "method")), Settings(), {"processor": name, "threads": name}, name)
-    files = report_files(bench, tmp_path)
+    files = make_report_files(bench, tmp_path)
     for file in files.values():
         assert not unprintable(file.decode())
     page = Page(files["report.html"].decode())
@@ -63,7 +63,7 @@ def test_a_hostile_name_is_text(tmp_path, name):
 
 
 def test_names_that_a_page_can_show_stay_as_they_are(tmp_path):
-    page = report_files(Bench((row("Küche 3", "ours"),), Settings(), {}, "bench"), tmp_path)
+    page = make_report_files(Bench((row("Küche 3", "ours"),), Settings(), {}, "bench"), tmp_path)
     assert "<td>Küche 3</td>" in page["report.html"].decode() and "| Küche 3 |" in page["report.md"].decode()
 
 
@@ -74,5 +74,5 @@ def test_renders_of_an_earlier_run_are_not_shown_beside_a_refusal(tmp_path):
         for picture in (PHOTOGRAPH, f"{method}-0.jpg"):
             (view / picture).write_bytes(b"")
     rows = row("a", "ours"), replace(row("a", "theirs"), psnr=None, ssim=None, verdict="NO_OVERLAP")
-    page = Page(report_files(Bench(rows, Settings(), {}, "bench"), tmp_path)["report.html"].decode())
+    page = Page(make_report_files(Bench(rows, Settings(), {}, "bench"), tmp_path)["report.html"].decode())
     assert page.sources == [f"{FOLDER}/a-3/view/{PHOTOGRAPH}", f"{FOLDER}/a-3/view/ours-0.jpg"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.evaluate.json_file import EvaluationFileError
-from splatnode.recon.evaluate.splits import Split, load_split, paper_split
+from splatnode.recon.evaluate.splits import Split, load_split, make_paper_split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
@@ -22,16 +22,16 @@ NAMES = tuple(f"{i:02d}.png" for i in range(8))
 
 def test_paper_split_of_24_frames():
     names = [str(i) for i in range(24)]
-    assert paper_split(names, 3).train == ("0", "11", "23")
-    assert paper_split(names, 6).train == ("0", "5", "9", "13", "17", "23")
-    assert paper_split(names, 12).train == ("0", "3", "5", "7", "9", "11", "13", "15", "17", "19", "21", "23")
-    assert paper_split(names, 3).test == ("1", "2", "4", "6", "8", "10", "12", "14", "16", "18", "20", "22")
+    assert make_paper_split(names, 3).train == ("0", "11", "23")
+    assert make_paper_split(names, 6).train == ("0", "5", "9", "13", "17", "23")
+    assert make_paper_split(names, 12).train == ("0", "3", "5", "7", "9", "11", "13", "15", "17", "19", "21", "23")
+    assert make_paper_split(names, 3).test == ("1", "2", "4", "6", "8", "10", "12", "14", "16", "18", "20", "22")
 
 
 @pytest.mark.parametrize("count", [6, 11, 23, 30, 100])
 def test_no_image_both_trains_and_tests(count):
     names = [f"{i:03d}" for i in range(count)]
-    split = paper_split(names, 3)
+    split = make_paper_split(names, 3)
     assert len(set(split.train)) == 3 and not set(split.train) & set(split.test)
     assert len(split.test) == min(12, count // 2)
     assert split.train[0] == names[0] and split.train[-1] == names[-1]
@@ -39,7 +39,7 @@ def test_no_image_both_trains_and_tests(count):
 
 def test_more_views_than_there_are_is_a_clear_error():
     with pytest.raises(ValueError, match="views must be 1 to 5 for 10 images, got 6"):
-        paper_split([str(i) for i in range(10)], 6)
+        make_paper_split([str(i) for i in range(10)], 6)
 
 
 def test_listed_split_wins_over_the_paper_s(tmp_path):
@@ -47,7 +47,7 @@ def test_listed_split_wins_over_the_paper_s(tmp_path):
     assert load_split(tmp_path / "garden", NAMES, 3) == Split(NAMES[:3], NAMES[3:5])
     with pytest.raises(ValueError, match="must list train6 and test for garden, has"):
         load_split(tmp_path / "garden", NAMES, 6)
-    assert load_split(tmp_path / "elsewhere", NAMES, 2) == paper_split(NAMES, 2)
+    assert load_split(tmp_path / "elsewhere", NAMES, 2) == make_paper_split(NAMES, 2)
 
 
 @pytest.mark.parametrize(

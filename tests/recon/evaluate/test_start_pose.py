@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.start_pose import between_neighbours
+from splatnode.recon.evaluate.start_pose import interpolate_pose
 
 
 def camera(x: float, turn_deg: float) -> np.ndarray:
@@ -21,15 +21,15 @@ KNOWN = {"a": camera(0, 0), "e": camera(8, 40)}
 
 
 def test_the_pose_lies_between_its_neighbours_by_its_place():
-    assert between_neighbours("b", ORDER, KNOWN) == pytest.approx(camera(2, 10))
-    assert between_neighbours("d", ORDER, KNOWN) == pytest.approx(camera(6, 30))
+    assert interpolate_pose("b", ORDER, KNOWN) == pytest.approx(camera(2, 10))
+    assert interpolate_pose("d", ORDER, KNOWN) == pytest.approx(camera(6, 30))
 
 
 def test_beyond_the_last_it_is_the_last():
-    assert between_neighbours("f", ORDER, KNOWN) == pytest.approx(camera(8, 40))
-    assert between_neighbours("a", ORDER, {"c": camera(3, 5)}) == pytest.approx(camera(3, 5))
+    assert interpolate_pose("f", ORDER, KNOWN) == pytest.approx(camera(8, 40))
+    assert interpolate_pose("a", ORDER, {"c": camera(3, 5)}) == pytest.approx(camera(3, 5))
 
 
 def test_without_cameras_there_is_no_start():
     with pytest.raises(ValueError, match="at least one of the 6 photographs"):
-        between_neighbours("b", ORDER, {})
+        interpolate_pose("b", ORDER, {})

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.frames.screening import Config, screen, summarise
+from splatnode.recon.frames.screening import ScreeningConfig, screen, summarise
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import blurred, exposed, photographs, renumbered, repeated
 
 
 def screened(frames):
-    return screen([summarise(frame) for frame in frames], Config())
+    return screen([summarise(frame) for frame in frames], ScreeningConfig())
 
 
 def test_views_of_a_capture_are_all_kept():

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from splatnode.recon.jobs.alone import ALONE, Moment, now, others_share, with_siblings
+from splatnode.recon.jobs.alone import ALONE, Moment, add_sibling_cores, now, others_share
 from splatnode.recon.jobs.cores import usable_cores
 
 SPINS = "import os, sys\nos.sched_setaffinity(0, {int(sys.argv[1])})\nprint(flush=True)\nwhile True: pass"
@@ -30,8 +30,8 @@ def test_threads_of_one_physical_core_belong_together(tmp_path):
         topology = tmp_path / f"cpu{core}" / "topology"
         topology.mkdir(parents=True)
         (topology / "thread_siblings_list").write_text(f"{listed}\n")
-    assert with_siblings((0, 2), tmp_path) == {0, 2, 3, 4}
-    assert with_siblings((7,), tmp_path) == {7}  # the system does not tell
+    assert add_sibling_cores((0, 2), tmp_path) == {0, 2, 3, 4}
+    assert add_sibling_cores((7,), tmp_path) == {7}  # the system does not tell
 
 
 def test_a_process_on_the_same_core_is_seen():

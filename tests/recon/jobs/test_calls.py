@@ -14,16 +14,16 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process import python
-from splatnode.recon.jobs.call import ANSWER, CALL, Answer, begun, laid_down, packed
-from splatnode.recon.jobs.calls import Engine, Task, engine, one_at_a_time, run_here, work_folder
-from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, finished
+from splatnode.recon.jobs.call import ANSWER, CALL, Answer, pack_call, start_call, write_call
+from splatnode.recon.jobs.calls import Engine, Task, engine, make_serial_engine, run_here, work_folder
+from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, wait_for_end
 from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.jobs.version import own_version
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 
 
 def answers(on: Engine, folder: Path, limits: Limits, **works: Callable[[], object]) -> dict[str, Answer]:
-    tasks = iter([Task(name, packed(work)) for name, work in works.items()])
+    tasks = iter([Task(name, pack_call(work)) for name, work in works.items()])
     return dict(on.answers(lambda: next(tasks, None), limits, folder))
 
 
@@ -64,7 +64,7 @@ def test_each_call_has_its_answer_or_its_reason(tmp_path):
 
 def test_a_call_that_hangs_is_ended_with_what_it_started(tmp_path):
     began_s = time.monotonic()
-    found = answers(one_at_a_time(), tmp_path / "calls", Limits(timeout_s=1.0), hangs=started_a_helper)
+    found = answers(make_serial_engine(), tmp_path / "calls", Limits(timeout_s=1.0), hangs=started_a_helper)
     assert found["hangs"].reason == "took longer than the 1 s that --timeout-s allows"
     assert time.monotonic() - began_s < 30.0
 
@@ -76,7 +76,7 @@ def ends_its_template() -> None:
 
 def test_calls_are_copies_of_one_process_and_go_on_where_that_is_ended(tmp_path):
     found = answers(
-        one_at_a_time(),
+        make_serial_engine(),
         tmp_path / "calls",
         Limits(),
         one=os.getppid,
@@ -90,7 +90,7 @@ def test_calls_are_copies_of_one_process_and_go_on_where_that_is_ended(tmp_path)
 
 
 def test_one_at_a_time_has_all_cores(tmp_path):
-    on = one_at_a_time()
+    on = make_serial_engine()
     found = answers(on, tmp_path / "calls", Limits(), cores=partial(os.sched_getaffinity, 0))
     assert found["cores"].value() == set(usable_cores()) and on.cores_each == len(usable_cores())
 
@@ -100,12 +100,12 @@ def test_what_a_killed_driver_left_is_removed(tmp_path):
     left.mkdir(parents=True)
     (left / "answer").write_bytes(b"old")
     with work_folder(tmp_path) as folder:
-        assert answers(one_at_a_time(), folder, Limits(), new=partial(abs, -1))["new"].value() == 1
+        assert answers(make_serial_engine(), folder, Limits(), new=partial(abs, -1))["new"].value() == 1
     assert not any(tmp_path.iterdir())
 
 
 def evil(trace: Path) -> bytes:
-    return packed(partial(trace.write_text, "run"))
+    return pack_call(partial(trace.write_text, "run"))
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o2775])
@@ -139,9 +139,9 @@ def test_calls_lie_among_the_results_where_nobody_else_may_change_them(tmp_path)
 
 @pytest.mark.parametrize("open_to", [".", ".."])
 def test_a_call_that_another_user_could_have_put_there_is_not_made(tmp_path, open_to):
-    trace, folder = tmp_path / "trace", laid_down(evil(tmp_path / "trace"), tmp_path / "calls" / "0")
+    trace, folder = tmp_path / "trace", write_call(evil(tmp_path / "trace"), tmp_path / "calls" / "0")
     os.chmod(folder / open_to, 0o770)
-    end = finished(begun(folder, usable_cores()), Limits())
+    end = wait_for_end(start_call(folder, usable_cores()), Limits())
     assert end.exit_code != 0 and "chmod go-w" in end.reason and not trace.exists()
 
 
@@ -149,8 +149,8 @@ def test_a_call_of_another_user_is_not_made(shared_tmp):  # noqa: F811
     folder, trace = shared_tmp / "0", shared_tmp / "trace"
     plants = "os.mkdir(sys.argv[1], 0o755); open(sys.argv[1] + '/call', 'wb').write(bytes.fromhex(sys.argv[2]))"
     assert as_other(plants, folder, evil(trace).hex()).returncode == 0
-    end = finished(
-        Child.started(python.command("splatnode.recon.jobs.called", str(folder)), shared_tmp / "log", usable_cores()),
+    end = wait_for_end(
+        Child.start(python.command("splatnode.recon.jobs.called", str(folder)), shared_tmp / "log", usable_cores()),
         Limits(),
     )
     assert end.exit_code != 0 and f"of user {OTHER}" in end.reason and not trace.exists()
@@ -162,7 +162,7 @@ def test_more_cores_than_there_are_are_refused():
 
 
 def test_a_worker_with_another_version_says_so():
-    call = packed(partial(sum, (1, 2)))
+    call = pack_call(partial(sum, (1, 2)))
     other = run_here(call, Limits(), "0.0.1")
     assert other.end == NOT_RUN and "the work was begun with 0.0.1" in other.reason
     assert run_here(call, Limits(), own_version()).value() == 3
@@ -172,4 +172,4 @@ def test_modules_are_found_where_the_driver_finds_them(tmp_path, monkeypatch):
     (tmp_path / "only_here.py").write_text("def answer():\n    return 42\n")
     monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     work = __import__("only_here").answer
-    assert answers(one_at_a_time(), tmp_path / "calls", Limits(), work=work)["work"].value() == 42
+    assert answers(make_serial_engine(), tmp_path / "calls", Limits(), work=work)["work"].value() == 42

@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.recon.config import Config, overlaid
-from splatnode.recon.estimation import Estimate
+from splatnode.recon.config import ReconstructionConfig, apply_changes
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.ladder import ladder
-from splatnode.recon.ladder.better import better
-from splatnode.recon.ladder.ladder import climbed
-from splatnode.recon.ladder.rung import Means, Rung
+from splatnode.recon.ladder.better import choose_better_reconstruction
+from splatnode.recon.ladder.ladder import run_fallbacks
+from splatnode.recon.ladder.rung import Fallback, FallbackState
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.row_of_views import graph_of, registration_of
@@ -29,26 +29,26 @@ from tests.support.synthetic import SMALL, places
 NAMES = graph_of(4).names
 
 
-def estimate(code: Code, cameras: int) -> Estimate:
+def estimate(code: Code, cameras: int) -> Reconstruction:
     """With a camera for each of the first keyframes of four."""
     publishable = code in (Code.OK, Code.OK_PARTIAL, Code.OK_ROUGH)
     verdict = Verdict(code, "So it is.", "", () if publishable else tuple(NAMES), publishable)
     evidence: Any = SimpleNamespace()
-    return Estimate(graph_of(4), registration_of(cameras), evidence, verdict)
+    return Reconstruction(graph_of(4), registration_of(cameras), evidence, verdict)
 
 
 NO_OVERLAP = estimate(Code.NO_OVERLAP, 2)
 
 
-def rung(name: str, parts: int = 1, obstacle: str = "") -> Rung:
+def rung(name: str, parts: int = 1, obstacle: str = "") -> Fallback:
     """Adds so many pieces of work of 1 each; the seed of its means' configuration counts them all."""
 
-    def climb(means: Means, doubtful: Collection[str]) -> Iterator[Means]:
+    def climb(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
         for _ in range(parts):
-            means = replace(means, config=overlaid(means.config, {"seed": means.config.seed + 1})).after(1.0)
+            means = replace(means, config=apply_changes(means.config, {"seed": means.config.seed + 1})).add_work(1.0)
             yield means
 
-    return Rung(name, climb, lambda: obstacle)
+    return Fallback(name, climb, lambda: obstacle)
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def estimated(monkeypatch):
     """The seeds of what was estimated from; `answers` is what came of it, in order."""
     seeds: list[int] = []
 
-    def of(*answers: Estimate) -> list[int]:
+    def of(*answers: Reconstruction) -> list[int]:
         coming = iter(answers)
 
         def estimate_cameras(graph, rejected, config, pause):
@@ -69,12 +69,12 @@ def estimated(monkeypatch):
     return of
 
 
-def working(work: float) -> Config:
-    return overlaid(Config(), {"ladder": {"work": work}})
+def working(work: float) -> ReconstructionConfig:
+    return apply_changes(ReconstructionConfig(), {"ladder": {"work": work}})
 
 
-def climb(first: Estimate, *rungs: Rung, config: Config | None = None) -> Estimate:
-    return climbed(first, (), config or working(100.0), rungs=rungs)
+def climb(first: Reconstruction, *rungs: Fallback, config: ReconstructionConfig | None = None) -> Reconstruction:
+    return run_fallbacks(first, (), config or working(100.0), rungs=rungs)
 
 
 def test_rungs_add_up_until_one_leads_to_an_answer(estimated):
@@ -101,7 +101,7 @@ def test_what_no_match_could_help_is_not_touched(first, estimated):
 
 
 def test_quick_stops_at_the_first_rung(estimated):
-    assert climb(NO_OVERLAP, rung("a"), config=Config(quick=True)) is NO_OVERLAP and estimated() == []
+    assert climb(NO_OVERLAP, rung("a"), config=ReconstructionConfig(quick=True)) is NO_OVERLAP and estimated() == []
 
 
 def test_the_work_ends_the_climb_between_pieces_and_between_rungs(estimated):
@@ -125,11 +125,11 @@ def test_no_work_is_no_ladder(estimated):
 def test_a_deadline_ends_the_climb_and_without_one_no_clock_is_read(estimated, monkeypatch):
     seeds, clock = estimated(NO_OVERLAP, NO_OVERLAP, NO_OVERLAP), itertools.count(0.0, 1.0)
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    climbed(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=6.0)
+    run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=6.0)
     assert 1 < seeds[0] <= 6 and (read := next(clock)) < 10
-    climbed(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=math.inf)
+    run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=math.inf)
     assert seeds[1] == 100 and next(clock) == read + 1
-    climb(NO_OVERLAP, rung("long", 100), config=overlaid(working(1000.0), {"ladder": {"most_s": 6.0}}))
+    climb(NO_OVERLAP, rung("long", 100), config=apply_changes(working(1000.0), {"ladder": {"most_s": 6.0}}))
     assert 1 < seeds[2] <= 6
 
 
@@ -143,12 +143,12 @@ def test_the_better_answer_is_kept(estimated):
     estimated(more)
     assert climb(NO_OVERLAP, rung("a")).verdict.code is Code.NO_OVERLAP
     estimated(estimate(Code.OK_PARTIAL, 4))
-    assert len(climb(partial, rung("a")).placed) == 4
+    assert len(climb(partial, rung("a")).publishable_camera_names) == 4
 
 
 def test_an_answer_that_contradicts_the_accepted_one_is_not_better():
     partial, whole = estimate(Code.OK_PARTIAL, 3), estimate(Code.OK, 4)
-    assert better(partial, whole) is whole
+    assert choose_better_reconstruction(partial, whole) is whole
     assert whole.registration is not None
     first, *others = whole.registration.cameras
     for turn_deg, kept in ((1.0, "other"), (10.0, "one")):
@@ -156,7 +156,7 @@ def test_an_answer_that_contradicts_the_accepted_one_is_not_better():
         T_world_camera[:3, :3] = cv2.Rodrigues(np.array([0.0, np.radians(turn_deg), 0.0]))[0]
         turned = replace(first, T_world_camera=T_world_camera)
         other = replace(whole, registration=replace(whole.registration, cameras=(turned, *others)))
-        assert better(partial, other) is (other if kept == "other" else partial)
+        assert choose_better_reconstruction(partial, other) is (other if kept == "other" else partial)
 
 
 def test_a_rough_answer_of_weak_matches_is_not_taken(estimated):
@@ -175,7 +175,7 @@ def test_an_accepted_camera_is_not_given_up_for_two_others():
     assert others.registration is not None
     without_first = replace(others, registration=replace(others.registration, cameras=others.registration.cameras[1:]))
     one = estimate(Code.OK_PARTIAL, 2)
-    assert better(one, without_first) is one and len(without_first.placed) == 3
+    assert choose_better_reconstruction(one, without_first) is one and len(without_first.publishable_camera_names) == 3
 
 
 def test_pause_may_abandon_the_climb(estimated):
@@ -187,14 +187,14 @@ def test_pause_may_abandon_the_climb(estimated):
 
     estimated(NO_OVERLAP)
     with pytest.raises(Abandoned):
-        climbed(NO_OVERLAP, (), Config(), pause, [rung("a")])
+        run_fallbacks(NO_OVERLAP, (), ReconstructionConfig(), pause, [rung("a")])
 
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_photographs_of_three_places_are_refused_with_what_was_tried_unless_quick(quick, monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
     frames = places(msgspec.structs.replace(SMALL, views=3), seeds=(0, 1, 2))
-    *_, final = reconstruct(frames, Config(quick=quick))
+    *_, final = reconstruct(frames, ReconstructionConfig(quick=quick))
     assert final.verdict.code is Code.NO_OVERLAP
     assert ("stronger tilts" in final.verdict.message) != quick
     assert (final.seconds["ladder"] > 0.1) != quick

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.ladder import others
-from splatnode.recon.ladder.ladder import climbed
-from splatnode.recon.ladder.others import without_the_doubtful
+from splatnode.recon.ladder.ladder import run_fallbacks
+from splatnode.recon.ladder.others import estimate_without_doubtful
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.row_of_views import graph_of, registration_of
 
@@ -21,19 +21,19 @@ GRAPH = graph_of(COUNT)
 NAMES = GRAPH.names
 
 
-def estimate(code: Code, cameras: int, *about: int) -> Estimate:
+def estimate(code: Code, cameras: int, *about: int) -> Reconstruction:
     """With a camera for each of the first keyframes; the verdict is about some of them."""
     publishable = code in (Code.OK, Code.OK_PARTIAL, Code.OK_ROUGH)
     verdict = Verdict(code, "So it is.", "Do so.", tuple(NAMES[index] for index in about), publishable)
     evidence: Any = SimpleNamespace()
-    return Estimate(GRAPH, registration_of(cameras), evidence, verdict)
+    return Reconstruction(GRAPH, registration_of(cameras), evidence, verdict)
 
 
 @pytest.fixture
 def asked(monkeypatch):
     """The graphs that were estimated from; `answers` is what came of it, in order."""
 
-    def of(*answers: Estimate) -> list:
+    def of(*answers: Reconstruction) -> list:
         graphs, coming = [], iter(answers)
 
         def estimate_cameras(graph, *_: object):
@@ -46,8 +46,8 @@ def asked(monkeypatch):
     return of
 
 
-def judged(first: Estimate) -> Estimate:
-    return without_the_doubtful(first, (), Config(), lambda: None)
+def judged(first: Reconstruction) -> Reconstruction:
+    return estimate_without_doubtful(first, (), ReconstructionConfig(), lambda: None)
 
 
 def test_most_photographs_are_published_without_the_one_in_doubt(asked):
@@ -55,7 +55,7 @@ def test_most_photographs_are_published_without_the_one_in_doubt(asked):
     found = judged(estimate(Code.MOVING_SCENE, 6, 5))
     assert graphs[0].names == NAMES and not any(5 in pair for pair in graphs[0].pairs)
     assert (0, 1) in graphs[0].pairs
-    assert found.verdict.code is Code.OK_PARTIAL and len(found.placed) == 5
+    assert found.verdict.code is Code.OK_PARTIAL and len(found.publishable_camera_names) == 5
     assert found.verdict.message == "5 of 6 photographs were placed, after 05.png was left out: So it is."
 
 
@@ -96,6 +96,6 @@ def test_what_is_not_exact_or_not_published_is_not_taken(second, asked):
 
 def test_quick_takes_the_first_answer(asked):
     first = estimate(Code.MOVING_SCENE, 6, 5)
-    assert climbed(first, (), Config(quick=True)) is first and asked() == []
+    assert run_fallbacks(first, (), ReconstructionConfig(quick=True)) is first and asked() == []
     asked(estimate(Code.OK_PARTIAL, 5, 5))
-    assert climbed(first, (), Config()).publishable
+    assert run_fallbacks(first, (), ReconstructionConfig()).publishable

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.ladder import learned, tilts
 from splatnode.recon.ladder.ladder import RUNGS
-from splatnode.recon.ladder.rung import Means, weak_pairs
+from splatnode.recon.ladder.rung import FallbackState, find_weak_pairs
 from splatnode.recon.matching.view_graph import ViewGraph
 from tests.support.synthetic import photographs, renumbered, view_graph
 
@@ -30,27 +30,27 @@ def far_aside() -> ViewGraph:
 
 def test_stronger_tilts_connect_what_nothing_else_does(far_aside):
     assert set(far_aside.pairs) == {(0, 1)}
-    *_, after = tilts.RUNG.climb(Means(far_aside, Config()), {far_aside.names[2]})
+    *_, after = tilts.RUNG.climb(FallbackState(far_aside, ReconstructionConfig()), {far_aside.names[2]})
     assert (0, 2) in after.graph.pairs
     np.testing.assert_array_equal(after.graph.pairs[0, 1].matches, far_aside.pairs[0, 1].matches)
     assert set(far_aside.keyframes[2].features.tilt) <= {1.0, 1.6}  # a graph is a value
 
 
 def test_only_weak_pairs_of_doubtful_keyframes_are_matched_further(far_aside):
-    assert {frozenset(pair) for pair in weak_pairs(far_aside, {far_aside.names[2]})} == {
+    assert {frozenset(pair) for pair in find_weak_pairs(far_aside, {far_aside.names[2]})} == {
         frozenset((0, 2)),
         frozenset((1, 2)),
     }
-    assert weak_pairs(far_aside, set()) == []
+    assert find_weak_pairs(far_aside, set()) == []
 
 
 def test_tilting_is_work_by_what_there_is_to_do(far_aside):
     both = {far_aside.names[2]}
-    *_, once = tilts.RUNG.climb(Means(far_aside, Config()), both)
+    *_, once = tilts.RUNG.climb(FallbackState(far_aside, ReconstructionConfig()), both)
     *_, twice = tilts.RUNG.climb(once, both)
     assert once.work > 0.2  # three photographs of 1000 x 750 pixels are tilted, and compared
     assert 0.0 < twice.work - once.work < 0.5 * once.work  # and then compared alone
-    first = next(iter(tilts.RUNG.climb(Means(far_aside, Config()), both)))
+    first = next(iter(tilts.RUNG.climb(FallbackState(far_aside, ReconstructionConfig()), both)))
     assert 0.0 < first.work < once.work
 
 

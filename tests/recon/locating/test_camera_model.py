@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.locating.camera_model import NUM_PARAMETERS, CameraModel, Lens, without_distortion
+from splatnode.recon.locating.camera_model import NUM_PARAMETERS, CameraModel, Lens, undistort_pixels
 from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.refinement import CORRELATED, pose_covariance, refined
+from splatnode.recon.locating.refinement import CORRELATED, optimize_camera, pose_covariance
 
 CAMERA = CameraModel(
     Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix(),
@@ -39,7 +39,7 @@ def test_derivatives_by_the_parameters(parameter):
     world, step = points(7), np.zeros(NUM_PARAMETERS)
     step[parameter] = 1e-6
     by_parameters, _ = CAMERA.derivatives(world)
-    numeric = (CAMERA.moved(step).project(world)[0] - CAMERA.moved(-step).project(world)[0]) / 2e-6
+    numeric = (CAMERA.apply_step(step).project(world)[0] - CAMERA.apply_step(-step).project(world)[0]) / 2e-6
     assert np.allclose(by_parameters[:, :, parameter], numeric, rtol=1e-4, atol=1e-4)
 
 
@@ -56,19 +56,19 @@ def test_derivatives_by_the_points():
 def test_pixels_without_distortion_are_those_of_a_pinhole():
     world = points(9)
     straight = replace(CAMERA, lens=replace(CAMERA.lens, radial=(0.0, 0.0), shift=np.zeros(2)))
-    assert np.allclose(without_distortion(CAMERA.project(world)[0], CAMERA.lens), straight.project(world)[0], atol=0.01)
+    assert np.allclose(undistort_pixels(CAMERA.project(world)[0], CAMERA.lens), straight.project(world)[0], atol=0.01)
 
 
 def test_the_camera_is_found_again_from_nearby():
     step = np.array([0.02, -0.01, 0.015, 0.05, -0.03, 0.04, 0, 0, 0, 0, 0])
-    fit = refined(CAMERA.moved(step), CAMERA.lens, seen(0.0, 0), 0.5)
+    fit = optimize_camera(CAMERA.apply_step(step), CAMERA.lens, seen(0.0, 0), 0.5)
     assert np.allclose(fit.camera.T_world_camera, CAMERA.T_world_camera, atol=1e-6)
 
 
 def test_the_covariance_is_that_of_the_errors_times_the_observations_that_count_as_one():
     twists, claimed = [], np.zeros((6, 6))
     for seed in range(200):
-        fit = refined(CAMERA, CAMERA.lens, seen(0.5, seed), 0.5)
+        fit = optimize_camera(CAMERA, CAMERA.lens, seen(0.5, seed), 0.5)
         between = np.linalg.inv(CAMERA.T_world_camera) @ fit.camera.T_world_camera
         twists.append([*between[:3, 3], *Rotation.from_matrix(between[:3, :3]).as_rotvec()])
         claimed = pose_covariance(fit.camera, fit.covariance) / CORRELATED

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.recon.locating import checks, posing
 from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
-from splatnode.recon.locating.case import Case, Judged
+from splatnode.recon.locating.case import PoseHypothesis, QueryContext
 from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.outcome import Claim, Reason
+from splatnode.recon.locating.outcome import LocalizationBounds, Reason
 
 WIDTH, HEIGHT = 1024, 768
 LENS = Lens(800.0, PINHOLE, np.zeros(2), 0.01, 0.0, 0.0)
@@ -50,13 +50,13 @@ def unrelated(count: int) -> Correspondences:
     return replace(known, pixels=known.pixels[::-1])
 
 
-def judged(known: Correspondences) -> Case:
-    by = Judged(known, WIDTH, HEIGHT, 0.5, 1.0, posing.Config())
-    return by.case(by.posed(LENS))
+def judged(known: Correspondences) -> PoseHypothesis:
+    by = QueryContext(known, WIDTH, HEIGHT, 0.5, 1.0, posing.PoseSearchConfig())
+    return by.make_hypothesis(by.estimate_pose(LENS))
 
 
 def code(known: Correspondences) -> Reason | None:
-    refusal = checks.refused(judged(known), checks.Config())
+    refusal = checks.run_checks(judged(known), checks.LocalizationCheckConfig())
     return None if refusal is None else refusal.code
 
 
@@ -86,7 +86,7 @@ def test_many_features_of_one_spot_count_as_one():
         for i in range(4)
     ]
     often = judged(together(*copies, unrelated(300)))
-    assert len(often.agreeing) > 3 * len(once.agreeing)
+    assert len(often.inliers) > 3 * len(once.inliers)
     assert often.num_independent < 1.5 * once.num_independent
 
 
@@ -115,12 +115,16 @@ def test_a_lens_that_no_camera_has_is_refused():
     assert case.posed is not None
     for lens in (replace(LENS, focal=100.0), replace(LENS, shift=np.array([600.0, 0.0]))):
         fit = replace(case.posed.fit, camera=replace(case.posed.fit.camera, lens=lens))
-        refusal = checks.refused(replace(case, posed=replace(case.posed, fit=fit)), checks.Config())
+        refusal = checks.run_checks(replace(case, posed=replace(case.posed, fit=fit)), checks.LocalizationCheckConfig())
         assert refusal is not None and refusal.code is Reason.LENS
 
 
 def test_what_is_known_too_roughly_is_refused():
-    assert checks.too_rough(Claim(1.0, 0.02, 2.0, 1.0), checks.Config()) is None
-    for claim in (Claim(6.0, 0.02, 2.0, 1.0), Claim(1.0, 0.2, 20.0, 1.0), Claim(np.nan, np.nan, np.nan, 1.0)):
-        refusal = checks.too_rough(claim, checks.Config())
+    assert checks.check_uncertainty(LocalizationBounds(1.0, 0.02, 2.0, 1.0), checks.LocalizationCheckConfig()) is None
+    for claim in (
+        LocalizationBounds(6.0, 0.02, 2.0, 1.0),
+        LocalizationBounds(1.0, 0.2, 20.0, 1.0),
+        LocalizationBounds(np.nan, np.nan, np.nan, 1.0),
+    ):
+        refusal = checks.check_uncertainty(claim, checks.LocalizationCheckConfig())
         assert refusal is not None and refusal.code is Reason.UNCERTAIN

@@ -8,15 +8,15 @@ import numpy as np
 
 from splatnode.recon.locating import follow as following
 from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.locate import locate
+from splatnode.recon.locating.locate import localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from tests.support.located import errors, known_place, photograph
 
 
 def test_each_is_placed_by_the_one_before(monkeypatch):
     landmarks = known_place().landmarks
-    found = locate(landmarks, photograph(0)[0])
-    monkeypatch.setattr(following, "locate", lambda *_: None)  # the slow way is not needed
+    found = localize_image(landmarks, photograph(0)[0])
+    monkeypatch.setattr(following, "localize_image", lambda *_: None)  # the slow way is not needed
     for index in range(1, 5):
         image, camera = photograph(index)
         assert isinstance(found, Located)
@@ -30,7 +30,7 @@ def test_each_is_placed_by_the_one_before(monkeypatch):
 def test_one_that_was_taken_elsewhere_is_looked_for_everywhere():
     landmarks = known_place().landmarks
     image, camera = photograph(3)
-    first = locate(landmarks, photograph(0)[0])
+    first = localize_image(landmarks, photograph(0)[0])
     assert isinstance(first, Located)
     behind = replace(first, T_world_camera=first.T_world_camera @ np.diag([-1.0, 1.0, -1.0, 1.0]))
     found = follow(landmarks, image, behind)
@@ -39,6 +39,6 @@ def test_one_that_was_taken_elsewhere_is_looked_for_everywhere():
 
 def test_one_of_another_place_is_refused():
     landmarks = known_place().landmarks
-    first = locate(landmarks, photograph(0)[0])
+    first = localize_image(landmarks, photograph(0)[0])
     assert isinstance(first, Located)
     assert isinstance(follow(landmarks, np.ascontiguousarray(photograph(1)[0][:, ::-1]), first), NotLocated)

@@ -9,7 +9,7 @@ import numpy as np
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.geometry import project
 from splatnode.recon.locating import gathering
-from splatnode.recon.modelling import with_landmarks
+from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.located import PLACE, known_place
@@ -36,7 +36,7 @@ def test_no_more_descriptors_are_kept_than_may_be_and_every_photograph_has_some(
     estimate = known_place().estimate
     assert estimate.registration is not None
     monkeypatch.setattr(gathering, "DESCRIPTORS_A_PHOTOGRAPH", 100)
-    few = gathering.gathered(estimate.graph, estimate.registration, estimate.bounds)
+    few = gathering.collect_landmarks(estimate.graph, estimate.registration, estimate.bounds)
     assert 400 < len(few.descriptors) <= 600 and len(few.points) <= len(few.descriptors) // 2
     assert (np.bincount(few.photograph_of, minlength=PLACE.views) > 40).all()
     assert set(few.point_of.tolist()) == set(range(len(few.points)))
@@ -54,17 +54,17 @@ def test_a_scene_that_grew_in_another_world_has_its_landmarks_there():
         moved = T_world_camera.copy()
         moved[:3, 3] = 3.0 * moved[:3, 3] + [1.0, 0.0, -2.0]
         cameras.append(CameraEstimate(name, 0, moved, np.eye(3), 9, 9))
-    made = with_landmarks(shown(tuple(cameras)), place.estimate)
+    made = add_landmarks(shown(tuple(cameras)), place.estimate)
     assert made.landmarks is not None
     assert np.allclose(made.landmarks.points, 3.0 * place.landmarks.points + [1.0, 0.0, -2.0])
-    assert with_landmarks(shown(tuple(cameras[:1])), place.estimate).landmarks is None
-    assert with_landmarks(shown(tuple(cameras)), None).landmarks is None
+    assert add_landmarks(shown(tuple(cameras[:1])), place.estimate).landmarks is None
+    assert add_landmarks(shown(tuple(cameras)), None).landmarks is None
 
 
 def test_a_refused_estimate_has_none():
     estimate = known_place().estimate
     refused = replace(estimate, verdict=replace(estimate.verdict, publishable=False))
-    assert refused.landmarks is None and refused.conclusion_to_save.landmarks is None
+    assert refused.landmarks is None and refused.summary_to_save.landmarks is None
 
 
 def test_the_bounds_of_the_focal_lengths_are_those_of_the_cameras():

@@ -11,12 +11,12 @@ from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames.keyframe import Features
 from splatnode.recon.locating import posing
 from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
-from splatnode.recon.locating.candidates import Assumed, any_lens, assume
-from splatnode.recon.locating.case import Judged
+from splatnode.recon.locating.candidates import LensAssumption, assume_lenses, make_lens_grid
+from splatnode.recon.locating.case import QueryContext
 from splatnode.recon.locating.correspondences import Correspondences, measure_mirror_gain
 from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.lens_choice import Chosen, choose_lens, search
-from splatnode.recon.locating.locate import described, locate
+from splatnode.recon.locating.lens_choice import LensChoice, choose_lens, search_cameras
+from splatnode.recon.locating.locate import localize_image, prepare_query_image
 from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
 from splatnode.recon.verification import reflection
@@ -30,7 +30,7 @@ MIRROR = np.diag([-1.0, 1.0, 1.0])
 def warped(index: int, warp: str) -> tuple[Query, Located | NotLocated, tuple]:
     image, camera = photograph(index)
     query = WARPS[warp](image, camera[1], index)
-    return query, locate(known_place().landmarks, query.image), camera
+    return query, localize_image(known_place().landmarks, query.image), camera
 
 
 def assert_right(query: Query, found: Located | NotLocated, camera: tuple) -> None:
@@ -73,7 +73,7 @@ def test_a_lens_that_bends_lines_is_estimated():
 
 
 def test_the_scenes_own_lens_is_named_where_the_image_does_not_contradict_it():
-    found = locate(known_place().landmarks, photograph(1)[0])
+    found = localize_image(known_place().landmarks, photograph(1)[0])
     assert isinstance(found, Located) and found.lens is LensSource.SCENE
     assert "its lens is its own" not in found.sentence
 
@@ -84,10 +84,10 @@ def test_a_lens_that_is_stated_is_tested(source):
     K = camera[1]
     stated = Intrinsics(PLACE.width, PLACE.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], source)
     query = WARPS["zoom 1.3"](image, K, 0)
-    found = locate(known_place().landmarks, query.image, stated)
+    found = localize_image(known_place().landmarks, query.image, stated)
     assert_right(query, found, camera)
     assert isinstance(found, Located) and found.lens is LensSource.FREE  # the statement is of the whole image
-    right = locate(known_place().landmarks, image, stated)
+    right = localize_image(known_place().landmarks, image, stated)
     assert isinstance(right, Located) and right.lens in (LensSource.SCENE, LensSource.GIVEN)
 
 
@@ -95,13 +95,13 @@ def test_a_lens_that_no_crop_makes_of_the_stated_one_is_refused():
     image, camera = photograph(0)
     focal = 2.0 * camera[1][0, 0]
     stated = Intrinsics(PLACE.width, PLACE.height, focal, focal, PLACE.width / 2, PLACE.height / 2, "exif")
-    found = locate(known_place().landmarks, image, stated)
+    found = localize_image(known_place().landmarks, image, stated)
     assert isinstance(found, NotLocated) and found.code is Reason.LENS and "are stated" in found.message
 
 
 def test_an_image_that_follows_another_may_zoom():
     image, camera = photograph(1)
-    before = locate(known_place().landmarks, photograph(0)[0])
+    before = localize_image(known_place().landmarks, photograph(0)[0])
     assert isinstance(before, Located)
     query = WARPS["zoom 1.6"](image, camera[1], 1)
     found = follow(known_place().landmarks, query.image, before)
@@ -126,9 +126,7 @@ def symmetric(landmarks: Landmarks, share: float) -> Landmarks:
         landmarks,
         points=np.concatenate([landmarks.points, landmarks.points[twice] @ MIRROR]),
         covariances=np.concatenate([landmarks.covariances, MIRROR @ landmarks.covariances[twice] @ MIRROR]),
-        descriptors=np.concatenate(
-            [landmarks.descriptors, reflection.mirrored_descriptors(landmarks.descriptors[kept])]
-        ),
+        descriptors=np.concatenate([landmarks.descriptors, reflection.mirror_descriptors(landmarks.descriptors[kept])]),
         point_of=np.concatenate([landmarks.point_of, number[landmarks.point_of[kept]]]),
         photograph_of=np.concatenate([landmarks.photograph_of, len(landmarks.names) + landmarks.photograph_of[kept]]),
         names=landmarks.names + tuple(f"mirrored {name}" for name in landmarks.names),
@@ -143,19 +141,21 @@ def symmetric(landmarks: Landmarks, share: float) -> Landmarks:
 def test_a_mirrored_image_of_a_symmetric_place_is_refused():
     image, camera = photograph(2)
     scene = symmetric(known_place().landmarks, 0.4)
-    mirrored = locate(scene, np.ascontiguousarray(image[:, ::-1]))
+    mirrored = localize_image(scene, np.ascontiguousarray(image[:, ::-1]))
     assert isinstance(mirrored, NotLocated) and mirrored.code is Reason.MIRRORED
-    found = locate(scene, image)
+    found = localize_image(scene, image)
     assert isinstance(found, Located) and max(errors(found, camera)) < 1.0
 
 
 def test_the_gain_of_mirroring_is_above_0_for_mirrored_images_alone():
     image, _ = photograph(2)
-    features = described(image).features
+    features = prepare_query_image(image).features
     turned = Features(
-        features.points, reflection.mirrored_descriptors(features.descriptors), features.point_of, features.tilt
+        features.points, reflection.mirror_descriptors(features.descriptors), features.point_of, features.tilt
     )
-    gains = [measure_mirror_gain(each, known_place().landmarks, reflection.Config()) for each in (features, turned)]
+    gains = [
+        measure_mirror_gain(each, known_place().landmarks, reflection.ReflectionConfig()) for each in (features, turned)
+    ]
     assert gains[0] < -0.3 and gains[1] == pytest.approx(-gains[0])
 
 
@@ -172,20 +172,20 @@ def seen(lens: Lens, relief: float, count: int = 600, noise_px: float = 0.5) -> 
     return Correspondences(noisy, index, points, np.zeros((count, 3, 3)), index, np.zeros(count, int), along)
 
 
-def chosen_of(known: Correspondences, assumed: list[Assumed]) -> Chosen:
-    judged = Judged(known, WIDTH, HEIGHT, 0.5, 4.0, posing.Config())
-    chosen = choose_lens(judged, search(judged, assumed, any_lens(judged.side, assumed)), assumed)
+def chosen_of(known: Correspondences, assumed: list[LensAssumption]) -> LensChoice:
+    judged = QueryContext(known, WIDTH, HEIGHT, 0.5, 4.0, posing.PoseSearchConfig())
+    chosen = choose_lens(judged, search_cameras(judged, assumed, make_lens_grid(judged.side, assumed)), assumed)
     assert chosen is not None
     return chosen
 
 
-def own(focal: float) -> list[Assumed]:
+def own(focal: float) -> list[LensAssumption]:
     one = np.ones(1)
     lenses = KnownLenses(focal / WIDTH * one, np.zeros((1, 2)), np.zeros((1, 2)), HEIGHT / WIDTH * one)
-    return assume(lenses, WIDTH, HEIGHT, None)
+    return assume_lenses(lenses, WIDTH, HEIGHT, None)
 
 
-def focal_sigmas(chosen: Chosen, focal: float) -> tuple[float, float]:
+def focal_sigmas(chosen: LensChoice, focal: float) -> tuple[float, float]:
     """The error of the logarithm of the focal length, and its standard deviation."""
     sigma = float(np.sqrt(chosen.posed.fit.covariance[6, 6]))
     return abs(np.log(chosen.posed.fit.camera.lens.focal / focal)), sigma
@@ -215,6 +215,6 @@ def test_a_given_lens_that_fits_stays_as_it_is_and_is_not_taken_for_exact():
     lens = Lens(FOCAL, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
     given = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, "given")
     nothing = KnownLenses(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
-    chosen = chosen_of(seen(lens, 1.0), assume(nothing, WIDTH, HEIGHT, given))
+    chosen = chosen_of(seen(lens, 1.0), assume_lenses(nothing, WIDTH, HEIGHT, given))
     assert chosen.source is LensSource.GIVEN and chosen.posed.fit.camera.lens.focal == pytest.approx(FOCAL)
     assert focal_sigmas(chosen, FOCAL)[1] > 0.001

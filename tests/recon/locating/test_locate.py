@@ -10,7 +10,7 @@ from splatnode.capture.cameras import building
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon import opencv_poses
 from splatnode.recon.locating import posing
-from splatnode.recon.locating.locate import Config, described, locate, located
+from splatnode.recon.locating.locate import LocalizationConfig, localize_image, localize_query, prepare_query_image
 from splatnode.recon.locating.outcome import Located, NotLocated, Reason
 from tests.support.located import PLACE, errors, known_place, photograph
 
@@ -18,7 +18,7 @@ from tests.support.located import PLACE, errors, known_place, photograph
 @pytest.mark.parametrize("index", range(PLACE.views - 1))
 def test_photographs_between_those_of_the_scene_are_placed_within_their_claim(index):
     image, camera = photograph(index)
-    found = locate(known_place().landmarks, image)
+    found = localize_image(known_place().landmarks, image)
     assert isinstance(found, Located)
     degrees, percent = errors(found, camera)
     assert degrees < 1.0 and percent < 1.0
@@ -32,11 +32,11 @@ def test_a_lens_that_is_given_is_believed():
     image, camera = photograph(2)
     K = camera[1]
     given = Intrinsics(PLACE.width, PLACE.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], source="given")
-    found = locate(known_place().landmarks, image, given)
+    found = localize_image(known_place().landmarks, image, given)
     assert isinstance(found, Located) and np.allclose(found.K, K)
     assert max(errors(found, camera)) < 1.0
     wrong = Intrinsics(PLACE.width, PLACE.height, 3.0 * K[0, 0], 3.0 * K[0, 0], K[0, 2], K[1, 2], source="given")
-    assert isinstance(locate(known_place().landmarks, image, wrong), NotLocated)
+    assert isinstance(localize_image(known_place().landmarks, image, wrong), NotLocated)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_a_lens_that_is_given_is_believed():
 )
 def test_a_photograph_that_was_turned_darkened_or_shrunk_is_placed_at_the_same_spot(changed):
     image, camera = photograph(1)
-    found = locate(known_place().landmarks, np.ascontiguousarray(changed(image)))
+    found = localize_image(known_place().landmarks, np.ascontiguousarray(changed(image)))
     assert isinstance(found, Located)
     assert errors(found, camera)[1] < 1.0
 
@@ -58,7 +58,7 @@ def test_a_photograph_that_was_turned_darkened_or_shrunk_is_placed_at_the_same_s
 def test_the_lens_of_a_part_of_a_photograph_looks_beside_its_middle():
     image, camera = photograph(2)
     part = np.ascontiguousarray(image[:, : 3 * PLACE.width // 4])
-    found = locate(known_place().landmarks, part)
+    found = localize_image(known_place().landmarks, part)
     assert isinstance(found, Located)
     degrees, percent = errors(found, camera)
     assert degrees <= found.claim.rotation_deg and percent <= found.claim.centre_percent and degrees < 1.0
@@ -67,11 +67,11 @@ def test_the_lens_of_a_part_of_a_photograph_looks_beside_its_middle():
 
 def test_photographs_of_other_places_are_refused():
     landmarks = known_place().landmarks
-    elsewhere = building.photograph(building.Config(width=480, height=360), 3.0)
+    elsewhere = building.render_image(building.Config(width=480, height=360), 3.0)
     mirrored = np.ascontiguousarray(photograph(2)[0][:, ::-1])
     noise = np.random.default_rng(0).integers(0, 255, (360, 480, 3)).astype(np.uint8)
     for image in (elsewhere, mirrored, noise, np.full((360, 480, 3), 99, np.uint8)):
-        found = locate(landmarks, image)
+        found = localize_image(landmarks, image)
         assert isinstance(found, NotLocated) and found.code is Reason.NOT_FOUND
         assert found.sentence.startswith("refused: NOT_FOUND: ") and found.advice in found.sentence
 
@@ -80,23 +80,23 @@ def test_what_shows_the_scene_in_one_patch_alone_is_refused():
     image, _ = photograph(2)
     covered = np.full_like(image, 128)
     covered[140:220, 190:290] = image[140:220, 190:290]
-    found = locate(known_place().landmarks, covered)
+    found = localize_image(known_place().landmarks, covered)
     assert isinstance(found, NotLocated)
 
 
 def test_without_poselib_it_is_placed_as_well(monkeypatch):
     monkeypatch.setattr(posing.poselib, "estimate_absolute_pose", opencv_poses.estimate_absolute_pose)
     image, camera = photograph(1)
-    found = locate(known_place().landmarks, image)
+    found = localize_image(known_place().landmarks, image)
     assert isinstance(found, Located) and max(errors(found, camera)) < 1.0
     mirrored = np.ascontiguousarray(image[:, ::-1])
-    assert isinstance(locate(known_place().landmarks, mirrored), NotLocated)
+    assert isinstance(localize_image(known_place().landmarks, mirrored), NotLocated)
 
 
 def test_a_photograph_is_described_once_for_several_scenes():
     image, _ = photograph(0)
-    landmarks, seen = known_place().landmarks, described(image)
-    once, again = located(landmarks, seen), located(landmarks, seen, Config())
+    landmarks, seen = known_place().landmarks, prepare_query_image(image)
+    once, again = localize_query(landmarks, seen), localize_query(landmarks, seen, LocalizationConfig())
     assert isinstance(once, Located) and isinstance(again, Located)
     assert np.array_equal(once.T_world_camera, again.T_world_camera)
 
@@ -104,8 +104,8 @@ def test_a_photograph_is_described_once_for_several_scenes():
 def test_in_metres_lengths_are_metres():
     image, _ = photograph(2)
     landmarks = known_place().landmarks
-    relative = locate(landmarks, image)
-    metric = locate(landmarks.moved(2.5, np.eye(3), np.zeros(3), metric=True), image)
+    relative = localize_image(landmarks, image)
+    metric = localize_image(landmarks.transform(2.5, np.eye(3), np.zeros(3), metric=True), image)
     assert isinstance(relative, Located) and isinstance(metric, Located) and metric.metric
     assert np.allclose(metric.T_world_camera[:3, 3], 2.5 * relative.T_world_camera[:3, 3], atol=1e-3)
     assert metric.claim.centre == pytest.approx(2.5 * relative.claim.centre, rel=0.05)
@@ -115,4 +115,4 @@ def test_in_metres_lengths_are_metres():
 
 def test_an_image_must_be_bytes_in_three_channels():
     with pytest.raises(ValueError, match="uint8"):
-        locate(known_place().landmarks, np.zeros((9, 9, 3)))  # pyright: ignore[reportArgumentType]
+        localize_image(known_place().landmarks, np.zeros((9, 9, 3)))  # pyright: ignore[reportArgumentType]

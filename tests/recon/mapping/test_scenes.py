@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.recon.mapping import scenes
-from splatnode.recon.mapping.scenes import check_begun, make_scenes, node_config, remove_checkpoint
+from splatnode.recon.mapping.scenes import check_incomplete, make_node_config, make_scenes, remove_checkpoint
 from tests.recon.daemon.test_daemon import QUICK
 from tests.support.synthetic import photographs
 
@@ -18,7 +18,7 @@ IDENTITY, OTHER = "a" * 32, "b" * 32
 
 @pytest.fixture
 def node(tmp_path):
-    return replace(node_config(QUICK, tmp_path / "out"), max_views=4, settle_s=0.2)
+    return replace(make_node_config(QUICK, tmp_path / "out"), max_views=4, settle_s=0.2)
 
 
 def index(node) -> dict:
@@ -60,12 +60,12 @@ def test_a_map_is_not_mixed_with_another_one_nor_written_over(node):
     with pytest.raises(ValueError, match="is that of another recording; remove it, or give another --out"):
         make_scenes(photographs()[:1], OTHER, node, ignored)
         make_scenes(photographs()[:1], IDENTITY, node, ignored)
-    check_begun(node.out)
+    check_incomplete(node.out)
     (node.out / "places.json").write_text("{}")
-    check_begun(node.out)
+    check_incomplete(node.out)
     remove_checkpoint(node.out)
     with pytest.raises(ValueError, match="holds the scenes of a map already; give another --out"):
-        check_begun(node.out)
+        check_incomplete(node.out)
 
 
 def test_a_photograph_that_cannot_be_used_is_named_and_stops_nothing(node, monkeypatch):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from splatnode.recon.matching import candidates
-from splatnode.recon.matching.candidates import Pair, to_glance_at, worth_matching
+from splatnode.recon.matching.candidates import Pair, select_pairs_worth_matching, select_short_list_pairs
 
-CONFIG = candidates.Config()
+CONFIG = candidates.PairSelectionConfig()
 RING = 40  # keyframes around a place, each of which overlaps its neighbours
 
 
@@ -27,7 +27,7 @@ def completed(size: int, glanced: dict[Pair, int], firm: set[Pair], first: set[P
     """The pairs that are worth it in the end, and those that were matched on the way, beginning with `first`."""
     matched = set(first)
     for _ in range(100):
-        worth = worth_matching(size, glanced, matched.__contains__, firm.__contains__, CONFIG)
+        worth = select_pairs_worth_matching(size, glanced, matched.__contains__, firm.__contains__, CONFIG)
         if worth <= matched:
             return worth, matched
         matched |= worth
@@ -42,7 +42,7 @@ def ring(reach: int = 6) -> tuple[dict[Pair, int], set[Pair]]:
 def test_a_few_keyframes_are_all_matched():
     for size in (2, CONFIG.exhaustive):
         assert completed(size, {}, set())[0] == set(every(size))
-        assert not to_glance_at([np.ones(4, np.float32)] * size, CONFIG)
+        assert not select_short_list_pairs([np.ones(4, np.float32)] * size, CONFIG)
 
 
 def test_many_are_matched_with_their_likeliest_partners():
@@ -83,7 +83,7 @@ def test_the_work_grows_with_the_keyframes(size):
     """Codes on a circle: each keyframe's short list is those beside it."""
     angles = 2 * np.pi * np.arange(size) / size
     codes = [np.array([np.cos(angle), np.sin(angle)], np.float32) for angle in angles]
-    pairs = to_glance_at(codes, CONFIG)
+    pairs = select_short_list_pairs(codes, CONFIG)
     assert pairs == {pair for pair in every(size) if distance(pair, size) <= CONFIG.short_list // 2}
     glanced = {pair: 100 - distance(pair, size) for pair in pairs}
     firm = {pair for pair in every(size) if distance(pair, size) <= 5}

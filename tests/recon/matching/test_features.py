@@ -26,7 +26,7 @@ def picture() -> np.ndarray:
 
 
 def test_one_descriptor_a_point_inside_the_image(picture):
-    found = features.extract(picture, features.Config(num_features=500))
+    found = features.extract(picture, features.FeatureConfig(num_features=500))
     assert 400 < len(found.points) <= 510
     assert found.descriptors.shape == (len(found.points), 128) and found.descriptors.dtype == np.uint8
     np.testing.assert_array_equal(found.point_of, np.arange(len(found.points)))
@@ -40,21 +40,28 @@ def test_points_are_in_full_size_pixels_at_whatever_size_they_are_found(picture,
     y, x = np.mgrid[:480, :640] + 0.5
     dot += 200 * np.exp(-((x - 201.3) ** 2 + (y - 150.8) ** 2) / (2 * 6.0**2))
     image = np.repeat(dot[..., None], 3, axis=2).astype(np.uint8)
-    config = features.Config(max_longer_side=longer_side, min_longer_side=min(longer_side, 1000))
+    config = features.FeatureConfig(max_longer_side=longer_side, min_longer_side=min(longer_side, 1000))
     found = features.extract(image, config)
     np.testing.assert_allclose(found.points[0], [201.3, 150.8], atol=0.25)
 
 
 def test_an_image_of_one_colour_has_none():
-    found = features.extract(np.full((60, 80, 3), 128, np.uint8), features.Config())
+    found = features.extract(np.full((60, 80, 3), 128, np.uint8), features.FeatureConfig())
     assert found.points.shape == (0, 2) and found.descriptors.shape == (0, 128)
-    assert len(features.add_tilted(found, np.full((60, 80, 3), 128, np.uint8), (1.6,), features.Config()).points) == 0
+    assert (
+        len(
+            features.add_affine_features(
+                found, np.full((60, 80, 3), 128, np.uint8), (1.6,), features.FeatureConfig()
+            ).points
+        )
+        == 0
+    )
 
 
 def test_a_tilt_adds_descriptors_to_known_points_and_points(picture):
-    config = features.Config(num_features=500)
+    config = features.FeatureConfig(num_features=500)
     plain = features.extract(picture, config)
-    widened = features.add_tilted(plain, picture, (1.6,), config)
+    widened = features.add_affine_features(plain, picture, (1.6,), config)
     added = widened.tilt == 1.6
     assert added.sum() > 200
     np.testing.assert_array_equal(widened.points[: len(plain.points)], plain.points)
@@ -62,7 +69,7 @@ def test_a_tilt_adds_descriptors_to_known_points_and_points(picture):
     snapped = widened.point_of[added] < len(plain.points)
     assert 0 < snapped.sum() < added.sum()
     assert widened.point_of.max() == len(widened.points) - 1
-    again = features.add_tilted(widened, picture, (1.6,), config)
+    again = features.add_affine_features(widened, picture, (1.6,), config)
     assert len(again.descriptors) == len(widened.descriptors)
 
 
@@ -82,13 +89,15 @@ def test_a_view_from_above_is_matched_by_tilts_below_one(picture):
 
 def num_right(picture: np.ndarray, shrunk: np.ndarray, tilt: float) -> tuple[int, int]:
     """Right matches of the shrunk picture with plain features of the picture, and with those of this tilt."""
-    config = features.Config(num_features=2000)
+    config = features.FeatureConfig(num_features=2000)
     front, side = features.extract(picture, config), features.extract(shrunk, config)
-    both = features.add_tilted(front, picture, (tilt,), config)
+    both = features.add_affine_features(front, picture, (tilt,), config)
     there = np.array(picture.shape[1::-1]) / shrunk.shape[1::-1]
 
     def count(chosen: np.ndarray) -> int:
-        found = nearest_neighbours.match(both.descriptors[chosen], side.descriptors, nearest_neighbours.Config())
+        found = nearest_neighbours.match(
+            both.descriptors[chosen], side.descriptors, nearest_neighbours.NearestNeighbourConfig()
+        )
         points = both.points[both.point_of[chosen]][found[:, 0]]
         return int((np.linalg.norm(points - side.points[found[:, 1]] * there, axis=1) < 3.0).sum())
 
@@ -97,13 +106,13 @@ def num_right(picture: np.ndarray, shrunk: np.ndarray, tilt: float) -> tuple[int
 
 def test_frames_without_features_are_compared_without_a_pair():
     flat = np.full((60, 80, 3), 128, np.uint8)
-    config = matching.Config()
+    config = matching.MatchingConfig()
     keyframes = [
         Keyframe(Frame(i, f"{i}.png", i, flat, None), flat, features.extract(flat, config.features)) for i in range(2)
     ]
     plain = pair_matching.match_plain(keyframes[0], keyframes[1], config.pair_matching)
     assert plain.geometry is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
-    assert pair_matching.match_tilted(keyframes[0], keyframes[1], plain, (1.6,), config.pair_matching).geometry is None
+    assert pair_matching.match_affine(keyframes[0], keyframes[1], plain, (1.6,), config.pair_matching).geometry is None
 
 
 def test_the_motion_of_a_resized_copy_is_none():
@@ -111,6 +120,6 @@ def test_the_motion_of_a_resized_copy_is_none():
     points = np.random.default_rng(0).uniform(-300, 300, (9, 2))
     pair = TwoView(np.zeros((9, 2), np.int64), points, 0.5 * points, 9, -20.0, 9, 9, 1.0, 1.0)
     assert pair_matching.median_motion_px(pair, 640, 320) == 0.0
-    moved = pair.scaled(1.0, 2.0)
+    moved = pair.rescale(1.0, 2.0)
     assert pair_matching.median_motion_px(moved, 640, 640) == 0.0
     assert pair_matching.median_motion_px(replace(moved, points2=points + [5.0, 0.0]), 640, 640) == pytest.approx(8.0)

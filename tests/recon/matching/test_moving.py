@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.recon.config import overlaid, preset
-from splatnode.recon.matching.config import Moving
-from splatnode.recon.matching.moving import moving_masks, without_moving
+from splatnode.recon.config import apply_changes, preset
+from splatnode.recon.matching.config import MovingObjectsConfig
+from splatnode.recon.matching.moving import mask_moving_objects, moving_masks
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.offline import run
 from splatnode.recon.pipeline import reconstruct_stream
@@ -20,7 +20,7 @@ from tests.support.moving import look_of, pasted
 from tests.support.synthetic import SMALL, errors, photographs, view_graph
 
 SHARE = 0.2
-CONFIG = overlaid(preset("preview"), {"size": 320})
+CONFIG = apply_changes(preset("preview"), {"size": 320})
 
 
 def with_thing():
@@ -44,11 +44,11 @@ def test_a_thing_that_moved_is_found_in_every_photograph_and_little_else():
 def test_nothing_is_found_where_nothing_moved():
     graph = graph_of(False)
     assert moving_masks(graph) == {}
-    assert without_moving(graph, None) is graph
+    assert mask_moving_objects(graph, None) is graph
 
 
 def test_no_match_is_on_the_thing_afterwards():
-    graph = without_moving(graph_of(True), None)
+    graph = mask_moving_objects(graph_of(True), None)
     free = {frame.name: mask for frame, mask in with_thing()}
     for (i, j), pair in graph.pairs.items():
         for side, index in enumerate((i, j)):
@@ -80,5 +80,5 @@ def test_a_live_scene_leaves_it_out_once_it_is_final():
 
 def test_it_can_be_switched_off():
     graph = graph_of(True)
-    off = replace(graph, config=msgspec.structs.replace(graph.config, moving=Moving(enabled=False)))
+    off = replace(graph, config=msgspec.structs.replace(graph.config, moving=MovingObjectsConfig(enabled=False)))
     assert moving_masks(off) == {} and moving_masks(graph) != {}

@@ -29,7 +29,7 @@ def pairs(num_common: int, num_other: int, noise: float = 0.02) -> tuple[np.ndar
 
 def test_what_corresponds_is_found_and_nothing_else():
     first, second = pairs(101, 57)
-    found = nearest_neighbours.match(first, second, nearest_neighbours.Config())
+    found = nearest_neighbours.match(first, second, nearest_neighbours.NearestNeighbourConfig())
     common = found[(found[:, 0] < 101) & (found[:, 1] < 101)]
     assert len(common) == 101
     np.testing.assert_array_equal(common.sum(1), np.full(101, 100))
@@ -80,7 +80,7 @@ def test_nearby_it_equals_brute_force(sizes, reach, instruction_set):
 
 def test_matches_nearby_are_those_of_all_where_all_are_near():
     first, second = pairs(101, 57)
-    config = nearest_neighbours.Config()
+    config = nearest_neighbours.NearestNeighbourConfig()
     places = [np.random.default_rng(0).uniform(0, 100, (len(each), 2)) for each in (first, second)]
     found = nearest_neighbours.match_near(first, places[0], second, places[1], 200.0, config)
     np.testing.assert_array_equal(found, nearest_neighbours.match(first, second, config))
@@ -92,14 +92,18 @@ def test_matches_nearby_are_those_of_all_where_all_are_near():
 def test_what_is_no_place_is_refused(points):
     four = descriptors(4, 0)
     with pytest.raises(ValueError, match="finite"):
-        nearest_neighbours.match_near(four, points, four, np.zeros((4, 2)), 1.0, nearest_neighbours.Config())
+        nearest_neighbours.match_near(
+            four, points, four, np.zeros((4, 2)), 1.0, nearest_neighbours.NearestNeighbourConfig()
+        )
     with pytest.raises(ValueError, match="reach"):
-        nearest_neighbours.match_near(four, np.zeros((4, 2)), four, np.zeros((4, 2)), 0.0, nearest_neighbours.Config())
+        nearest_neighbours.match_near(
+            four, np.zeros((4, 2)), four, np.zeros((4, 2)), 0.0, nearest_neighbours.NearestNeighbourConfig()
+        )
 
 
 def test_the_most_distinct_matches_come_first():
     first, second = pairs(60, 40, noise=0.08)
-    found = nearest_neighbours.match(first, second, nearest_neighbours.Config(ratio=1.0))
+    found = nearest_neighbours.match(first, second, nearest_neighbours.NearestNeighbourConfig(ratio=1.0))
     squared = ((first[:, None].astype(int) - second[None].astype(int)) ** 2).sum(2)
     two_nearest = np.sort(squared[found[:, 0]], axis=1)[:, :2]
     ratios = two_nearest[:, 0] / two_nearest[:, 1]
@@ -113,17 +117,21 @@ def test_products_of_the_largest_descriptors_do_not_overflow():
     for kind in (even, peak):
         bytes_ = nearest_neighbours.quantise(kind)
         assert np.linalg.norm(bytes_.astype(float), axis=1).max() <= 181.0
-        assert len(nearest_neighbours.match(bytes_, bytes_, nearest_neighbours.Config())) == 0  # no nearest is distinct
+        assert (
+            len(nearest_neighbours.match(bytes_, bytes_, nearest_neighbours.NearestNeighbourConfig())) == 0
+        )  # no nearest is distinct
 
 
 def test_too_few_descriptors_give_no_match():
-    assert nearest_neighbours.match(descriptors(1, 0), descriptors(9, 1), nearest_neighbours.Config()).shape == (0, 2)
+    assert nearest_neighbours.match(
+        descriptors(1, 0), descriptors(9, 1), nearest_neighbours.NearestNeighbourConfig()
+    ).shape == (0, 2)
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((4, 64), np.uint8), np.zeros((4, 128), np.float32)])
 def test_what_is_no_descriptor_is_refused(wrong):
     with pytest.raises(ValueError, match="uint8"):
-        nearest_neighbours.match(wrong, descriptors(4, 0), nearest_neighbours.Config())
+        nearest_neighbours.match(wrong, descriptors(4, 0), nearest_neighbours.NearestNeighbourConfig())
 
 
 @pytest.mark.parametrize(
@@ -141,7 +149,7 @@ def test_descriptors_whose_products_overflow_are_refused(wrong, first):
     """Longer than 181, or with a byte that the core would take for a negative one."""
     good, bad = descriptors(40, 0), descriptors(40, 1)
     bad[23] = wrong
-    config, places = nearest_neighbours.Config(), np.zeros((40, 2))
+    config, places = nearest_neighbours.NearestNeighbourConfig(), np.zeros((40, 2))
     pair = (bad, good) if first else (good, bad)
     with pytest.raises(ValueError, match="bytes below 128 and norms of at most 181"):
         nearest_neighbours.match(*pair, config)
@@ -152,7 +160,7 @@ def test_descriptors_whose_products_overflow_are_refused(wrong, first):
 def test_the_longest_descriptors_are_matched():
     longest = np.zeros((3, 128), np.uint8)
     longest[0, :2], longest[1, :121], longest[2, 5] = (127, 127), 16, 127
-    found = nearest_neighbours.match(longest, longest, nearest_neighbours.Config())
+    found = nearest_neighbours.match(longest, longest, nearest_neighbours.NearestNeighbourConfig())
     assert sorted(map(tuple, found.tolist())) == [(0, 0), (1, 1), (2, 2)]
 
 
@@ -160,5 +168,5 @@ def test_the_longest_descriptors_are_matched():
 def test_places_at_the_ends_of_their_type_are_places(far):
     four = descriptors(4, 0)
     places = np.array([[-far, 0.0], [far, -far], [0.0, far], [far / 3, 0.0]])
-    found = nearest_neighbours.match_near(four, places, four, places, 1.0, nearest_neighbours.Config())
+    found = nearest_neighbours.match_near(four, places, four, places, 1.0, nearest_neighbours.NearestNeighbourConfig())
     assert len(found) == 4 or far < 1

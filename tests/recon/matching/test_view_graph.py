@@ -13,7 +13,7 @@ import pytest
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features, pair_matching, tilting
-from splatnode.recon.matching.match import FIRST_COMPARISONS, completed, match, matched_soon
+from splatnode.recon.matching.match import FIRST_COMPARISONS, match, match_newest, match_pending
 from splatnode.recon.matching.pair_matching import MatchedPair
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import register
@@ -56,26 +56,24 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
         return MatchedPair(NO_MATCHES, weak, -20.0 if weak else 0.0)
 
     monkeypatch.setattr(pair_matching, "match_plain", compare)
-    monkeypatch.setattr(pair_matching, "match_tilted", match_tilted)
+    monkeypatch.setattr(pair_matching, "match_affine", match_tilted)
     monkeypatch.setattr("splatnode.recon.matching.view_graph.content_key", lambda keyframe: keyframe.name)
-    monkeypatch.setattr(
-        "splatnode.recon.matching.match._with_tilted_features", lambda keyframe, tilts, config: keyframe
-    )
+    monkeypatch.setattr("splatnode.recon.matching.match._try_affine_features", lambda keyframe, tilts, config: keyframe)
     return calls
 
 
 def graph_of(*names: str) -> Any:
-    return match(map(keyframe, names), matching.Config())  # pyright: ignore[reportArgumentType]
+    return match(map(keyframe, names), matching.MatchingConfig())  # pyright: ignore[reportArgumentType]
 
 
 def complete(graph: Any) -> Any:
-    *_, whole = completed(graph, None)
+    *_, whole = match_pending(graph, None)
     return whole
 
 
 def soon(graph: Any, name: str) -> Any:
     """With a further keyframe that is compared with a few others."""
-    *_, later = matched_soon(graph.with_keyframe(keyframe(name)), None)
+    *_, later = match_newest(graph.with_keyframe(keyframe(name)), None)
     return later
 
 
@@ -151,14 +149,18 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
 
 
 def test_out_of_time_no_pair_is_matched_with_tilted_features(compared):
-    graph: Any = ViewGraph(matching.Config(), (keyframe("a1"),))
-    *_, whole = completed(graph.with_keyframe(keyframe("A2")), None, until=0.0)
+    graph: Any = ViewGraph(matching.MatchingConfig(), (keyframe("a1"),))
+    *_, whole = match_pending(graph.with_keyframe(keyframe("A2")), None, until=0.0)
     assert compared == [("A2", "a1")] and not whole.pending and not whole.tilted
 
 
 def test_who_waits_hears_how_many_pairs_are_matched_and_how_many_weak_ones_again(compared):
     told = []
-    match([keyframe(name) for name in ("a", "b", "A")], matching.Config(), tell=lambda step: told.append(str(step)))
+    match(
+        [keyframe(name) for name in ("a", "b", "A")],
+        matching.MatchingConfig(),
+        tell=lambda step: told.append(str(step)),
+    )
     matched = [f"matching: {done} of 3 photograph pairs" for done in (1, 2, 3)]
     assert told[:3] == matched and told[-1] == "matching weak pairs again: 3 of 3 photograph pairs"
     assert all(line.startswith("matching weak pairs again") for line in told[3:])
@@ -166,7 +168,7 @@ def test_who_waits_hears_how_many_pairs_are_matched_and_how_many_weak_ones_again
 
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
     before = {(0, 1): Verified(range(77), ("a1", "a2"))}
-    graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), before)
+    graph: Any = ViewGraph(matching.MatchingConfig(), (keyframe("a1"), keyframe("a2")), before)
     graph = complete(graph.with_keyframe(keyframe("b1")))
     assert graph.pairs == before
 
@@ -174,7 +176,9 @@ def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
 def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
     graph: Any = ViewGraph(
-        matching.Config(tilting=tilting.Config(tilts=())), ("a", "b", "c", "d", "e"), dict.fromkeys(pairs)
+        matching.MatchingConfig(tilting=tilting.AffineSimulationConfig(tilts=())),
+        ("a", "b", "c", "d", "e"),
+        dict.fromkeys(pairs),
     )
     assert graph.components() == [[0, 1, 2, 3], [4]]
 
@@ -188,13 +192,13 @@ def test_photographs_of_one_place_are_a_pair_and_those_of_two_are_not():
 
 def test_cameras_do_not_depend_on_the_order_of_the_photographs():
     frames = photographs()[1:4]
-    config = matching.Config(features=features.Config(num_features=1500))
+    config = matching.MatchingConfig(features=features.FeatureConfig(num_features=1500))
     found = {}
     for order in ((0, 1, 2), (2, 0, 1)):
         images = [frames[index].image for index in order]
         found_in = [features.extract(image, config.features) for image in images]
         graph = match(map(Keyframe, [frames[index] for index in order], images, found_in), config)
-        registration = register.register(graph.keyframes, graph.pairs, register.Config())
+        registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
         assert registration is not None and len(registration.cameras) == 3
         found[order] = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
     relative = []
@@ -238,7 +242,7 @@ def test_what_is_pending_stays_so_without_another_keyframe(compared):
 def test_a_joined_graph_knows_what_either_knew_and_what_is_left_to_compare():
     graph = view_graph(photographs()[3::-1])  # the last came first
     names = [keyframe.name for keyframe in graph.keyframes]
-    joined = graph.without({names[0]}).joined(graph.without({names[3]}))
+    joined = graph.remove_keyframes({names[0]}).merge(graph.remove_keyframes({names[3]}))
     assert [keyframe.name for keyframe in joined.keyframes] == names[::-1]
     assert joined.pending == {(0, 3)} and set(joined.pairs) == set(itertools.combinations(range(4), 2)) - {(0, 3)}
     assert np.array_equal(joined.pairs[0, 1].points1, graph.pairs[2, 3].points2)  # swapped with their keyframes

@@ -9,11 +9,11 @@ import pytest
 
 import splatnode
 from splatnode.command_line import main
-from splatnode.recon.occupancy.occupancy_map import State
+from splatnode.recon.occupancy.occupancy_map import VoxelState
 from splatnode.recon.result.export import read_cameras, read_gaussians
-from splatnode.recon.result.pieces import pieces_of
+from splatnode.recon.result.pieces import find_pieces
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.result.whole import read_whole
+from splatnode.recon.result.whole import read_map_set
 from tests.support.walk import place, walk, write_walk
 
 PROVISIONAL = place("scene-0003", folder="scene-0003", verdict="OK", publishable=True, provisional=True)
@@ -51,17 +51,20 @@ def test_free_space_is_mapped_through_all_scenes_that_are_known_well(tmp_path, s
     out = write_walk(tmp_path / "out", second=second)
     assert main(["merge", str(out)]) == 0
     found = splatnode.load(out / "map-scene-0001").map(voxel=0.05)
-    mapped = State.FREE if second is Code.OK else State.NOT_SEEN
-    assert found.at(AHEAD).tolist() == [State.FREE, mapped]
+    mapped = VoxelState.FREE if second is Code.OK else VoxelState.NOT_SEEN
+    assert found.at(AHEAD).tolist() == [VoxelState.FREE, mapped]
     on_wall = AHEAD * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
-    assert found.at(on_wall).tolist() == [State.OCCUPIED, State.OCCUPIED if second is Code.OK else State.NOT_SEEN]
+    assert found.at(on_wall).tolist() == [
+        VoxelState.OCCUPIED,
+        VoxelState.OCCUPIED if second is Code.OK else VoxelState.NOT_SEEN,
+    ]
 
 
 def test_the_pieces_are_the_whole(merged_out):
-    whole = read_whole(merged_out)
-    pieces = pieces_of(whole, whole.maps[0], merged_out)
+    whole = read_map_set(merged_out)
+    pieces = find_pieces(whole, whole.maps[0], merged_out)
     assert pieces.merged
-    parts = np.concatenate([piece.gaussians().means for piece in pieces.pieces])
+    parts = np.concatenate([piece.load_gaussians().means for piece in pieces.pieces])
     every = read_gaussians(merged_out / "map-scene-0001" / "scene.ply").means
     assert np.allclose(parts[np.lexsort(parts.T)], every[np.lexsort(every.T)])
 

@@ -7,23 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.merging.merge import merged
+from splatnode.recon.merging.merge import merge_submaps
 from splatnode.recon.merging.regions import NOBODY, REGION_PX, owners, regions
-from splatnode.recon.merging.seams import kept
-from splatnode.recon.merging.sight import sight, surface_views
-from splatnode.recon.merging.submap import Submap, submap
-from splatnode.recon.result.coarser import joined
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.merging.seams import resolve_seams
+from splatnode.recon.merging.sight import measure_visibility, surface_views
+from splatnode.recon.merging.submap import Submap, place_submap
+from splatnode.recon.result.coarser import concatenate_gaussians
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.rendering import render_arrays
 from tests.support.walk import WalkScene, walk, without
 
 
 def submaps() -> list[Submap]:
-    return [submap(s.scene_id, "OK", s.gaussians, s.cameras, s.placement) for s in walk()]
+    return [place_submap(s.scene_id, "OK", s.gaussians, s.cameras, s.placement) for s in walk()]
 
 
 def of(scene: WalkScene, gaussians) -> Submap:
-    return submap(scene.scene_id, "OK", scene.placement.inverse().gaussians(gaussians), scene.cameras, scene.placement)
+    return place_submap(
+        scene.scene_id, "OK", scene.placement.inverse().transform_gaussians(gaussians), scene.cameras, scene.placement
+    )
 
 
 def shown(gaussians, camera):
@@ -34,7 +36,9 @@ def shown(gaussians, camera):
 
 def stays_of(parts: list[Submap]):
     """(means, shell or not) of what stays of each."""
-    return [(each.gaussians.means[mask], each.shell[mask]) for each, mask in zip(parts, kept(parts), strict=True)]
+    return [
+        (each.gaussians.means[mask], each.shell[mask]) for each, mask in zip(parts, resolve_seams(parts), strict=True)
+    ]
 
 
 def test_shells_are_told_from_surfaces():
@@ -59,16 +63,16 @@ def test_a_shell_does_not_hang_before_what_another_scene_sees():
     parts = submaps()
     views = surface_views(parts[1].gaussians, parts[1].shell, parts[1].cameras)
     before = parts[0].gaussians.means[parts[0].shell]
-    assert (sight(views, before).before > 0).any()  # it does to begin with
-    assert not (sight(views, first[first_shell]).before > 0).any()
+    assert (measure_visibility(views, before).before > 0).any()  # it does to begin with
+    assert not (measure_visibility(views, first[first_shell]).before > 0).any()
 
 
 def test_a_scene_without_a_shell_is_merged_too():
     parts = [replace(each, shell=np.zeros(len(each.gaussians), bool)) for each in submaps()]
-    assert [mask.shape for mask in kept(parts)] == [(len(each.gaussians),) for each in parts]
-    bare = [replace(each, gaussians=take(each.gaussians, ~part.shell), shell=each.shell[~part.shell])
+    assert [mask.shape for mask in resolve_seams(parts)] == [(len(each.gaussians),) for each in parts]
+    bare = [replace(each, gaussians=select_gaussians(each.gaussians, ~part.shell), shell=each.shell[~part.shell])
             for each, part in zip(parts, submaps(), strict=True)]  # fmt: skip
-    assert all(mask.any() for mask in kept(bare))
+    assert all(mask.any() for mask in resolve_seams(bare))
 
 
 def test_nothing_goes_where_the_better_scene_has_a_hole():
@@ -82,7 +86,9 @@ def test_nothing_goes_where_the_better_scene_has_a_hole():
 
 def test_no_hole_opens_for_any_camera():
     parts = submaps()
-    together = joined([take(each.gaussians, mask) for each, mask in zip(parts, kept(parts), strict=True)])
+    together = concatenate_gaussians(
+        [select_gaussians(each.gaussians, mask) for each, mask in zip(parts, resolve_seams(parts), strict=True)]
+    )
     for part in parts:
         for camera in part.cameras:
             alone, now = shown(part.gaussians, camera), shown(together, camera)
@@ -93,14 +99,14 @@ def test_no_hole_opens_for_any_camera():
 
 def test_a_scene_alone_keeps_everything():
     (part,) = submaps()[:1]
-    assert kept([part])[0].all()
-    same = merged([part])
+    assert resolve_seams([part])[0].all()
+    same = merge_submaps([part])
     assert len(same.gaussians) == len(part.gaussians) and same.shares[0].kept == (~part.shell).sum()
 
 
 def test_merged_looks_from_every_camera_as_its_own_scene_did():
     parts = submaps()
-    one = merged(parts)
+    one = merge_submaps(parts)
     assert len(one.gaussians) < 0.85 * sum(len(part.gaussians) for part in parts)
     assert [camera.name for camera in one.cameras] == [f"{n}.png" for n in range(6)]  # each photograph once
     assert all(camera.bounds is None for camera in one.cameras)
@@ -113,7 +119,7 @@ def test_merged_looks_from_every_camera_as_its_own_scene_did():
 
 def test_a_limit_is_kept_and_costs_what_is_missed_least():
     parts = submaps()
-    few = merged(parts, most=900)
+    few = merge_submaps(parts, most=900)
     assert len(few.gaussians) <= 900 and few.shell <= 90
     middle = few.cameras[2]
     assert (shown(few.gaussians, middle).alpha > 0.5).mean() > 0.95
@@ -121,7 +127,7 @@ def test_a_limit_is_kept_and_costs_what_is_missed_least():
 
 def test_nothing_cannot_be_merged():
     with pytest.raises(ValueError, match="at least one"):
-        merged([])
+        merge_submaps([])
 
 
 def test_regions_follow_the_resolution():

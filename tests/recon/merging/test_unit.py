@@ -14,7 +14,7 @@ from splatnode.recon.merging.unit import scale_and_up
 from splatnode.recon.result.placement import IDENTITY, Placement
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.up import Up
-from splatnode.recon.result.whole import SceneLink, ScenePlace, Whole, WholeMap, read_whole
+from splatnode.recon.result.whole import JoinedMap, MapSet, SubmapEdge, SubmapEntry, read_map_set
 from tests.support.walk import write_walk
 
 SOURCE = "marker 0 of 100 mm in 3 photographs, known to 1.1 %"
@@ -37,15 +37,15 @@ def metric_walk(out: Path, **of_link: object) -> Path:
     return out
 
 
-def whole_of(folder: Path, links: list[SceneLink]) -> tuple[Whole, WholeMap]:
+def whole_of(folder: Path, links: list[SubmapEdge]) -> tuple[MapSet, JoinedMap]:
     """The scenes in one world, of which `folder` has the first."""
-    places = {each: ScenePlace(each, folder / SCENES[0], "OK", "", True, False, ()) for each in SCENES}
-    one = WholeMap(SCENES[0], dict.fromkeys(SCENES, IDENTITY))
-    return Whole(places, tuple(links), (one,)), one
+    places = {each: SubmapEntry(each, folder / SCENES[0], "OK", "", True, False, ()) for each in SCENES}
+    one = JoinedMap(SCENES[0], dict.fromkeys(SCENES, IDENTITY))
+    return MapSet(places, tuple(links), (one,)), one
 
 
-def link(first: int, second: int, sigma: float, retracted: str | None = None) -> SceneLink:
-    return SceneLink(SCENES[first], SCENES[second], IDENTITY, "chain", retracted, sigma, 100 * sigma)
+def link(first: int, second: int, sigma: float, retracted: str | None = None) -> SubmapEdge:
+    return SubmapEdge(SCENES[first], SCENES[second], IDENTITY, "chain", retracted, sigma, 100 * sigma)
 
 
 def test_a_merged_map_is_known_as_well_as_the_links_know_its_scenes(tmp_path):
@@ -66,7 +66,7 @@ def test_a_merged_map_is_known_as_well_as_the_links_know_its_scenes(tmp_path):
 
 @pytest.mark.parametrize("of_link", [{}, {"sigma_scale": None}, {"sigma_scale": 1e9, "sigma_deg": 1e9}])
 def test_where_links_do_not_tell_how_sure_they_are_there_is_no_interval(tmp_path, of_link):
-    whole = read_whole(metric_walk(tmp_path / "out", **of_link))
+    whole = read_map_set(metric_walk(tmp_path / "out", **of_link))
     scale, up = scale_and_up(whole, whole.maps[0], SCENES[:2])
     assert scale.metric and scale.interval_95 is None
     assert (scale.source or "").endswith("by links, and how well the metres are known there is not told")
@@ -74,21 +74,21 @@ def test_where_links_do_not_tell_how_sure_they_are_there_is_no_interval(tmp_path
 
 
 def test_one_scene_alone_is_as_it_says(tmp_path):
-    whole = read_whole(metric_walk(tmp_path / "out", sigma_scale=0.02, sigma_deg=0.4))
+    whole = read_map_set(metric_walk(tmp_path / "out", sigma_scale=0.02, sigma_deg=0.4))
     low, high = FIRST["scale_interval_95"]
     told = scale_and_up(whole, whole.maps[0], SCENES[:1])
     assert told == (Scale(True, SOURCE, (low, high)), Up((0.0, -1.0, 0.0), 0.3, "gravity of 4 photographs"))
 
 
 def test_a_map_without_metres_gets_none(tmp_path):
-    whole = read_whole(write_walk(tmp_path / "out"))
+    whole = read_map_set(write_walk(tmp_path / "out"))
     assert scale_and_up(whole, whole.maps[0], SCENES[:2]) == (Scale(), None)
 
 
 def test_the_scene_that_is_known_worst_counts_along_the_links_that_count(tmp_path):
     folder = metric_walk(tmp_path / "out")
 
-    def wide(links: list[SceneLink], scenes: tuple[str, ...] = SCENES) -> float | None:
+    def wide(links: list[SubmapEdge], scenes: tuple[str, ...] = SCENES) -> float | None:
         scale, _ = scale_and_up(*whole_of(folder, links), scenes)
         return scale.interval_95 and math.log(scale.interval_95[1])
 
@@ -115,7 +115,7 @@ def test_in_a_chain_the_interval_has_the_true_length_as_often_as_it_says(tmp_pat
 
 
 def test_links_are_read_with_how_sure_they_are(tmp_path):
-    (read,) = read_whole(metric_walk(tmp_path / "out", sigma_scale=0.02, sigma_deg=0.4)).links
+    (read,) = read_map_set(metric_walk(tmp_path / "out", sigma_scale=0.02, sigma_deg=0.4)).links
     assert (read.sigma_scale, read.sigma_deg) == (0.02, 0.4) and isinstance(read.placement, Placement)
-    (old,) = read_whole(metric_walk(tmp_path / "old")).links
+    (old,) = read_map_set(metric_walk(tmp_path / "old")).links
     assert (old.sigma_scale, old.sigma_deg) == (None, None)

@@ -8,13 +8,13 @@ import pytest
 
 from splatnode.command_line import build_parser
 from splatnode.recon.batch.verb import replay_options
-from splatnode.recon.config import Config, overlaid
-from splatnode.recon.metric.arguments import add_poses, metric_changes, trusts_poses
+from splatnode.recon.config import ReconstructionConfig, apply_changes
+from splatnode.recon.metric.arguments import add_poses, collect_metric_changes, trusts_poses
 
 
 def configured(*options: str):
     args = build_parser().parse_args(["replay", "photographs", "--out", "out", *options])
-    return overlaid(Config(), {"metric": metric_changes(args)}).metric
+    return apply_changes(ReconstructionConfig(), {"metric": collect_metric_changes(args)}).metric
 
 
 def test_options_become_the_configuration():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.metric.marker_fit import fitted
+from splatnode.recon.metric.marker_fit import refine_corners
 
 BITS = np.zeros((6, 6), bool)
 BITS[1:5, 1:5] = [[1, 0, 1, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]]  # number 0 of 4X4_50
@@ -43,7 +43,7 @@ def test_the_side_is_right_within_a_third_of_a_percent(side, gamma, blur, ink):
     for seed in range(3):
         picture, true = photograph(side, seed, gamma, blur, ink)
         rough = true + np.random.default_rng(seed).normal(0.0, 0.5, (4, 2))
-        found = fitted(picture, BITS, rough)
+        found = refine_corners(picture, BITS, rough)
         assert found is not None and found.correlation > 0.98
         np.testing.assert_allclose(found.pixels, true, atol=0.3)
         errors.append(around(found.pixels) / around(true) - 1.0)
@@ -53,13 +53,13 @@ def test_the_side_is_right_within_a_third_of_a_percent(side, gamma, blur, ink):
 def test_a_marker_at_the_border_is_not_fitted():
     picture, true = photograph(40.0, 1, 1.0, 0.5, 0.0)
     left = int(true[:, 0].min())
-    assert fitted(np.ascontiguousarray(picture[:, left:]), BITS, true - [left, 0.0]) is None
+    assert refine_corners(np.ascontiguousarray(picture[:, left:]), BITS, true - [left, 0.0]) is None
 
 
 def test_what_is_no_marker_has_little_correlation():
     noise = np.random.default_rng(0).normal(128.0, 40.0, (100, 100)).astype(np.float32)
-    found = fitted(noise, BITS, np.array([[30.0, 30.0], [70.0, 30.0], [70.0, 70.0], [30.0, 70.0]]))
+    found = refine_corners(noise, BITS, np.array([[30.0, 30.0], [70.0, 30.0], [70.0, 70.0], [30.0, 70.0]]))
     assert found is not None and found.correlation < 0.7
     negative, true = photograph(40.0, 1, 1.0, 0.5, 0.0)
-    turned = fitted(255.0 - negative, BITS, true)
+    turned = refine_corners(255.0 - negative, BITS, true)
     assert turned is not None and turned.correlation < 0.7

@@ -13,14 +13,14 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.lenses.undistort import undistorted
-from splatnode.recon.metric.config import Config
-from splatnode.recon.metric.evidence import Evidence, gathered
+from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.recon.metric.config import MetricConfig
+from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.measurement import Measurement
-from splatnode.recon.metric.metres import in_metres
-from splatnode.recon.metric.stereo import by_stereo
-from splatnode.recon.metric.stereo_pairs import Pair, pairs_of, rights_in
-from splatnode.recon.metric.views import View
+from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.stereo import estimate_scale_from_stereo
+from splatnode.recon.metric.stereo_pairs import StereoPair, make_pairs, stream_right_images
+from splatnode.recon.metric.views import MetricView
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from tests.recon.result.test_preview import snapshot as ball_snapshot
@@ -37,8 +37,8 @@ def rights() -> tuple[Frame, ...]:
 
 
 @lru_cache(maxsize=1)
-def pairs() -> tuple[Pair, ...]:
-    return pairs_of(support.photographs(PLACE), rights())
+def pairs() -> tuple[StereoPair, ...]:
+    return make_pairs(support.photographs(PLACE), rights())
 
 
 @lru_cache(maxsize=1)
@@ -70,18 +70,18 @@ def landmarks() -> Landmarks:
     )
 
 
-def known() -> dict[str, View]:
+def known() -> dict[str, MetricView]:
     found = {}
     for index, (T, K) in enumerate(synthetic.scene_cameras(PLACE)):
         smaller = T.copy()
         smaller[:3, 3] /= UNIT
-        found[synthetic.frame_name(index)] = View(smaller, K[0, 0] / PLACE.width, *np.zeros((2, 2)), 0.0)
+        found[synthetic.frame_name(index)] = MetricView(smaller, K[0, 0] / PLACE.width, *np.zeros((2, 2)), 0.0)
     return found
 
 
 @pytest.mark.parametrize("stated", [1.0, 1.02, 1.05, 0.95])
 def test_the_scale_is_what_the_baseline_says_within_half_a_percent(stated):
-    told = by_stereo(known(), landmarks(), pairs(), stated * BASELINE_M, 0.0)
+    told = estimate_scale_from_stereo(known(), landmarks(), pairs(), stated * BASELINE_M, 0.0)
     assert isinstance(told, Measurement) and told.source == "2 stereo pairs with " + told.source.split(" with ")[1]
     assert told.metres_per_unit == pytest.approx(stated * UNIT, rel=0.005)
     assert abs(np.log(told.metres_per_unit / (stated * UNIT))) < 1.96 * told.sigma < 0.02
@@ -94,13 +94,15 @@ def test_how_well_the_scene_is_known_counts_once_whichever_cameras_have_a_partne
     T_beside = one.T_world_camera.copy()
     T_beside[:3, 3] += 1e-3
     beside = replace(one, T_world_camera=T_beside)
-    alone, both = (by_stereo(of_scene, landmarks(), pairs()[:count], BASELINE_M, 0.0) for count in (1, 2))
+    alone, both = (
+        estimate_scale_from_stereo(of_scene, landmarks(), pairs()[:count], BASELINE_M, 0.0) for count in (1, 2)
+    )
     assert isinstance(alone, Measurement) and isinstance(both, Measurement)
     apart = float(np.linalg.norm(one.centre - other.centre))
     least = 0.02 * 2**0.5 / 1.96 / apart
     assert least < alone.sigma < 1.2 * least and both.sigma <= alone.sigma
     crowded = {first: one, "beside": beside, second: other}
-    told = by_stereo(crowded, landmarks(), pairs()[:1], BASELINE_M, 0.0)
+    told = estimate_scale_from_stereo(crowded, landmarks(), pairs()[:1], BASELINE_M, 0.0)
     assert isinstance(told, Measurement) and told.sigma == pytest.approx(alone.sigma, rel=0.1)
 
 
@@ -113,7 +115,7 @@ def snapshot() -> Snapshot:
 
 
 def test_a_scene_gets_metres_from_its_pairs():
-    metric = in_metres(snapshot(), Config(stereo_m=BASELINE_M), Evidence(pairs=pairs()))
+    metric = apply_metric_scale(snapshot(), MetricConfig(stereo_m=BASELINE_M), Evidence(pairs=pairs()))
     assert metric.scale.metric and "2 stereo pairs with 150 mm between the cameras" in (metric.scale.source or "")
 
 
@@ -130,7 +132,7 @@ def test_a_pair_that_the_newest_estimate_has_no_camera_of_does_not_count(kept):
         rotation_bounds=np.zeros(kept),
         centre_bounds=np.zeros(kept),
     )
-    told = by_stereo(known(), fewer, pairs(), BASELINE_M, 0.0)
+    told = estimate_scale_from_stereo(known(), fewer, pairs(), BASELINE_M, 0.0)
     if kept:
         assert isinstance(told, Measurement) and told.source.startswith("1 stereo pairs")
         assert told.metres_per_unit == pytest.approx(UNIT, rel=0.005)
@@ -140,18 +142,20 @@ def test_a_pair_that_the_newest_estimate_has_no_camera_of_does_not_count(kept):
 
 @pytest.mark.parametrize("sigma_m", [0.0003, 100.0])
 def test_a_baseline_that_is_configured_is_as_the_configuration_allows(sigma_m):
-    metric = in_metres(snapshot(), Config(stereo_m=150.0, stereo_sigma_m=sigma_m), Evidence(pairs=pairs()))
+    metric = apply_metric_scale(
+        snapshot(), MetricConfig(stereo_m=150.0, stereo_sigma_m=sigma_m), Evidence(pairs=pairs())
+    )
     assert "150 m between the cameras" in (metric.scale.source or "")
 
 
-def shifted(down: int = 0, across: int = 0, swap: bool = False) -> list[Pair]:
+def shifted(down: int = 0, across: int = 0, swap: bool = False) -> list[StereoPair]:
     found = [replace(each, right=np.roll(each.right, (down, across), (0, 1))) for each in pairs()]
     return [replace(each, left=each.right, right=each.left) for each in found] if swap else found
 
 
 def test_pairs_that_are_not_rectified_give_nothing():
-    def asked(given: list[Pair]) -> str:
-        told = by_stereo(known(), landmarks(), given, BASELINE_M, 0.0)
+    def asked(given: list[StereoPair]) -> str:
+        told = estimate_scale_from_stereo(known(), landmarks(), given, BASELINE_M, 0.0)
         assert isinstance(told, str)
         return told
 
@@ -159,24 +163,24 @@ def test_pairs_that_are_not_rectified_give_nothing():
     assert "the principal points of both must be the same" in asked(shifted(across=-4))
     assert "left and right exchanged" in asked(shifted(swap=True))
     assert "share 0 points" in asked([replace(each, right=np.zeros_like(each.right)) for each in pairs()])
-    assert "no points to compare" in str(by_stereo(known(), None, pairs(), BASELINE_M, 0.0))
+    assert "no points to compare" in str(estimate_scale_from_stereo(known(), None, pairs(), BASELINE_M, 0.0))
 
 
 def test_partners_have_one_name(tmp_path: Path):
     frames = support.photographs(PLACE)
     (tmp_path / "view_001.png").write_bytes(encode_png(rights()[1].image))
     (tmp_path / "other.png").write_bytes(encode_png(rights()[0].image))
-    (found,) = pairs_of(frames, rights_in(tmp_path, frames))
+    (found,) = make_pairs(frames, stream_right_images(tmp_path, frames))
     assert found.photograph == "view_001.png"
     with pytest.raises(ValueError, match=r"no right photograph has the name of a left one, such as view_000"):
-        pairs_of(frames, [replace(rights()[0], name="x.png")])
+        make_pairs(frames, [replace(rights()[0], name="x.png")])
     with pytest.raises(ValueError, match="must have one size"):
-        pairs_of(frames, [replace(rights()[0], image=rights()[0].image[:100])])
+        make_pairs(frames, [replace(rights()[0], image=rights()[0].image[:100])])
 
 
 def test_right_images_that_came_with_the_frames_give_metres_without_a_configuration():
     frames = list(synthetic.stream(msgspec.structs.replace(PLACE, baseline_m=BASELINE_M)))
-    told = in_metres(snapshot(), Config(), gathered(frames, Config())).scale
+    told = apply_metric_scale(snapshot(), MetricConfig(), gather_evidence(frames, MetricConfig())).scale
     assert told.metric and "2 stereo pairs with 150 mm between the cameras" in (told.source or "")
     assert told.interval_95 is not None and 1.0 < told.interval_95[1] < 1.02
 
@@ -185,7 +189,7 @@ def test_a_right_image_is_taken_out_of_the_lens_as_its_left_one_is():
     lens = Intrinsics(320, 240, 300.0, 310.0, 160.0, 120.0, "calibration", (-0.2, 0.05, 0.0, 0.0))
     frame = next(synthetic.stream(msgspec.structs.replace(PLACE, lens=lens, baseline_m=BASELINE_M)))
     assert frame.right is not None
-    straight = undistorted(frame)
-    alone = undistorted(replace(frame, image=np.repeat(frame.right.image[:, :, None], 3, 2), right=None))
+    straight = undistort_frame(frame)
+    alone = undistort_frame(replace(frame, image=np.repeat(frame.right.image[:, :, None], 3, 2), right=None))
     assert straight.right is not None and straight.right.baseline == frame.right.baseline
     assert np.array_equal(straight.right.image, alone.image[:, :, 0])

@@ -25,7 +25,7 @@ from splatnode.recon.networks.dinov2 import Dinov2
 from splatnode.recon.networks.dinov2 import Size as VitSize
 from splatnode.recon.optimize.losses.dino import DinoFeatures, load_dino
 from splatnode.recon.optimize.losses.dino import load_network as load_dinov2
-from splatnode.recon.priors.monocular import with_monocular
+from splatnode.recon.priors.monocular import fit_monocular_depth
 from splatnode.recon.priors.pointmap import Pointmap
 from tests.support.generated import generated_images, generated_weights, shapes_of
 
@@ -116,20 +116,20 @@ def test_monocular_depth_takes_its_scale_from_several_views():
     def network(photograph: np.ndarray):
         to = crop(120, 90, 60, 14)
         columns, rows = np.meshgrid(np.arange(to.width) + 0.5, np.arange(to.height) + 0.5)
-        there = to.to_photograph(np.stack([columns, rows], -1))
+        there = to.map_to_image(np.stack([columns, rows], -1))
         inverse = (1.0 + 0.3 * (there[..., 0] - 60) / 100 + 0.2 * (there[..., 1] - 45) / 100) / 3.0
         return (50.0 * inverse - 7.0).astype(np.float32), to
 
-    full = with_monocular(pointmap, image, network)
+    full = fit_monocular_depth(pointmap, image, network)
     inside = full.depth > 0
     assert inside.mean() > 0.8 and (full.confidence[inside] == 1).all()
     np.testing.assert_allclose(full.depth[inside], truth[inside], rtol=0.01)
     middle = inside & (np.abs(u - 60) < 50) & (np.abs(v - 45) < 35)
     facing = np.array([-0.3, -0.2, -1.0]) / np.linalg.norm([0.3, 0.2, 1.0])
     assert np.median(full.normal[middle] @ facing) > 0.99
-    contradicted = with_monocular(
+    contradicted = fit_monocular_depth(
         pointmap, image, lambda photograph: (2.0 - network(photograph)[0] / 50, crop(120, 90, 60, 14))
     )
     assert contradicted is pointmap
     nothing = Pointmap("a", 0, 0 * depth, 0 * depth, pointmap.normal, np.eye(4), K)
-    assert with_monocular(nothing, image, network) is nothing
+    assert fit_monocular_depth(nothing, image, network) is nothing

@@ -15,7 +15,7 @@ import pytest
 
 from splatnode.recon.networks import weight_folder
 from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
-from splatnode.recon.networks.weight_download import complaint, fetch
+from splatnode.recon.networks.weight_download import fetch, find_mismatch
 from splatnode.recon.networks.weight_folder import WeightsError, find, folder
 
 CONTENT = bytes(range(256)) * 4000
@@ -137,14 +137,14 @@ def test_a_checkout_beside_a_folder_that_others_can_change_does_not_look_there(t
     monkeypatch.setattr(weight_folder, "__file__", str(module))
     monkeypatch.delenv("SPLATNODE_WEIGHTS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    assert weight_folder.located("net/tiny.pth") == file
+    assert weight_folder.locate_weights("net/tiny.pth") == file
     try:
         change(tmp_path / "shared" / what)
     except PermissionError:
         pytest.skip("needs root, which can be two users")
-    assert weight_folder.located("net/tiny.pth") is None
+    assert weight_folder.locate_weights("net/tiny.pth") is None
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path / "shared" / "weights"))
-    assert weight_folder.located("net/tiny.pth") == file  # whoever names it means it
+    assert weight_folder.locate_weights("net/tiny.pth") == file  # whoever names it means it
 
 
 def test_a_file_with_another_digest_is_not_kept(server, tmp_path):
@@ -171,11 +171,11 @@ def test_a_folder_serves_offline(tmp_path):
 def test_the_complaint_names_the_difference(tmp_path):
     file = tmp_path / "tiny.pth"
     file.write_bytes(CONTENT[:-1])
-    assert complaint(GOOD, file) == f"it has {len(CONTENT) - 1} bytes instead of {len(CONTENT)}"
+    assert find_mismatch(GOOD, file) == f"it has {len(CONTENT) - 1} bytes instead of {len(CONTENT)}"
     file.write_bytes(CONTENT[::-1])
-    assert "sha256" in complaint(GOOD, file)
+    assert "sha256" in find_mismatch(GOOD, file)
     file.write_bytes(CONTENT)
-    assert complaint(GOOD, file) == ""
+    assert find_mismatch(GOOD, file) == ""
 
 
 def test_missing_weights_name_the_remedy(tmp_path, monkeypatch):
@@ -188,7 +188,7 @@ def test_the_catalogue_describes_the_files_that_are_here(shared):
     for entry in CATALOGUE:
         file = Path(shared / "weights" / entry.path)
         if file.is_file():
-            assert complaint(entry, file) == "", entry.name
+            assert find_mismatch(entry, file) == "", entry.name
     assert len({entry.name for entry in CATALOGUE}) == len(CATALOGUE)
     assert all(entry.licence and entry.what and (entry.url or entry.sha256) for entry in CATALOGUE)
 

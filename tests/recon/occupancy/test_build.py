@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.occupancy.build import NoMap, occupancy_map
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code
@@ -26,7 +26,7 @@ def made(room) -> OccupancyMap:
     return occupancy_map(room)
 
 
-def corners(made: OccupancyMap, state: State) -> np.ndarray:
+def corners(made: OccupancyMap, state: VoxelState) -> np.ndarray:
     """(M, 8, 3) the corners of the voxels in a state, in the world."""
     index = np.argwhere(made.states == state)
     steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
@@ -35,13 +35,13 @@ def corners(made: OccupancyMap, state: State) -> np.ndarray:
 
 
 def test_what_is_free_lies_before_wall_and_above_floor_whole(made):
-    free = corners(made, State.FREE)
+    free = corners(made, VoxelState.FREE)
     assert len(free) > 1000
     assert free[..., 0].max() < WALL and free[..., 2].min() > 0
 
 
 def test_what_is_occupied_is_at_a_surface(made):
-    occupied = corners(made, State.OCCUPIED)
+    occupied = corners(made, VoxelState.OCCUPIED)
     off = np.minimum(np.abs(occupied[..., 0] - WALL).min(1), np.abs(occupied[..., 2]).min(1))
     assert len(occupied) > 300 and off.max() < 0.05
 
@@ -50,11 +50,11 @@ def test_surfaces_that_are_seen_are_found(made, room):
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(0.9, 1.9, 200), rng.uniform(-0.3, 0.3, 200), np.zeros(200)])
     wall = np.column_stack([np.full(200, WALL), rng.uniform(-0.3, 0.3, 200), rng.uniform(0.1, 0.6, 200)])
-    assert (made.at(np.concatenate([floor, wall])) == State.OCCUPIED).mean() > 0.98
+    assert (made.at(np.concatenate([floor, wall])) == VoxelState.OCCUPIED).mean() > 0.98
 
 
 def test_behind_the_wall_and_outside_the_map_nothing_is_known(made):
-    assert (made.at([[WALL + 0.2, 0, 0.5], [50.0, 0, 0], [np.nan, 0, 0]]) == State.NOT_SEEN).all()
+    assert (made.at([[WALL + 0.2, 0, 0.5], [50.0, 0, 0], [np.nan, 0, 0]]) == VoxelState.NOT_SEEN).all()
     with pytest.raises(ValueError, match=r"points must be \(M, 3\)"):
         made.at([0.0, 0, 0])
 
@@ -71,19 +71,19 @@ def test_what_is_filled_in_frees_nothing(room, made):
     for depth in holes.values():
         depth[:, :64] = 0
     fewer = occupancy_map(replace(room, depths=holes))
-    assert (fewer.states == State.FREE).sum() < 0.75 * (made.states == State.FREE).sum()
+    assert (fewer.states == VoxelState.FREE).sum() < 0.75 * (made.states == VoxelState.FREE).sum()
     points = np.random.default_rng(1).uniform((0, -1, 0), (WALL, 1, 1), (20000, 3))
     for camera in room.cameras:
         x, _, z = ((points - camera.T_world_camera[:3, 3]) @ camera.T_world_camera[:3, :3]).T
         points = points[(z < 0) | (x * camera.K[0, 0] / z < 0)]  # in the left half of its picture, or not in it
     assert len(points) > 1000
-    assert (made.at(points) == State.FREE).sum() > 500 and not (fewer.at(points) == State.FREE).any()
+    assert (made.at(points) == VoxelState.FREE).sum() > 500 and not (fewer.at(points) == VoxelState.FREE).any()
 
 
 def test_a_wider_claim_frees_less(room, made):
     bounds = make_snapshot().cameras[0].bounds
     wide = replace(room, cameras=tuple(replace(camera, bounds=bounds) for camera in room.cameras))
-    assert (occupancy_map(wide).states == State.FREE).sum() < (made.states == State.FREE).sum()
+    assert (occupancy_map(wide).states == VoxelState.FREE).sum() < (made.states == VoxelState.FREE).sum()
 
 
 def test_voxels_of_a_metric_scene_are_round(room):

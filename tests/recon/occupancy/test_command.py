@@ -10,7 +10,7 @@ import pytest
 from splatnode import command_line
 from splatnode.recon.occupancy.build import occupancy_map
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.write import write_result_folder
 from tests.support.exported import make_snapshot
 from tests.support.occupied import room_snapshot
 
@@ -20,7 +20,7 @@ ALWAYS = {"occupancy.npz", "occupancy.bt", "collision.ply", "collision.glb", "ma
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("result")
-    finish(room_snapshot(), folder, seed=0, preset_name="fast")
+    write_result_folder(room_snapshot(), folder, seed=0, preset_name="fast")
     return folder
 
 
@@ -37,7 +37,7 @@ def test_a_map_is_written_beside_the_scene(result, capsys):
 
 def test_a_map_goes_through_no_link_of_whoever_made_the_result(tmp_path, capsys):
     result, mine, elsewhere = tmp_path / "result", tmp_path / "mine", tmp_path / "elsewhere"
-    finish(room_snapshot(), result, seed=0, preset_name="fast")
+    write_result_folder(room_snapshot(), result, seed=0, preset_name="fast")
     mine.write_text("mine")
     elsewhere.mkdir()
     (result / "occupancy").symlink_to(elsewhere)
@@ -67,20 +67,20 @@ def test_without_a_band_there_is_nothing_for_nav2(result, tmp_path, capsys):
     ],
 )
 def test_of_a_result_that_is_not_sure_there_is_none(tmp_path, capsys, snapshot, code, said):
-    finish(snapshot, tmp_path, seed=0, preset_name="fast")
+    write_result_folder(snapshot, tmp_path, seed=0, preset_name="fast")
     assert command_line.main(["map", str(tmp_path)]) == code
     assert said in capsys.readouterr().err and not (tmp_path / "occupancy").exists()
 
 
 def test_a_map_of_an_earlier_band_or_result_does_not_stay(tmp_path, capsys):
-    finish(room_snapshot(), tmp_path, seed=0, preset_name="fast")
+    write_result_folder(room_snapshot(), tmp_path, seed=0, preset_name="fast")
     folder = tmp_path / "occupancy"
     assert command_line.main(["map", str(tmp_path), "--band", "0.1", "0.5"]) == 0
     assert command_line.main(["map", str(tmp_path), "--voxel", "0.1"]) == 0
     assert {path.name for path in folder.iterdir()} == ALWAYS
     (folder / "mine.txt").write_text("somebody else's")
     (folder / "collision.ply").write_text("changed by hand")
-    finish(make_snapshot(Code.NO_OVERLAP, False), tmp_path, seed=0, preset_name="fast")
+    write_result_folder(make_snapshot(Code.NO_OVERLAP, False), tmp_path, seed=0, preset_name="fast")
     assert {path.name for path in folder.iterdir()} == {"mine.txt", "collision.ply"}
 
 

@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from msgspec.structs import replace as with_fields
 
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
-from splatnode.recon.occupancy.message import MapHeader, from_message, no_map, to_message
+from splatnode.recon.occupancy.message import MapHeader, decode_map, encode_map, no_map
 from splatnode.recon.result.scale import Scale
 from tests.support.occupied import small_map
 
@@ -19,13 +19,13 @@ STATES = np.arange(24).reshape(2, 3, 4) % 3
 
 def sent(states=STATES):
     metric = Scale(True, "a marker", (0.98, 1.02))
-    header, arrays = to_message(replace(small_map(states), scale=metric), "scene-0001", 7, Numbering().next())
+    header, arrays = encode_map(replace(small_map(states), scale=metric), "scene-0001", 7, Numbering().next())
     return decode(encode(header, arrays), MapHeader)
 
 
 def test_a_map_comes_as_it_was_sent():
     message = sent()
-    made, was = from_message(message), small_map(STATES)
+    made, was = decode_map(message), small_map(STATES)
     assert made is not None and np.array_equal(made.states, was.states) and made.states.dtype == np.uint8
     assert made.voxel == was.voxel and np.array_equal(made.origin, was.origin)
     assert np.array_equal(made.T_world_map, was.T_world_map) and made.upright.source == "the floor"
@@ -35,9 +35,9 @@ def test_a_map_comes_as_it_was_sent():
 
 def test_that_there_is_none_comes_with_the_reason():
     message = decode(encode(no_map("none", "the camera is lost", Numbering().next())), MapHeader)
-    assert from_message(message) is None and message.header.why == "the camera is lost"
+    assert decode_map(message) is None and message.header.why == "the camera is lost"
     with pytest.raises(WireError, match="without a map has no array"):
-        from_message(Message(message.header, (np.zeros((1, 1, 1), np.uint8),)))
+        decode_map(Message(message.header, (np.zeros((1, 1, 1), np.uint8),)))
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_that_there_is_none_comes_with_the_reason():
 )
 def test_what_is_no_map_is_refused(arrays, said):
     with pytest.raises(WireError, match=said):
-        from_message(Message(sent().header, arrays))
+        decode_map(Message(sent().header, arrays))
 
 
 def test_a_frame_that_is_bent_is_refused():

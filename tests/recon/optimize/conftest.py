@@ -11,5 +11,5 @@ from splatnode.recon.rasterize import dispatch
 def computed_by(request, monkeypatch) -> str:
     """Runs a test twice: with what serves on the processor, and with what serves elsewhere."""
     if request.param == "torch":
-        monkeypatch.setattr(dispatch, "by_core", lambda tensor: False)
+        monkeypatch.setattr(dispatch, "is_on_cpu", lambda tensor: False)
     return request.param

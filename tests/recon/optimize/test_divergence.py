@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.optimize.divergence import misfit, refusal
+from splatnode.recon.optimize.divergence import check_divergence, misfit
 from splatnode.recon.optimize.refinement import refine
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene.scene import Scene
@@ -37,11 +37,11 @@ def test_the_true_scene_misses_nothing_and_others_more(truth):
 def test_a_refinement_that_works_is_let_through(truth):
     begun = disturbed(truth)
     *_, refined = refine(begun, QUICK, seed=0)
-    assert refusal(misfit(begun), refined) is None and refusal(misfit(begun), begun) is None
+    assert check_divergence(misfit(begun), refined) is None and check_divergence(misfit(begun), begun) is None
 
 
 def test_a_ruined_scene_is_refused_with_both_figures(truth):
-    refused = refusal(misfit(truth), scattered(truth))
+    refused = check_divergence(misfit(truth), scattered(truth))
     assert refused is not None and refused.code is Code.DIVERGED and not refused.publishable
     assert refused.frames == tuple(view.name for view in truth.views)
     assert f"{misfit(scattered(truth)):.2g}" in refused.message and "optimize.rates" in refused.advice
@@ -50,7 +50,7 @@ def test_a_ruined_scene_is_refused_with_both_figures(truth):
 def test_numbers_that_nothing_can_show_are_refused(truth):
     broken = scattered(truth, lost=math.nan)
     assert misfit(broken) == math.inf
-    refused = refusal(misfit(truth), broken)
+    refused = check_divergence(misfit(truth), broken)
     assert refused is not None and refused.code is Code.DIVERGED
 
 
@@ -60,7 +60,7 @@ def test_of_many_photographs_some_are_looked_at(truth, monkeypatch):
         "splatnode.recon.optimize.divergence._misfit", lambda scene, view, valid: looked_at.append(view.name) or 1.0
     )
     views = tuple(replace(truth.views[0], name=f"{index}.png") for index in range(30))
-    assert refusal(1.0, replace(scattered(truth), views=views)) is None
+    assert check_divergence(1.0, replace(scattered(truth), views=views)) is None
     assert looked_at == ["0.png", "8.png", "16.png", "24.png"]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.optimize.dropout import Config, Dropout, uncertainty
+from splatnode.recon.optimize.dropout import Dropout, DropoutConfig, uncertainty
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import TrainingView
@@ -34,7 +34,7 @@ def gaussians(count: int, source_frame: int = SHELL) -> Gaussians:
 
 def test_a_share_of_the_unknown_is_left_out_and_the_others_make_up_for_it():
     opacities = torch.full((20000,), 0.4, requires_grad=True)
-    rendered = Dropout(Config(share=0.2), gaussians(20000), [view()], seed=0)(opacities, progress=0.0)
+    rendered = Dropout(DropoutConfig(share=0.2), gaussians(20000), [view()], seed=0)(opacities, progress=0.0)
     there = rendered > 0
     assert float(there.float().mean()) == pytest.approx(0.8, abs=0.01)
     torch.testing.assert_close(rendered[there], torch.full((int(there.sum()),), 0.5))
@@ -61,30 +61,32 @@ def test_a_gaussian_is_looked_up_at_its_pixel():
 
 def test_what_stereo_is_sure_of_is_never_left_out():
     opacities = torch.full((1000,), 0.4)
-    drawn = Dropout(Config(share=0.5, sure=0.3), gaussians(1000, 4), [view()], seed=0)(opacities, progress=0.0)
+    drawn = Dropout(DropoutConfig(share=0.5, sure=0.3), gaussians(1000, 4), [view()], seed=0)(opacities, progress=0.0)
     torch.testing.assert_close(drawn, opacities)
 
 
 def test_each_render_leaves_out_others_and_a_seed_says_which():
     opacities = torch.full((100,), 0.5)
-    first, again = (Dropout(Config(share=0.1), gaussians(100), [view()], seed=3) for _ in range(2))
+    first, again = (Dropout(DropoutConfig(share=0.1), gaussians(100), [view()], seed=3) for _ in range(2))
     drawn = [first(opacities, 0.0) for _ in range(2)]
     assert not torch.equal(*drawn)
     assert all(torch.equal(again(opacities, 0.0), each) for each in drawn)
 
 
 def test_it_follows_the_gaussians():
-    dropout = Dropout(Config(share=0.5), gaussians(10), [view()], seed=0)
+    dropout = Dropout(DropoutConfig(share=0.5), gaussians(10), [view()], seed=0)
     dropout.follow(gaussians(300))
     assert len(dropout(torch.full((300,), 0.5), 0.0)) == 300
 
 
 def test_opacities_stay_below_one():
-    dropout = Dropout(Config(share=0.5), gaussians(100), [view()], seed=0)
+    dropout = Dropout(DropoutConfig(share=0.5), gaussians(100), [view()], seed=0)
     assert float(dropout(torch.full((100,), 0.9), 0.0).max()) < 1
 
 
-@pytest.mark.parametrize(("config", "progress"), [(Config(share=0.1, until=0.7), 0.7), (Config(share=0.0), 0.0)])
+@pytest.mark.parametrize(
+    ("config", "progress"), [(DropoutConfig(share=0.1, until=0.7), 0.7), (DropoutConfig(share=0.0), 0.0)]
+)
 def test_in_the_end_and_without_a_share_all_are_there(config, progress):
     opacities = torch.rand(100)
     assert Dropout(config, gaussians(100), [view()], seed=0)(opacities, progress) is opacities
@@ -92,4 +94,4 @@ def test_in_the_end_and_without_a_share_all_are_there(config, progress):
 
 def test_all_cannot_be_left_out():
     with pytest.raises(ValueError, match="share must be from 0 to below 1, got 1"):
-        Dropout(Config(share=1.0), gaussians(1), [], seed=0)
+        Dropout(DropoutConfig(share=1.0), gaussians(1), [], seed=0)

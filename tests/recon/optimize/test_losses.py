@@ -79,9 +79,9 @@ def test_multi_scale_gradient_by_hand():
     truth[:, 2:], half[:, 2:] = 2.0, 1.0
     strength = 2 * 4 / 12  # of the 4 x 3 horizontal differences 4 are 2; the vertical ones are 0
     expected = (1 * 4 / 12) / (strength + 1e-3)
-    assert MultiScaleGradient(scales=1).prepared(truth)(half).item() == pytest.approx(expected)
-    assert MultiScaleGradient().prepared(truth)(truth).item() == 0.0
-    assert MultiScaleGradient().prepared(truth)(truth + 0.1).item() == pytest.approx(0.0, abs=1e-6)
+    assert MultiScaleGradient(scales=1).prepare_distance(truth)(half).item() == pytest.approx(expected)
+    assert MultiScaleGradient().prepare_distance(truth)(truth).item() == 0.0
+    assert MultiScaleGradient().prepare_distance(truth)(truth + 0.1).item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_gradients_are_exact():
@@ -97,7 +97,7 @@ def test_gradients_are_exact():
         (lambda x: local_depth_loss(x, truth, weights, patch=4, share=1.0, generator=generator()), depth),
         (lambda x: normal_loss(x, known, weights[:4, :4]), normal),
         (lambda x: semantic_loss(x, other), embedding),
-        (MultiScaleGradient().prepared(target), picture),
+        (MultiScaleGradient().prepare_distance(target), picture),
     )
     for loss, at in losses:
         assert torch.autograd.gradcheck(loss, (at.requires_grad_(True),))
@@ -120,7 +120,7 @@ def test_lpips_as_a_loss(shared):
     if network is None:
         pytest.skip("needs LPIPS's weights, which the shared test data has not")
     truth, other = image(0), image(1).requires_grad_(True)
-    distance = LpipsDistance(network, "LPIPS AlexNet").prepared(truth)
+    distance = LpipsDistance(network, "LPIPS AlexNet").prepare_distance(truth)
     assert distance(truth).item() == 0.0
     value = distance(other)
     assert value.item() == pytest.approx(network(other, truth), abs=1e-6)
@@ -135,4 +135,4 @@ def test_lpips_as_a_loss(shared):
 
 def test_without_weights_structure_serves(tmp_path):
     assert load_perceptual(tmp_path).name == "multi-scale gradient"
-    assert math.isfinite(load_perceptual(tmp_path).prepared(image(0))(image(1)).item())
+    assert math.isfinite(load_perceptual(tmp_path).prepare_distance(image(0))(image(1)).item())

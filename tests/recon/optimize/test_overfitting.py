@@ -10,10 +10,10 @@ import torch
 from msgspec.structs import replace as replace_fields
 
 from splatnode.recon import modelling
-from splatnode.recon.config import Config
-from splatnode.recon.modelling import refined
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.modelling import refine_scene
 from splatnode.recon.optimize import overfitting, refinement
-from splatnode.recon.optimize.watch import SHORT, Watch, examine, watch
+from splatnode.recon.optimize.watch import SHORT, RefinementWatch, examine, start_watch
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
@@ -70,7 +70,7 @@ def faded(scene: Scene, iterations: int) -> Scene:
 
 
 def test_the_true_scene_meets_what_is_expected_between_its_photographs(truth):
-    expected = overfitting.expected(truth)
+    expected = overfitting.make_expectations(truth)
     assert len(expected) == 2
     right = overfitting.misfit(expected, truth.gaussians)
     wrong = overfitting.misfit(expected, faded(truth, 0).gaussians)
@@ -79,12 +79,12 @@ def test_the_true_scene_meets_what_is_expected_between_its_photographs(truth):
 
 def test_without_point_maps_nothing_is_expected():
     scene = photographed()
-    assert overfitting.expected(scene) == () and overfitting.misfit((), scene.gaussians) == 0.0
+    assert overfitting.make_expectations(scene) == () and overfitting.misfit((), scene.gaussians) == 0.0
 
 
 def test_an_overfitted_scene_gives_way_to_the_best_before_it(truth, monkeypatch):
     monkeypatch.setattr("splatnode.recon.optimize.divergence.misfit", lambda scene: 0.1)  # the photographs fit
-    watching = watch(truth, SHORT + 1)
+    watching = start_watch(truth, SHORT + 1)
     better = replace(truth, iterations=150)
     watching, verdict = examine(replace(watching, best_misfit=2 * watching.best_misfit), better)
     assert verdict is None and watching.best is better
@@ -94,7 +94,7 @@ def test_an_overfitted_scene_gives_way_to_the_best_before_it(truth, monkeypatch)
 
 
 def test_a_scene_that_diverged_is_not_published_and_a_short_refinement_is_not_tested(truth):
-    watching = watch(truth, SHORT)
+    watching = start_watch(truth, SHORT)
     assert watching.expectations == ()
     _, verdict = examine(watching, faded(truth, 100))
     assert verdict is not None and verdict.code is Code.DIVERGED and not verdict.publishable
@@ -105,14 +105,14 @@ def test_a_scene_that_diverged_is_not_published_and_a_short_refinement_is_not_te
 def test_the_refinement_ends_with_the_best_scene_and_the_verdict(truth, monkeypatch):
     monkeypatch.setattr(overfitting, "OVERFITTED", 0.0)  # whatever comes is too much
     steps = plain(iterations=SHORT + 1, checkpoints=(refinement.MIN_SOFT,), first_opacity=None)
-    (only,) = refined(truth, replace_fields(Config(), optimize=steps), steps)
+    (only,) = refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps)
     assert only.verdict is not None and only.verdict.code is Code.OVERFIT
     assert only.scene is not None and torch.equal(only.scene.gaussians.means, truth.gaussians.means)
 
 
 def test_a_scene_that_started_soft_is_not_judged_before_it_shows_its_photographs(truth):
     steps = plain(iterations=refinement.MIN_SOFT, checkpoints=(2,))
-    first, *_ = refined(truth, replace_fields(Config(), optimize=steps), steps)
+    first, *_ = refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps)
     assert first.verdict is None and first.scene is not None and first.scene.iterations == 2
     assert first.scene.gaussians.opacities.max() < 0.15  # it is soft
 
@@ -121,13 +121,13 @@ def test_who_watches_changes_no_verdict(truth, monkeypatch):
     """A scene is judged after the same iterations, however often it is looked at."""
     judged: list[int] = []
 
-    def noting(watching: Watch, later: Scene) -> tuple[Watch, None]:
+    def noting(watching: RefinementWatch, later: Scene) -> tuple[RefinementWatch, None]:
         judged.append(later.iterations)
         return watching, None
 
     monkeypatch.setattr(modelling, "examine", noting)
     first = refinement.MIN_SOFT
     steps = plain(iterations=first + 20, checkpoints=(first,), looks=(first + 5, first + 10), first_opacity=None)
-    shown = list(refined(truth, replace_fields(Config(), optimize=steps), steps))
+    shown = list(refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps))
     assert [show.scene.iterations for show in shown if show.scene] == [first, first + 5, first + 10, first + 20]
     assert judged == [first, first + 20]

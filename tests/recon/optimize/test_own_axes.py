@@ -6,10 +6,10 @@ from splatnode.recon.optimize import own_axes
 from splatnode.recon.optimize.own_axes import (
     LARGEST_EXTENT,
     Shifts,
-    along_axes,
     axes_by_torch,
-    in_world,
-    turned_by_torch,
+    rotate_by_torch,
+    rotate_to_axes,
+    rotate_to_world,
 )
 from splatnode.recon.scene.gaussians import Gaussians
 
@@ -36,10 +36,10 @@ def gaussians(quats: list, scales: list) -> Gaussians:
 
 def test_an_offset_goes_along_the_gaussian_s_own_axis_by_its_standard_deviations():
     one = gaussians([QUARTER_TURN], [[0.1, 0.02, 0.03]])
-    assert in_world(torch.tensor([[2.0, 0.0, 0.0]]), one).numpy() == pytest.approx(
+    assert rotate_to_world(torch.tensor([[2.0, 0.0, 0.0]]), one).numpy() == pytest.approx(
         np.array([[0.0, 0.2, 0.0]]), abs=1e-6
     )
-    assert in_world(torch.tensor([[0.0, 1.0, 0.0]]), one).numpy() == pytest.approx(
+    assert rotate_to_world(torch.tensor([[0.0, 1.0, 0.0]]), one).numpy() == pytest.approx(
         np.array([[-0.02, 0.0, 0.0]]), abs=1e-6
     )
 
@@ -48,22 +48,22 @@ def test_derivatives_by_offsets_are_those_by_the_chain_rule():
     some = random_gaussians()
     offsets = torch.zeros(len(some), 3, requires_grad=True)
     weights = torch.rand(len(some), 3, generator=torch.Generator().manual_seed(1))
-    (turned_by_torch(axes_by_torch(some.quats, some.log_scales), offsets, to_world=True) * weights).sum().backward()
-    assert along_axes(weights, some).numpy() == pytest.approx(offsets.grad.numpy(), abs=1e-6)
+    (rotate_by_torch(axes_by_torch(some.quats, some.log_scales), offsets, to_world=True) * weights).sum().backward()
+    assert rotate_to_axes(weights, some).numpy() == pytest.approx(offsets.grad.numpy(), abs=1e-6)
 
 
 @pytest.mark.parametrize("to_world", [False, True])
 def test_the_core_computes_what_torch_computes(to_world: bool):
     some = random_gaussians()
     vectors = torch.randn(len(some), 3, generator=torch.Generator().manual_seed(2))
-    function = in_world if to_world else along_axes
-    expected = turned_by_torch(axes_by_torch(some.quats, some.log_scales), vectors, to_world)
+    function = rotate_to_world if to_world else rotate_to_axes
+    expected = rotate_by_torch(axes_by_torch(some.quats, some.log_scales), vectors, to_world)
     assert function(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-5)
 
 
 def test_what_is_far_larger_than_the_scene_moves_as_if_it_were_not():
     one = gaussians([[1.0, 0.0, 0.0, 0.0]], [[50.0, 0.01, 0.01]])
-    assert float(in_world(torch.tensor([[1.0, 0.0, 0.0]]), one)[0, 0]) == pytest.approx(LARGEST_EXTENT)
+    assert float(rotate_to_world(torch.tensor([[1.0, 0.0, 0.0]]), one)[0, 0]) == pytest.approx(LARGEST_EXTENT)
 
 
 def test_the_first_step_moves_each_axis_by_the_rate_whatever_the_gradient_s_size():
@@ -92,6 +92,6 @@ def random_gaussians(count: int = 5000) -> Gaussians:
 
 def test_gaussians_on_another_device_are_turned_by_torch(monkeypatch: pytest.MonkeyPatch):
     some, vectors = random_gaussians(20), torch.ones(20, 3)
-    expected = in_world(vectors, some)
+    expected = rotate_to_world(vectors, some)
     monkeypatch.setattr(own_axes.dispatch, "by_core", lambda _: False)
-    assert in_world(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-6)
+    assert rotate_to_world(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-6)

@@ -10,10 +10,10 @@ from msgspec import structs
 from splatnode.recon.networks.lpips import Layer, Lpips
 from splatnode.recon.optimize import perceptual_loss
 from splatnode.recon.optimize.losses.perceptual import LpipsDistance
-from splatnode.recon.optimize.perceptual_loss import Config
-from splatnode.recon.optimize.refinement import Config as Refinement
+from splatnode.recon.optimize.perceptual_loss import PerceptualLossConfig
+from splatnode.recon.optimize.refinement import RefinementConfig as Refinement
 from splatnode.recon.optimize.refinement import refine
-from splatnode.recon.optimize.training_image import training_image
+from splatnode.recon.optimize.training_image import make_training_image
 from splatnode.recon.scene.scene import Exposure, TrainingView
 from tests.support.known_scene import disturbed, photographed
 
@@ -38,17 +38,17 @@ def view_of(photograph: np.ndarray, exposure: Exposure | None = None) -> Trainin
 
 
 def test_it_counts_in_every_few_steps_as_much_as_in_all():
-    config = Config(weight=0.5, start=0.5, every=3)
-    assert [config.in_step(step, 0.6) for step in range(5)] == [1.5, 0.0, 0.0, 1.5, 0.0]
-    assert config.in_step(0, 0.4) == 0.0
-    assert not any(Config().in_step(step, 0.9) for step in range(10))
+    config = PerceptualLossConfig(weight=0.5, start=0.5, every=3)
+    assert [config.weight_in_step(step, 0.6) for step in range(5)] == [1.5, 0.0, 0.0, 1.5, 0.0]
+    assert config.weight_in_step(0, 0.4) == 0.0
+    assert not any(PerceptualLossConfig().weight_in_step(step, 0.9) for step in range(10))
 
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_only_what_shows_the_scene_is_compared(measure, photograph, keep):
     shown = np.ones((HEIGHT, WIDTH), bool)
     shown[:9] = False
-    compared = training_image(view_of(photograph), shown, 1.0, 0.2, keep=keep, measure=measure)
+    compared = make_training_image(view_of(photograph), shown, 1.0, 0.2, keep=keep, measure=measure)
     assert compared.perceptual is not None
     same = torch.from_numpy(photograph).float() / 255
     hidden = same.clone()
@@ -63,20 +63,20 @@ def test_what_is_left_of_the_exposure_costs_nothing(measure, photograph):
     exposed = view_of(photograph, Exposure((2.0, 2.0, 2.0), 0.0, None))
     shown = np.ones((HEIGHT, WIDTH), bool)
     render = 0.8 * torch.from_numpy(photograph).float() / 255
-    found = [training_image(view, shown, 1.0, 0.2, measure=measure) for view in (exposed, view_of(photograph))]
+    found = [make_training_image(view, shown, 1.0, 0.2, measure=measure) for view in (exposed, view_of(photograph))]
     with_gain, without = (float(each.perceptual(render)) for each in found if each.perceptual)
     assert with_gain < 0.1 * without
 
 
 def test_a_photograph_that_the_network_would_pool_away_has_none(measure):
     thin = np.zeros((31, 90, 3), np.uint8)
-    assert training_image(view_of(thin), np.ones((31, 90), bool), 1.0, 0.2, measure=measure).perceptual is None
+    assert make_training_image(view_of(thin), np.ones((31, 90), bool), 1.0, 0.2, measure=measure).perceptual is None
 
 
 def test_it_changes_a_scene_where_there_is_a_network_and_nothing_where_there_is_none(measure, monkeypatch):
     start = disturbed(photographed())
     refined = Refinement(iterations=6, checkpoints=(), control=None)
-    configured = structs.replace(refined, perceptual=Config(weight=0.2, start=0.0, every=2))
+    configured = structs.replace(refined, perceptual=PerceptualLossConfig(weight=0.2, start=0.0, every=2))
 
     def end(config, found):
         monkeypatch.setattr(perceptual_loss, "load_alex", lambda: found)

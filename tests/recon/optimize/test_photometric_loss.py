@@ -56,15 +56,15 @@ def test_the_closed_form_is_the_references(height, width, weighted):
     expected_rgb = rgb.clone().requires_grad_()
     expected = photometric_reference.photometric_loss(expected_rgb, target, 0.4, weights)
     expected.backward()
-    weighing = photometric_by_torch.weights_of(target, 0.4, weights)
-    value, gradient = photometric_by_torch.evaluated(rgb.permute(2, 0, 1), target, weighing)
+    weighing = photometric_by_torch.make_weights(target, 0.4, weights)
+    value, gradient = photometric_by_torch.evaluate_loss(rgb.permute(2, 0, 1), target, weighing)
     assert value.item() == pytest.approx(expected.item(), rel=1e-10)
     torch.testing.assert_close(gradient.permute(1, 2, 0), expected_rgb.grad, rtol=1e-8, atol=1e-12)
     assert gradient.permute(1, 2, 0).is_contiguous()  # as the rasteriser wants it
 
 
 def test_where_torch_computes_single_precision_suffices(monkeypatch):
-    monkeypatch.setattr(dispatch, "by_core", lambda tensor: False)
+    monkeypatch.setattr(dispatch, "is_on_cpu", lambda tensor: False)
     rgb, target = textured(60, 80, 5)
     rgb, target = 0.02 * rgb + 0.9, 0.02 * target + 0.9  # bright and almost plain: where variances lose most digits
     expected_rgb, actual_rgb = rgb.clone().requires_grad_(), rgb.float().requires_grad_()

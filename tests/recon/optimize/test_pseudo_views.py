@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.optimize.pseudo_views import interpolate, path, pseudo_views
+from splatnode.recon.optimize.pseudo_views import interpolate, order_cameras, pseudo_views
 
 
 def camera(x: float, yaw_deg: float = 0.0) -> np.ndarray:
@@ -25,7 +25,7 @@ def test_half_way_of_a_turn_on_a_circle_is_on_the_circle():
 
 
 def test_the_path_visits_cameras_in_the_order_of_their_places():
-    assert path([camera(x) for x in (2.0, 0.0, 3.0, 1.0)]) in ([1, 3, 0, 2], [2, 0, 3, 1])
+    assert order_cameras([camera(x) for x in (2.0, 0.0, 3.0, 1.0)]) in ([1, 3, 0, 2], [2, 0, 3, 1])
 
 
 def test_pseudo_views_lie_between_their_neighbours_and_beside_the_path():

@@ -15,11 +15,11 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.optimize import dropout, fit, refinement, regularise
-from splatnode.recon.optimize.fit import Fit
+from splatnode.recon.optimize.fit import Trainer
 from splatnode.recon.optimize.losses import normal
 from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.refinement import Config, Rates, refine
+from splatnode.recon.optimize.refinement import LearningRates, RefinementConfig, refine
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.sources import SHELL
 from splatnode.recon.scene import pixelwise
@@ -27,17 +27,17 @@ from splatnode.recon.scene.gaussians import logit
 from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.known_scene import disturbed, photographed, render, turned
 
-FROZEN = Rates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0, sh=0.0)
+FROZEN = LearningRates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0, sh=0.0)
 
 
-def plain(**changes: object) -> Config:
+def plain(**changes: object) -> RefinementConfig:
     """A refinement that keeps all Gaussians in every render and to the end."""
-    nothing = Config(checkpoints=(), dssim=0.2, dropout=dropout.Config(share=0.0), control=None)
+    nothing = RefinementConfig(checkpoints=(), dssim=0.2, dropout=dropout.DropoutConfig(share=0.0), control=None)
     return structs.replace(nothing, **changes)
 
 
 QUICK = plain(iterations=12)
-WITH_NORMALS = regularise.Config({"normal": LossChoice("normal", normal.Config(1.0))})
+WITH_NORMALS = regularise.RegularizerConfig({"normal": LossChoice("normal", normal.Config(1.0))})
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def truth() -> Scene:
     return photographed()
 
 
-def last(scene: Scene, config: Config, seed: int = 0, deadline: float | None = None) -> Scene:
+def last(scene: Scene, config: RefinementConfig, seed: int = 0, deadline: float | None = None) -> Scene:
     *_, end = refine(scene, config, seed=seed, deadline=deadline)
     return end
 
@@ -132,7 +132,7 @@ def test_no_iterations_give_the_start(truth):
 
 def test_every_view_takes_its_turn(truth, monkeypatch):
     taken = []
-    monkeypatch.setattr(Fit, "step", lambda fit, index, progress: taken.append(index))
+    monkeypatch.setattr(Trainer, "step", lambda fit, index, progress: taken.append(index))
     last(truth, plain(iterations=9))
     assert [sorted(taken[i : i + 3]) for i in (0, 3, 6)] == [[0, 1, 2]] * 3
 
@@ -142,7 +142,7 @@ def steps_until(deadline: float, truth: Scene, monkeypatch) -> list[float]:
     progress: list[float] = []
     clock = itertools.count()
     monkeypatch.setattr(refinement.time, "monotonic", lambda: float(next(clock)))
-    monkeypatch.setattr(Fit, "step", lambda fit, index, share: progress.append(share))
+    monkeypatch.setattr(Trainer, "step", lambda fit, index, share: progress.append(share))
     assert len(list(refine(truth, plain(iterations=100), seed=0, deadline=deadline))) == 1
     return progress
 
@@ -190,8 +190,8 @@ def test_torch_gets_its_threads_back(truth, wholly):
 
 def test_torch_has_one_thread_while_a_step_computes(truth, monkeypatch):
     threads = []
-    step = Fit.step
-    monkeypatch.setattr(Fit, "step", lambda *rest: threads.append(torch.get_num_threads()) or step(*rest))
+    step = Trainer.step
+    monkeypatch.setattr(Trainer, "step", lambda *rest: threads.append(torch.get_num_threads()) or step(*rest))
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -233,7 +233,7 @@ class Brighter:
 
 
 def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypatch):
-    monkeypatch.setattr(fit, "Regularisation", Brighter)
+    monkeypatch.setattr(fit, "Regularizer", Brighter)
     start = replace(truth, views=tuple(map(with_pointmap, truth.views)))
     config = plain(iterations=8, half_resolution_share=0.5)
     unpulled = last(start, config)
@@ -252,7 +252,7 @@ def test_a_loss_without_a_point_map_names_the_view(truth):
 
 def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):
     def moved(**final: float) -> tuple[float, float]:
-        fit = Fit(disturbed(truth), plain(rates=Rates(**final)), seed=0)
+        fit = Trainer(disturbed(truth), plain(rates=LearningRates(**final)), seed=0)
         fit.step(1, progress=1.0)
         scene = fit.scene()
         camera = (scene.views[1].T_world_camera - truth.views[1].T_world_camera).abs().max()
@@ -288,9 +288,9 @@ def test_looks_change_nothing(truth):
 
 def test_what_is_as_soft_already_is_left_to_the_bit(truth):
     from_photographs = replace(truth.gaussians, source_frame=torch.zeros_like(truth.gaussians.source_frame))
-    soft = refinement.softened(from_photographs, 0.1)
+    soft = refinement.soften_opacities(from_photographs, 0.1)
     assert soft.opacities.max() < 0.11
-    again = refinement.softened(soft, pixelwise.Config().opacity)
+    again = refinement.soften_opacities(soft, pixelwise.PixelwiseConfig().opacity)
     assert torch.equal(soft.logit_opacities, again.logit_opacities)
 
 
@@ -309,11 +309,11 @@ def test_a_longer_refinement_takes_no_more_memory():
     """Where a tensor was kept of each step, the allocator could often not join what lay around it: 90 MB more."""
     script = (
         "import resource\n"
-        "from splatnode.recon.optimize.refinement import Config, refine\n"
+        "from splatnode.recon.optimize.refinement import RefinementConfig, refine\n"
         "from tests.support.known_scene import many_gaussians\n"
         "peaks = {}\n"
         "def note(done): peaks[done] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "list(refine(many_gaussians(), Config(iterations=200, checkpoints=(), control=None), seed=0, gone_on=note))\n"
+        "list(refine(many_gaussians(), RefinementConfig(iterations=200, checkpoints=(), control=None), seed=0, gone_on=note))\n"
         "print(peaks[200] - peaks[50])\n"
     )
     grown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -7,12 +7,12 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.config import overlaid, preset
+from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.evaluate.methods import CONFIGS
 from splatnode.recon.networks.crop import Crop
 from splatnode.recon.optimize import losses
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularise import Config, Regularisation
+from splatnode.recon.optimize.regularise import Regularizer, RegularizerConfig
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.render import Render
 
@@ -66,17 +66,17 @@ def without_networks(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
 
 
-def weighted(**weights: float) -> Config:
+def weighted(**weights: float) -> RegularizerConfig:
     """A loss of each name with that weight, with all patches of the depth."""
     chosen = {name: {"weight": weight} for name, weight in weights.items()}
     if "depth" in chosen:
         chosen["depth"]["share"] = 1.0
-    return overlaid(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}}).optimize.regularise
+    return apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}}).optimize.regularise
 
 
-def regularisation(config: Config) -> Regularisation:
+def regularisation(config: RegularizerConfig) -> Regularizer:
     pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4, 0.8))), strict=True)
-    return Regularisation(pointmaps, images, config, seed=0)
+    return Regularizer(pointmaps, images, config, seed=0)
 
 
 def test_the_papers_schedule(without_networks):
@@ -138,7 +138,7 @@ def test_which_network_served_is_told(without_networks):
         "normal": "normals of the multi-view depth",
         "semantic": "nothing: no weights",
     }
-    assert regularisation(Config()).served_by == {}
+    assert regularisation(RegularizerConfig()).served_by == {}
     nothing = regularisation(weighted(semantic=1.0))
     assert nothing.pseudo_loss(lambda view, _: truth_at(view), 0.5) is None  # no view is rendered for it
 
@@ -172,7 +172,7 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
     pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4))), strict=True)
     for pointmap in pointmaps:
         pointmap.depth[:, ::3] = 0  # several views know only a part
-    served = Regularisation(pointmaps, images, PAPER, seed=0)
+    served = Regularizer(pointmaps, images, PAPER, seed=0)
     depth = "depth of a network (in 1 of 2 views, scaled by multi-view depth)"
     assert served.served_by["depth"] == depth and served.served_by["normal"] == f"normals of the {depth}"
     assert served.served_by["semantic"] == "an encoder"
@@ -180,9 +180,9 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
     wrong = Render(right.rgb, right.depth.flip(1), right.normal, None)
     losses = [float(served.training_loss(0, render, progress)) for render in (right, wrong)]
     assert losses[0] < 1e-3 < losses[1]
-    assert Regularisation(pointmaps, images, Config(), seed=0).served_by == {}
+    assert Regularizer(pointmaps, images, RegularizerConfig(), seed=0).served_by == {}
     left = np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2  # what a mask hides, a network sees, too
-    hidden = Regularisation(pointmaps, images, PAPER, seed=0, shown=[left, left])
+    hidden = Regularizer(pointmaps, images, PAPER, seed=0, shown=[left, left])
     half = Render(right.rgb, torch.where(torch.from_numpy(left), right.depth, wrong.depth), right.normal, None)
     assert float(hidden.training_loss(0, half, progress)) < 1e-3 < float(served.training_loss(0, half, progress))
 
@@ -217,5 +217,5 @@ def test_a_loss_that_is_not_there_is_named_with_those_that_are():
 
 def test_a_loss_may_be_used_twice_under_names_of_its_own():
     chosen = {"fine": {"kind": "depth", "weight": 1.0, "patch": 16}, "coarse": {"kind": "depth", "weight": 0.5}}
-    changed = overlaid(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}})
+    changed = apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}})
     assert list(regularisation(changed.optimize.regularise).served_by) == ["fine", "coarse"]

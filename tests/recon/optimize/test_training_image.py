@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.optimize.training_image import training_image
+from splatnode.recon.optimize.training_image import make_training_image
 from splatnode.recon.scene.scene import Exposure, TrainingView
 
 HEIGHT, WIDTH = 24, 40
@@ -16,7 +16,7 @@ def test_only_what_shows_the_scene_is_compared(scale):
     shown = np.ones((HEIGHT, WIDTH), bool)
     image[:3], shown[:3] = 0, False
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
-    compared = training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, scale, 0.2)
+    compared = make_training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, scale, 0.2)
     assert (compared.width, compared.height) == (WIDTH * scale, HEIGHT * scale)
     torch.testing.assert_close(compared.K[:2], scale * K[:2])
     grey = torch.full((compared.height, compared.width, 3), 128 / 255, requires_grad=True)
@@ -32,7 +32,7 @@ def test_a_photograph_that_is_read_only_is_nothing_to_warn_of(recwarn):
     photograph = np.full((8, 12, 3), 51, np.uint8)
     photograph.setflags(write=False)
     view = TrainingView("a.png", 0, photograph, torch.eye(4), torch.eye(3))
-    found = training_image(view, np.ones((8, 12), bool), 1.0, 0.0)
+    found = make_training_image(view, np.ones((8, 12), bool), 1.0, 0.0)
     assert float(found.loss(torch.full((8, 12, 3), 0.2))) == pytest.approx(0.0, abs=1e-6)
     assert not recwarn.list
 
@@ -44,7 +44,7 @@ def test_a_render_may_be_brighter_where_the_photograph_is_saturated(scale):
     saturated[:, :20] = True
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
     view = TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), 0.0, saturated))
-    compared = training_image(view, np.ones((HEIGHT, WIDTH), bool), scale, 0.0)
+    compared = make_training_image(view, np.ones((HEIGHT, WIDTH), bool), scale, 0.0)
     for level, expected in ((0.9, False), (0.2, True)):
         render = torch.full((compared.height, compared.width, 3), level, requires_grad=True)
         compared.loss(render).backward()
@@ -58,8 +58,8 @@ def test_what_is_left_of_the_exposure_is_a_gain_that_fits_the_render():
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
     shown = np.ones((HEIGHT, WIDTH), bool)
     render = 1.1 * torch.from_numpy(image).float() / 255
-    as_it_is = training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, 1.0, 0.0)
-    exposed = training_image(
+    as_it_is = make_training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, 1.0, 0.0)
+    exposed = make_training_image(
         TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), 0.0, None)), shown, 1.0, 0.0
     )
     assert float(exposed.loss(render)) < 0.2 * float(as_it_is.loss(render))
@@ -73,5 +73,5 @@ def test_a_colour_that_an_exposed_photograph_has_nowhere_is_wrong_in_a_render():
     exposure = Exposure((2.0, 2.0, 2.0), 0.0, None)
     view = TrainingView("a", 0, image, torch.eye(4), K, exposure=exposure)
     render = torch.full((HEIGHT, WIDTH, 3), 0.5, requires_grad=True)
-    training_image(view, np.ones((HEIGHT, WIDTH), bool), 1.0, 0.0).loss(render).backward()
+    make_training_image(view, np.ones((HEIGHT, WIDTH), bool), 1.0, 0.0).loss(render).backward()
     assert render.grad is not None and bool((render.grad[..., 1:] > 0).all())

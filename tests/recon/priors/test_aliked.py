@@ -13,9 +13,9 @@ import torch
 from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.priors.aliked import WEIGHTS, Config, load
-from splatnode.recon.priors.aliked.deformable import DeformableConv, sampled
-from splatnode.recon.priors.aliked.detection import detected
-from splatnode.recon.priors.aliked.matcher import AlikedMatcher, mutual
+from splatnode.recon.priors.aliked.deformable import DeformableConv, sample_maps
+from splatnode.recon.priors.aliked.detection import detect_keypoints
+from splatnode.recon.priors.aliked.matcher import AlikedMatcher, match_mutual
 from splatnode.recon.priors.aliked.network import Aliked, load_aliked
 from tests.support.generated import generated, generated_images, shapes_of
 
@@ -70,7 +70,7 @@ def test_it_agrees_with_another_implementation(width):
     network.load_state_dict(made(width))
     image = generated_images(1, 96, 64)[0].sigmoid()
     with torch.inference_mode():
-        _, scores = network.maps(image)
+        _, scores = network.compute_maps(image)
         found = network(image, 1000)
     expected = GOLDEN[width]
     places = found.points - 0.5
@@ -86,7 +86,7 @@ def test_samples_between_pixels_and_outside():
     """Bilinear by hand; what lies outside counts as 0."""
     maps = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]])
     at = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.5, 0.5], [-0.5, 0.0], [3.0, 0.0]])
-    torch.testing.assert_close(sampled(maps, at), torch.tensor([[1.0, 2.0, 2.5, 0.5, 0.0]]))
+    torch.testing.assert_close(sample_maps(maps, at), torch.tensor([[1.0, 2.0, 2.5, 0.5, 0.0]]))
 
 
 def test_a_convolution_that_is_not_shifted_is_an_ordinary_one():
@@ -113,17 +113,17 @@ def test_a_keypoint_lies_where_the_scores_around_it_balance():
     scores[8, 3] = 0.5
     scores[1, 1] = 0.95  # the window around it is cut off
     scores[9, 12] = 0.1  # too faint
-    found = detected(scores, 10)
+    found = detect_keypoints(scores, 10)
     drawn = (np.exp(8.0) - 1.0) / (np.exp(9.0) + np.exp(8.0) + 23.0)  # by its neighbour, less what is opposite to it
     np.testing.assert_allclose(found, [[8.0 + drawn, 5.0], [3.0, 8.0]], atol=1e-5)
-    assert len(detected(scores, 1)) == 1
+    assert len(detect_keypoints(scores, 1)) == 1
 
 
 def test_matches_are_mutual_and_the_distinct_ones_first():
     first = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0.0], [0.0, 1.0, 1.0], [1.0, 0.3, 0.0]]), dim=1)
     second = torch.nn.functional.normalize(torch.tensor([[0.0, 1.0, 1.1], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), dim=1)
-    assert mutual(first, second).tolist() == [[1, 0], [0, 1]]
-    assert mutual(first[:1], second).shape == (0, 2)
+    assert match_mutual(first, second).tolist() == [[1, 0], [0, 1]]
+    assert match_mutual(first[:1], second).shape == (0, 2)
 
 
 def test_checkpoints_of_others_are_named(tmp_path):
@@ -141,7 +141,7 @@ def test_checkpoints_of_others_are_named(tmp_path):
 
 def test_an_image_of_odd_size_is_refused():
     with pytest.raises(ValueError, match=r"sides that 32 divides, got \(3, 40, 64\)"):
-        Aliked(8).maps(torch.zeros(3, 40, 64))
+        Aliked(8).compute_maps(torch.zeros(3, 40, 64))
 
 
 def epipolar_distance(points1: np.ndarray, points2: np.ndarray, camera1: TrueCamera, camera2: TrueCamera) -> np.ndarray:
@@ -172,8 +172,8 @@ def test_matches_of_photographs_lie_on_the_true_epipolar_lines(shared, weights, 
     """Before any check of their geometry. The fountain is seen from 58 degrees apart."""
     scene = load_scene(shared / "scenes" / folder)
     matcher = AlikedMatcher(load_aliked(shared / "weights" / "aliked" / weights), longer_side=640, num_keypoints=1000)
-    first, second = (matcher.with_points(plain(scene, name)) for name in pair)
-    assert matcher.with_points(first) is first and (first.features.points[0] == 7.0).all()
+    first, second = (matcher.add_points(plain(scene, name)) for name in pair)
+    assert matcher.add_points(first) is first and (first.features.points[0] == 7.0).all()
     matches = matcher.match(first, second)
     assert len(matches) > 150 and matches.min() >= 1
     for side in (0, 1):
@@ -191,7 +191,7 @@ def test_a_shifted_photograph_gives_shifted_keypoints(shared):
     part = torch.from_numpy(image[200:392, 300:588]).permute(2, 0, 1) / 255.0
     with torch.inference_mode():
         first, second = network(part[..., :-32], 300), network(part[..., 32:], 300)
-    chosen1, chosen2 = mutual(first.descriptors, second.descriptors).unbind(1)
+    chosen1, chosen2 = match_mutual(first.descriptors, second.descriptors).unbind(1)
     step = first.points[chosen1] - second.points[chosen2]
     np.testing.assert_allclose(step.median(0).values, [32.0, 0.0], atol=0.1)
 

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.networks.dinov2 import MEAN, STD
-from splatnode.recon.priors.da3.inference import ask
-from splatnode.recon.priors.da3.network import DepthAnything3, Estimate, PlacedCamera, load_network
+from splatnode.recon.priors.da3.inference import estimate_keyframes
+from splatnode.recon.priors.da3.network import DepthAnything3, DepthEstimate, PlacedCamera, load_network
 from splatnode.recon.priors.da3.prior import Config, Da3Prior, load
 from splatnode.recon.registration import register
 from tests.support.generated import generated_images, generated_weights, shapes_of
@@ -116,7 +116,7 @@ class Oracle:
         self.told = cameras
         return [self._estimate(image) for image in images]
 
-    def _estimate(self, image: torch.Tensor) -> Estimate:
+    def _estimate(self, image: torch.Tensor) -> DepthEstimate:
         height, width = image.shape[1:]
         top, left = (SMALL.height - height) // 2, (SMALL.width - width) // 2
         shown = image.permute(1, 2, 0).numpy() * STD + MEAN
@@ -131,14 +131,14 @@ class Oracle:
         T_scaled[:3, 3] *= self.unit
         K = K - np.array([[0, 0, left], [0, 0, top], [0, 0, 0]])
         depth = depth[top : top + height, left : left + width].astype(np.float32)
-        return Estimate(depth, np.full((height, width), 4.0, np.float32), PlacedCamera(T_scaled, K))
+        return DepthEstimate(depth, np.full((height, width), 4.0, np.float32), PlacedCamera(T_scaled, K))
 
 
 def test_depth_comes_out_right_for_the_verified_cameras():
     graph = view_graph(photographs()[:3])
     oracle = Oracle((0, 1, 2))
     prior = Da3Prior(oracle, Config(longer_side=320))
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None
     pointmaps = prior.pointmaps(graph, registration)
     assert oracle.told is not None  # the registered cameras, as the network's image has them
@@ -178,7 +178,7 @@ def test_what_it_draws_from_the_other_camera_matches_from_far_apart():
 def test_photographs_of_different_shapes_are_cut_to_what_all_have():
     wide, tall = photographs()[0], replace(photographs()[1], image=photographs()[1].image.transpose(1, 0, 2).copy())
     graph = view_graph([wide, tall])
-    answers = ask(lambda images, cameras: [None] * len(images), graph.keyframes, 280)  # type: ignore[arg-type]
+    answers = estimate_keyframes(lambda images, cameras: [None] * len(images), graph.keyframes, 280)  # type: ignore[arg-type]
     assert {(answer.crop.width, answer.crop.height) for answer in answers} == {(210, 210)}
 
 

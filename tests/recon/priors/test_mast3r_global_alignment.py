@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.evaluate.camera_errors import camera_errors
-from splatnode.recon.priors.mast3r.global_alignment import PairPoints, align
+from splatnode.recon.evaluate.camera_errors import compare_cameras
+from splatnode.recon.priors.mast3r.global_alignment import PairPoints, align_views
 
 HEIGHT, WIDTH, FOCAL = 36, 48, 45.0
 
@@ -70,9 +70,9 @@ def intrinsics(focals: list[float]) -> np.ndarray:
 @pytest.mark.parametrize(("count", "outliers"), [(2, 0.0), (3, 0.0), (12, 0.2)])
 def test_cameras_are_found_from_noisy_pairs(count, outliers):
     Ts = cameras(count)
-    views = align(predictions(Ts, 0.01, outliers, np.random.default_rng(count)))
+    views = align_views(predictions(Ts, 0.01, outliers, np.random.default_rng(count)))
     estimated = np.stack([view.T_world_camera for view in views])
-    errors = camera_errors(estimated, Ts, intrinsics([v.focal for v in views]), intrinsics([FOCAL] * count))
+    errors = compare_cameras(estimated, Ts, intrinsics([v.focal for v in views]), intrinsics([FOCAL] * count))
     assert errors.rotation_pair_deg is not None and errors.rotation_pair_deg < 0.2
     assert errors.centre_pct is not None and (count == 2 or errors.centre_pct < 0.5)
     assert errors.focal_pct is not None and errors.focal_pct < 1.0
@@ -88,7 +88,7 @@ def test_cameras_are_found_from_noisy_pairs(count, outliers):
 
 def test_perfect_pairs_give_perfect_cameras():
     Ts = cameras(4)
-    views = align(predictions(Ts, 0.0, 0.0, np.random.default_rng(0)), shared_focal=False)
+    views = align_views(predictions(Ts, 0.0, 0.0, np.random.default_rng(0)), shared_focal=False)
     relative = np.linalg.inv(Ts[0]) @ Ts[3]
     np.testing.assert_allclose(views[3].T_world_camera[:3, :3], relative[:3, :3], atol=1e-5)
     assert views[2].focal == pytest.approx(FOCAL, rel=1e-4)
@@ -96,9 +96,9 @@ def test_perfect_pairs_give_perfect_cameras():
 
 def test_wrong_pairs_leave_no_trace():
     Ts = cameras(8)
-    views = align(predictions(Ts, 0.0, 0.2, np.random.default_rng(1)))
+    views = align_views(predictions(Ts, 0.0, 0.2, np.random.default_rng(1)))
     estimated = np.stack([view.T_world_camera for view in views])
-    errors = camera_errors(estimated, Ts, intrinsics([v.focal for v in views]), intrinsics([FOCAL] * 8))
+    errors = compare_cameras(estimated, Ts, intrinsics([v.focal for v in views]), intrinsics([FOCAL] * 8))
     assert errors.centre_pct is not None and errors.centre_pct < 0.01
 
 
@@ -106,6 +106,6 @@ def test_views_that_no_pair_connects_are_refused():
     pairs = predictions(cameras(4), 0.0, 0.0, np.random.default_rng(0))
     apart = {pair: pairs[pair] for pair in ((0, 1), (1, 0), (2, 3), (3, 2))}
     with pytest.raises(ValueError, match=r"views \[0, 1\] stand alone"):
-        align(apart)
+        align_views(apart)
     with pytest.raises(ValueError, match="view 1 must be the first"):
-        align({(0, 1): pairs[0, 1]})
+        align_views({(0, 1): pairs[0, 1]})

@@ -134,8 +134,8 @@ def test_attention_with_rotary_positions_sees_only_distances():
     query, key = torch.randn(2, 1, 8, generator=torch.Generator().manual_seed(0)).double()
 
     def product(at_query: int, at_key: int) -> float:
-        rotary = Rotary.of(positions[[at_query, at_key]], 8)
-        turned_query, turned_key = rotary.turned(torch.stack([query[0], key[0]]))
+        rotary = Rotary.create_from_positions(positions[[at_query, at_key]], 8)
+        turned_query, turned_key = rotary.rotate(torch.stack([query[0], key[0]]))
         return float(turned_query @ turned_key)
 
     assert product(0, 5) == pytest.approx(product(10, 15), rel=1e-5)

@@ -11,20 +11,18 @@ import pytest
 import torch
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.networks.crop import crop
-from splatnode.recon.priors.depth_normals import normals_of_depth
-from splatnode.recon.priors.mast3r.inference import PATCH, Asked, prepared
-from splatnode.recon.priors.mast3r.network import Encoded, Prediction
+from splatnode.recon.priors.depth_normals import compute_depth_normals
+from splatnode.recon.priors.mast3r.inference import PATCH, NetworkCache, prepare_image
+from splatnode.recon.priors.mast3r.network import EncodedImage, Prediction
 from splatnode.recon.priors.mast3r.prior import Config, Mast3rPrior, load
 from splatnode.recon.registration import register
-from splatnode.recon.verification.decision import Config as DecisionConfig
-from splatnode.recon.verification.decision import decide, refuse_before_registration
-from splatnode.recon.verification.verify import Config as VerificationConfig
-from splatnode.recon.verification.verify import verify
+from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
+from splatnode.recon.verification.verify import VerificationConfig, verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 VIEWS = 3
@@ -45,14 +43,16 @@ class Oracle:
     noise: float = 0.003
     encoded: list[torch.Tensor] = field(default_factory=list)
 
-    def encode(self, image: torch.Tensor) -> Encoded:
+    def encode(self, image: torch.Tensor) -> EncodedImage:
         self.encoded.append(image)
-        known = [prepared(photographs()[k].image, crop(SMALL.width, SMALL.height, 320, PATCH)) for k in range(VIEWS)]
+        known = [
+            prepare_image(photographs()[k].image, crop(SMALL.width, SMALL.height, 320, PATCH)) for k in range(VIEWS)
+        ]
         gaps = [float((image - other).abs().mean()) if image.shape == other.shape else np.inf for other in known]
         index = torch.tensor([[float(np.argmin(gaps))]])
-        return Encoded(index, torch.zeros(1, 2), image.shape[1], image.shape[2])
+        return EncodedImage(index, torch.zeros(1, 2), image.shape[1], image.shape[2])
 
-    def decode(self, first: Encoded, second: Encoded) -> tuple[Prediction, Prediction]:
+    def decode(self, first: EncodedImage, second: EncodedImage) -> tuple[Prediction, Prediction]:
         i, j = (int(encoded.tokens[0, 0]) for encoded in (first, second))
         to_first = np.linalg.inv(synthetic.scene_cameras(SMALL)[i][0])
         rng = np.random.default_rng(100 * i + j)
@@ -60,7 +60,7 @@ class Oracle:
         return self._seen(i, to_first, scale, first, rng), self._seen(j, to_first, scale, second, rng)
 
     def _seen(
-        self, index: int, to_first: np.ndarray, scale: float, encoded: Encoded, rng: np.random.Generator
+        self, index: int, to_first: np.ndarray, scale: float, encoded: EncodedImage, rng: np.random.Generator
     ) -> Prediction:
         T_world_camera, K = synthetic.scene_cameras(SMALL)[index]
         to = crop(SMALL.width, SMALL.height, 320, PATCH)
@@ -81,7 +81,7 @@ class Oracle:
 class Liar(Oracle):
     """Says of any two images that both show the same wall, pixel for pixel."""
 
-    def decode(self, first: Encoded, second: Encoded) -> tuple[Prediction, Prediction]:
+    def decode(self, first: EncodedImage, second: EncodedImage) -> tuple[Prediction, Prediction]:
         v, u = np.mgrid[: first.height, : first.width]
         pixels = np.stack([u / first.width - 0.5, v / first.height - 0.5, np.ones(u.shape)], -1)
         phase = pixels @ _FOURIER
@@ -95,11 +95,11 @@ def test_cameras_and_depth_come_out_right():
     graph = view_graph(photographs()[:VIEWS])
     oracle = Oracle()
     prior = Mast3rPrior(oracle, Config(longer_side=320))
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None and len(registration.cameras) == VIEWS
     cameras = synthetic.scene_cameras(SMALL)[:VIEWS]
     Ks = np.stack([np.diag([c.focal, c.focal, 1.0]) for c in registration.cameras])
-    errors = camera_errors(
+    errors = compare_cameras(
         np.stack([camera.T_world_camera for camera in registration.cameras]),
         np.stack([T for T, _ in cameras]),
         Ks,
@@ -124,14 +124,14 @@ def test_cameras_and_depth_come_out_right():
 @pytest.mark.parametrize("noise", [False, True])
 def test_what_a_lying_network_invents_is_refused(noise):
     """Frames of three places, or of nothing at all: the network claims that all of them show one wall."""
-    few = matching.Config(features=features.Config(num_features=2000, min_longer_side=500))
+    few = matching.MatchingConfig(features=features.FeatureConfig(num_features=2000, min_longer_side=500))
     frames = places(msgspec.structs.replace(SMALL, views=3, width=192, height=144), seeds=(0, 1, 2))
     if noise:
         rng = np.random.default_rng(0)
         frames = [replace(frame, image=rng.integers(0, 256, frame.image.shape, np.uint8)) for frame in frames]
     prior = Mast3rPrior(Liar(), Config(longer_side=192))
     graph = view_graph(frames, prior.matcher, few)
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     evidence = verify(graph, registration, VerificationConfig())
     verdict = refuse_before_registration(graph, (), DecisionConfig()) or decide(
         graph, registration, evidence, DecisionConfig()
@@ -144,10 +144,10 @@ def test_crops_are_whole_patches_and_keep_the_middle():
     assert (to.width, to.height, to.left, to.top) == (512, 384, 0, 0)
     to = crop(300, 1000, 512, PATCH)
     assert (to.width, to.height) == (144, 512)
-    np.testing.assert_allclose(to.to_network(np.array([[150.0, 500.0]])), [[72.0, 256.0]], atol=0.5)
+    np.testing.assert_allclose(to.map_to_network(np.array([[150.0, 500.0]])), [[72.0, 256.0]], atol=0.5)
     image = np.zeros((1000, 300, 3), np.uint8)
     image[:, :, 0] = 255
-    seen = prepared(image, to)
+    seen = prepare_image(image, to)
     assert seen.shape == (3, 512, 144) and seen[0].min() == 1.0 and seen[1].max() == -1.0
     with pytest.raises(ValueError, match="too thin"):
         crop(4000, 60, 512, PATCH)
@@ -158,7 +158,7 @@ def test_with_many_frames_only_neighbours_are_asked_about():
     nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros(0, np.int64), np.zeros(0))
     keyframes = [Keyframe(frame, frame.image, nothing) for frame in frames]
     liar = Liar()
-    pairs = Asked(liar, 32).points(keyframes, 1)
+    pairs = NetworkCache(liar, 32).predict_points(keyframes, 1)
     assert sorted(pairs) == sorted({(i, (i + d) % 6) for i in range(6) for d in (1, -1)})
     assert len(liar.encoded) == 6
 
@@ -180,7 +180,7 @@ def test_normals_of_a_tilted_plane():
     rays = np.stack([(u - 16) / 50, (v - 12) / 50, np.ones_like(u)], -1)
     depth = (-2.0 / (rays @ facing)).astype(np.float32)
     depth[5:8, 5:8] = 0
-    normal = normals_of_depth(depth, K)
+    normal = compute_depth_normals(depth, K)
     known = depth > 0
     np.testing.assert_allclose(normal[known], np.broadcast_to(facing, normal[known].shape), atol=1e-3)
     assert (normal[~known] == 0).all()

@@ -9,8 +9,8 @@ import torch
 from splatnode.recon.priors import patchmatchnet
 from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
 from splatnode.recon.priors.patchmatchnet.sampling import Source
-from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo, _planes
-from splatnode.recon.priors.stereo import Config, StereoView
+from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo, _make_planes
+from splatnode.recon.priors.stereo import StereoConfig, StereoView
 
 HEIGHT, WIDTH, DEPTH = 64, 96, 2.0
 
@@ -56,7 +56,7 @@ def test_it_computes_what_the_authors_module_computes(shared):
 
 def test_the_depth_of_a_wall(shared):
     stereo = NetworkStereo(patchmatchnet.load_network(shared / "weights" / patchmatchnet.WEIGHTS[0]))
-    for depth_map in stereo.depth_maps(views(), Config(), seed=0):
+    for depth_map in stereo.estimate_depth_maps(views(), StereoConfig(), seed=0):
         known = depth_map.depth > 0
         assert known.mean() > 0.4
         assert np.median(np.abs(depth_map.depth[known] / DEPTH - 1)) < 0.01
@@ -67,7 +67,7 @@ def test_slopes_of_a_tilted_plane_and_none_across_a_step():
     u, v = np.meshgrid(np.arange(8.0), np.arange(6.0))
     inverse_depth = (0.5 + 0.002 * u - 0.001 * v).astype(np.float32)
     inverse_depth[:, 4:] *= 2
-    planes = _planes(inverse_depth).values
+    planes = _make_planes(inverse_depth).values
     np.testing.assert_allclose(planes[:, :4, 1], 0.002, atol=1e-6)
     np.testing.assert_allclose(planes[:, 4:, 1], 0.004, atol=1e-6)
     np.testing.assert_allclose(planes[:, :4, 2], -0.001, atol=1e-6)
@@ -86,6 +86,8 @@ def test_the_search_is_drawn_from_the_seed():
     torch.manual_seed(0)
     network = PatchmatchNet().eval()  # untrained: only that equal seeds give equal depth is looked at
     stereo = NetworkStereo(network)
-    first, again, other = (stereo.depth_maps(views(2), Config(), seed=seed)[0].depth for seed in (1, 1, 2))
+    first, again, other = (
+        stereo.estimate_depth_maps(views(2), StereoConfig(), seed=seed)[0].depth for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first, again)
     assert first.shape == other.shape

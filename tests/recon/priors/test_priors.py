@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.process.config import ConfigError, typed
-from splatnode.recon.config import Config, PriorChoice, overlaid, preset
+from splatnode.capture.process.config import ConfigError, parse_config
+from splatnode.recon.config import PriorChoice, ReconstructionConfig, apply_changes, preset
 from splatnode.recon.registration import register
 from tests.support.synthetic import SMALL, photographs, view_graph
 
@@ -31,7 +31,7 @@ def test_the_priors_are_found():
 
 @pytest.mark.parametrize("kind", PriorChoice.kinds())
 def test_its_configuration_has_what_all_have(kind):
-    config = typed({"prior": {"kind": kind, "seed": 3}}, Config)
+    config = parse_config({"prior": {"kind": kind, "seed": 3}}, ReconstructionConfig)
     assert config.prior.kind == kind and config.prior.config.seed == 3
 
 
@@ -40,7 +40,7 @@ def test_it_keeps_the_interface(kind):
     prior = loaded(kind)
     assert prior.matcher is None or callable(prior.matcher.match)
     graph = view_graph(photographs()[:3], prior.matcher)
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
     pointmaps = prior.pointmaps(graph, registration)
     assert [pointmap.name for pointmap in pointmaps] == [keyframe.name for keyframe in graph.keyframes]
@@ -61,7 +61,7 @@ def test_a_further_view_finds_depth_where_those_before_it_were_not_confirmed():
     """A camera that goes on sees what those before it saw at their edges, where no other view had confirmed it."""
     prior = loaded("classical")
     graph = view_graph(photographs()[:4], None)
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None
     known = {}
     for pointmap in prior.pointmaps(graph, registration)[:3]:
@@ -76,15 +76,15 @@ def test_a_further_view_finds_depth_where_those_before_it_were_not_confirmed():
 
 
 def test_another_prior_starts_from_its_own_defaults():
-    config = overlaid(preset("fast"), {"prior": {"kind": "mast3r", "longer_side": 224}})
+    config = apply_changes(preset("fast"), {"prior": {"kind": "mast3r", "longer_side": 224}})
     assert config.prior.kind == "mast3r" and config.prior.config.longer_side == 224
     assert config.optimize == preset("fast").optimize
-    same = overlaid(config, {"prior": {"max_neighbours": 2}, "size": 256})
+    same = apply_changes(config, {"prior": {"max_neighbours": 2}, "size": 256})
     assert (same.prior.config.longer_side, same.prior.config.max_neighbours, same.size) == (224, 2, 256)
-    assert overlaid(Config(), {}) == Config()
-    assert msgspec.to_builtins(Config())["prior"]["kind"] == "classical"
+    assert apply_changes(ReconstructionConfig(), {}) == ReconstructionConfig()
+    assert msgspec.to_builtins(ReconstructionConfig())["prior"]["kind"] == "classical"
 
 
 def test_an_unknown_prior_is_answered_with_the_known_ones():
     with pytest.raises(ConfigError, match=r"prior.kind: expected one of .*classical.*mast3r.*, got 'vggt'"):
-        overlaid(Config(), {"prior": {"kind": "vggt"}})
+        apply_changes(ReconstructionConfig(), {"prior": {"kind": "vggt"}})

@@ -11,16 +11,16 @@ from splatnode.recon.deadline import OutOfTime
 from splatnode.recon.priors import consistency
 from splatnode.recon.priors.patchmatch import Matching, Planes, Search, make_level
 from splatnode.recon.priors.stereo import (
-    Config,
     SparsePoints,
-    Stage,
+    StereoConfig,
+    StereoStage,
     StereoView,
-    compared_with,
-    depth_maps,
-    depth_range,
-    estimate,
-    further_depth_map,
+    estimate_depth_maps,
+    estimate_depth_range,
+    estimate_further_depth_map,
+    estimate_planes,
     rank_partners,
+    select_sources,
 )
 from tests.bench.speed import stereo as bench
 
@@ -72,7 +72,7 @@ def views() -> list[StereoView]:
 
 @pytest.fixture(scope="module")
 def maps(views):
-    return depth_maps(views, Config(), seed=1)
+    return estimate_depth_maps(views, StereoConfig(), seed=1)
 
 
 def test_depth_is_right_and_nearly_complete(maps):
@@ -111,7 +111,7 @@ def test_same_seed_gives_the_same_result_for_any_number_of_threads(views, maps):
     try:
         for count in (1, 3):
             set_threads(count)
-            for first, second in zip(maps, depth_maps(views, Config(), seed=1), strict=True):
+            for first, second in zip(maps, estimate_depth_maps(views, StereoConfig(), seed=1), strict=True):
                 np.testing.assert_array_equal(first.depth, second.depth)
                 np.testing.assert_array_equal(first.confidence, second.confidence)
     finally:
@@ -120,14 +120,14 @@ def test_same_seed_gives_the_same_result_for_any_number_of_threads(views, maps):
 
 def test_one_view_alone_with_known_depth_of_the_others(views, maps):
     others = [views[0], views[2]]
-    planes = estimate(views[1], others, Config(), seed=1, known={0: maps[0].depth, 1: maps[2].depth})
+    planes = estimate_planes(views[1], others, StereoConfig(), seed=1, known={0: maps[0].depth, 1: maps[2].depth})
     _, depth, _ = render(CAMERAS[1])
     error = np.abs(1 / planes.inverse_depth / depth - 1)
     assert np.median(error) < 0.005
 
 
 def test_a_further_view_is_as_good_and_no_map_but_its_own_is_needed_again(views, maps):
-    further = further_depth_map(views, 1, {0: maps[0].depth, 2: maps[2].depth}, Config(), seed=1)
+    further = estimate_further_depth_map(views, 1, {0: maps[0].depth, 2: maps[2].depth}, StereoConfig(), seed=1)
     _, depth, _ = render(CAMERAS[1])
     known = further.depth > 0
     assert known.mean() > 0.75
@@ -144,7 +144,7 @@ def test_the_work_can_be_abandoned_between_views(views):
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        depth_maps(views, Config(), pause=pause)
+        estimate_depth_maps(views, StereoConfig(), pause=pause)
     assert len(calls) == 2
 
 
@@ -152,7 +152,7 @@ def test_when_time_is_over_depth_is_as_fine_as_it_is_by_then(views):
     def over() -> None:
         raise OutOfTime
 
-    for T, early in zip(CAMERAS, depth_maps(views, Config(), seed=1, pause=over), strict=True):
+    for T, early in zip(CAMERAS, estimate_depth_maps(views, StereoConfig(), seed=1, pause=over), strict=True):
         _, depth, _ = render(T)
         known = early.depth > 0
         assert early.depth.shape == depth.shape and known.mean() > 0.3
@@ -165,7 +165,9 @@ def flat_planes(inverse_depth: float) -> Planes:
     return Planes(values, np.zeros((HEIGHT, WIDTH), np.float32))
 
 
-def check_side_by_side(first: Planes, second: Planes, config: consistency.Config) -> list[consistency.DepthMap]:
+def check_side_by_side(
+    first: Planes, second: Planes, config: consistency.ConsistencyConfig
+) -> list[consistency.DepthMap]:
     """Two cameras side by side before a striped wall at z = 4, with the planes given."""
     stripes = np.repeat((np.arange(WIDTH) % 16 * 10).astype(np.uint8)[None, :, None], HEIGHT, 0).repeat(3, 2)
     levels = [make_level(stripes, K, camera(x, 0.0), (1.0, 10.0), 0) for x in (0.0, 0.4)]
@@ -173,21 +175,21 @@ def check_side_by_side(first: Planes, second: Planes, config: consistency.Config
 
 
 def test_depth_is_the_mean_of_agreeing_views():
-    first, _ = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 4.02), consistency.Config())
+    first, _ = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 4.02), consistency.ConsistencyConfig())
     seen_by_both = first.num_consistent == 1
     assert seen_by_both[:, 20:].all() and not seen_by_both[:, :12].any()
     assert (first.depth[seen_by_both] > 4.001).all() and (first.depth[seen_by_both] < 4.019).all()
 
 
 def test_views_that_disagree_leave_no_depth():
-    first, second = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 6.0), consistency.Config())
+    first, second = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 6.0), consistency.ConsistencyConfig())
     assert not first.depth.any() and not second.depth.any()
 
 
 def test_a_wrong_pixel_takes_the_plane_of_its_neighbours_and_counts_as_unconfirmed():
     planes = flat_planes(1 / 4.0)
     planes.values[60, 80, 0] = 1 / 2.0
-    first, _ = check_side_by_side(planes, flat_planes(1 / 4.0), consistency.Config())
+    first, _ = check_side_by_side(planes, flat_planes(1 / 4.0), consistency.ConsistencyConfig())
     assert first.depth[60, 80] == pytest.approx(4.0, rel=1e-3)
     assert first.num_consistent[60, 80] == 0
     assert 0 < first.confidence[60, 80] < first.confidence[60, 90]
@@ -196,7 +198,7 @@ def test_a_wrong_pixel_takes_the_plane_of_its_neighbours_and_counts_as_unconfirm
 def test_a_surveyed_scene_meets_the_bars(shared):
     names = ["0003.jpg", "0004.jpg", "0005.jpg"]
     case = bench.make_case(shared / "scenes" / "fountain_p11", names, names)
-    _, row = bench.run(case, Config())
+    _, row = bench.run(case, StereoConfig())
     assert row["median_relative_error"] < 0.005
     assert row["coverage"] > 0.7
     assert row["sparsification"][0] > row["sparsification"][-1]
@@ -205,12 +207,12 @@ def test_a_surveyed_scene_meets_the_bars(shared):
 
 def test_sparse_points_replace_the_search_over_the_depth_range(views):
     """A short search at full size only, which never looks at the whole range, starts at infinity without points."""
-    config = Config(stages=(Stage(0, Search(iterations=3, perturbation=1.0), geometric=False),))
+    config = StereoConfig(stages=(StereoStage(0, Search(iterations=3, perturbation=1.0), geometric=False),))
     sources = [views[0], views[2]]
     _, depth, _ = render(CAMERAS[1])
     y, x = np.mgrid[10:HEIGHT:20, 10:WIDTH:20].reshape(2, -1)
     sparse = SparsePoints(np.stack([x, y], 1) + 0.5, depth[y, x])
-    lost, found = estimate(views[1], sources, config), estimate(views[1], sources, config, sparse=sparse)
+    lost, found = estimate_planes(views[1], sources, config), estimate_planes(views[1], sources, config, sparse=sparse)
     assert np.median(np.abs(found.inverse_depth * depth - 1)) < 0.01
     assert np.median(np.abs(lost.inverse_depth * depth - 1)) > 0.1
 
@@ -218,24 +220,24 @@ def test_sparse_points_replace_the_search_over_the_depth_range(views):
 def test_sources_overlap_and_have_parallax(views):
     behind = StereoView(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
     same_place = StereoView(views[0].image, K, camera(0.001, 0.0), (1.5, 12.0))
-    partners = rank_partners([views[1], same_place, behind, views[0], views[2]], 0, Config())
-    assert compared_with(partners, Config())[:2] in ([3, 4], [4, 3])
-    assert 2 not in compared_with(partners, Config())
+    partners = rank_partners([views[1], same_place, behind, views[0], views[2]], 0, StereoConfig())
+    assert select_sources(partners, StereoConfig())[:2] in ([3, 4], [4, 3])
+    assert 2 not in select_sources(partners, StereoConfig())
 
 
 def test_a_view_without_overlap_has_no_depth(views):
     behind = StereoView(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
-    first, second, third = depth_maps([views[0], views[1], behind], Config())
+    first, second, third = estimate_depth_maps([views[0], views[1], behind], StereoConfig())
     assert (first.depth > 0).any() and (second.depth > 0).any()
     assert not third.depth.any() and not third.confidence.any() and not third.normal.any()
 
 
 def test_depth_range_covers_the_points_and_ignores_outliers():
     depths = np.r_[np.linspace(2.0, 4.0, 998), 1e-3, 1e4]
-    near, far = depth_range(depths)
+    near, far = estimate_depth_range(depths)
     assert 1.0 < near < 2.0 and 4.0 < far < 8.0
     with pytest.raises(ValueError, match="at least 3"):
-        depth_range(np.array([1.0, -1.0, np.nan]))
+        estimate_depth_range(np.array([1.0, -1.0, np.nan]))
 
 
 def test_wrong_input_says_what_was_expected(views):
@@ -244,11 +246,11 @@ def test_wrong_input_says_what_was_expected(views):
     with pytest.raises(ValueError, match="near < far"):
         StereoView(np.zeros((4, 4, 3), np.uint8), K, np.eye(4), (2.0, 1.0))
     with pytest.raises(ValueError, match="one entry a view"):
-        depth_maps(views, Config(), sparse=[None])
+        estimate_depth_maps(views, StereoConfig(), sparse=[None])
     with pytest.raises(ValueError, match="sources are needed"):
-        estimate(views[0], [], Config())
+        estimate_planes(views[0], [], StereoConfig())
 
 
 def test_a_view_without_sparse_points_still_finds_its_sources(views):
     none = SparsePoints(np.empty((0, 2)), np.empty(0))
-    assert rank_partners(views, 1, Config(), none) == rank_partners(views, 1, Config())
+    assert rank_partners(views, 1, StereoConfig(), none) == rank_partners(views, 1, StereoConfig())

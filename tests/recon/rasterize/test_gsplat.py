@@ -95,7 +95,7 @@ def test_it_is_what_gsplat_makes_of_quaternions_harmonics_and_a_pose(by_torch, p
     ours, theirs = moderate(32).tensors(), moderate(32).tensors()
     render = gsplat.rasterize(*ours, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha"))
     means, quats, scales, opacities, sh, T_world_camera, K = theirs
-    colours = reference.colours(sh, means - T_world_camera[:3, 3])
+    colours = reference.compute_colours(sh, means - T_world_camera[:3, 3])
     image, alpha, _ = package.rasterization(  # pyright: ignore[reportAttributeAccessIssue]
         means, quats, scales, opacities, colours, torch.linalg.inv(T_world_camera)[None], K[None], WIDTH, HEIGHT,
         packed=packed,
@@ -146,6 +146,6 @@ def test_tensors_must_be_on_the_gpu():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
 def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
     with pytest.raises(DeviceUnavailable, match=r"device cuda needs an NVIDIA GPU .* but .* Take device auto or cpu"):
-        device.chosen("cuda")
-    assert device.chosen("auto") == device.chosen("cpu") == torch.device("cpu")
-    assert "on the processor: the torch that is installed" in device.in_words("auto", torch.device("cpu"))
+        device.choose_device("cuda")
+    assert device.choose_device("auto") == device.choose_device("cpu") == torch.device("cpu")
+    assert "on the processor: the torch that is installed" in device.format_device("auto", torch.device("cpu"))

@@ -67,7 +67,7 @@ def turned_deg(one: bundle.Problem, other: bundle.Problem) -> float:
 def test_what_was_disturbed_comes_back_exactly_without_noise():
     true = problem(noise_px=0.0)
     prior = replace(PRIOR, sigmas=np.array([1e3]), radial_sigmas=np.full((1, 2), 1e3), shift_sigmas=np.array([1e6]))
-    found = bundle.adjust(disturbed(true), prior, bundle.Config(tolerance=1e-14, max_iterations=200))
+    found = bundle.adjust(disturbed(true), prior, bundle.BundleAdjustmentConfig(tolerance=1e-14, max_iterations=200))
     assert bundle.reprojection_errors(found).max() < 1e-4
     assert turned_deg(found, true) < 1e-4
     assert np.exp(found.log_focals[0]) == pytest.approx(900.0, abs=0.01)
@@ -76,7 +76,7 @@ def test_what_was_disturbed_comes_back_exactly_without_noise():
 
 
 def test_scipy_finds_no_lower_cost_from_where_it_ends():
-    config = bundle.Config(robust_px=0.5, tolerance=1e-12, max_iterations=200)
+    config = bundle.BundleAdjustmentConfig(robust_px=0.5, tolerance=1e-12, max_iterations=200)
     found = bundle.adjust(disturbed(problem(num_points=20)), PRIOR, config)
 
     def moved(step: np.ndarray) -> bundle.Problem:
@@ -119,13 +119,15 @@ def test_outliers_hardly_move_the_cameras():
     clean = problem()
     wrong = np.random.default_rng(3).random(len(clean.pixels)) < 0.1
     spoiled = replace(clean, pixels=clean.pixels + wrong[:, None] * [80.0, -50.0])
-    found = bundle.adjust(disturbed(spoiled), PRIOR, bundle.Config())
+    found = bundle.adjust(disturbed(spoiled), PRIOR, bundle.BundleAdjustmentConfig())
     assert turned_deg(found, clean) < 0.3
 
 
 def test_a_sigma_of_zero_fixes_a_parameter():
     start = disturbed(problem())
-    found = bundle.adjust(start, replace(PRIOR, sigmas=np.zeros(1), radial_sigmas=np.zeros((1, 2))), bundle.Config())
+    found = bundle.adjust(
+        start, replace(PRIOR, sigmas=np.zeros(1), radial_sigmas=np.zeros((1, 2))), bundle.BundleAdjustmentConfig()
+    )
     assert found.log_focals[0] == start.log_focals[0]
     assert not found.radials.any()
     assert np.abs(found.shifts).max() > 0.0
@@ -138,7 +140,7 @@ def test_the_argument_is_left_alone_and_the_number_of_threads_does_not_matter():
     results = []
     for threads in (3, 1):
         set_threads(threads)
-        results.append(bundle.adjust(start, PRIOR, bundle.Config()))
+        results.append(bundle.adjust(start, PRIOR, bundle.BundleAdjustmentConfig()))
     set_threads(default_threads())
     np.testing.assert_array_equal(start.points, kept)
     np.testing.assert_array_equal(results[0].points, results[1].points)
@@ -151,13 +153,13 @@ def test_the_order_of_observations_does_not_matter():
     shuffled = replace(
         start, camera_of=start.camera_of[order], point_of=start.point_of[order], pixels=start.pixels[order]
     )
-    one, other = (bundle.adjust(case, PRIOR, bundle.Config()) for case in (start, shuffled))
+    one, other = (bundle.adjust(case, PRIOR, bundle.BundleAdjustmentConfig()) for case in (start, shuffled))
     assert turned_deg(one, other) < 1e-4
 
 
 def test_covariance_is_the_spread_of_the_estimates():
     # Nearly squares, for which the covariance is exact.
-    config = bundle.Config(robust_px=50.0, noise_px=NOISE_PX)
+    config = bundle.BundleAdjustmentConfig(robust_px=50.0, noise_px=NOISE_PX)
     estimates = [bundle.adjust(problem(seed=seed), PRIOR, config) for seed in range(60)]
     predicted = bundle.covariance(estimates[0], PRIOR, config)
     true = problem()

@@ -14,7 +14,7 @@ from tests.recon.registration.test_bundle import problem
 
 NOISE_PX, SIGMAS = 0.5, np.array([np.radians(0.1), 0.004])
 TOLD = bundle.LensPrior(np.log([900.0]), np.zeros(1), np.zeros((1, 2)), np.zeros(1))
-LOSS = bundle.Config(robust_px=1e3, noise_px=NOISE_PX, tolerance=1e-12)
+LOSS = bundle.BundleAdjustmentConfig(robust_px=1e3, noise_px=NOISE_PX, tolerance=1e-12)
 
 
 def given_poses(true: bundle.Problem, seed: int) -> bundle.GivenPoses:

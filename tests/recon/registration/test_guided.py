@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.given_pose import given_pose
+from splatnode.capture.given_pose import make_given_pose
 from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
 from splatnode.recon.registration import guided
-from splatnode.recon.registration.known_poses import given_by
+from splatnode.recon.registration.known_poses import collect_known_poses
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 350.0
 
@@ -32,21 +32,21 @@ def keyframes(shared: int, seed: int = 0) -> list[Keyframe]:
         image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
         lens = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, "given")
         frame = Frame(index, f"{index}.png", index, image, lens)
-        found.append(Keyframe(replace(frame, given_pose=given_pose(T, 0.001, 0.1)), image, features))
+        found.append(Keyframe(replace(frame, given_pose=make_given_pose(T, 0.001, 0.1)), image, features))
     return found
 
 
 def test_features_along_the_lines_match_and_nothing_beside_them_does() -> None:
     both = keyframes(shared=150)
-    given = given_by(both)
+    given = collect_known_poses(both)
     assert given is not None
-    found = guided.with_more(both, {}, given)[0, 1]
+    found = guided.add_guided_matches(both, {}, given)[0, 1]
     right = found.matches[:, 0] == found.matches[:, 1]
     assert len(found.matches) > 130 and right.mean() > 0.9
 
 
 def test_images_that_share_nothing_get_no_matches() -> None:
     both = keyframes(shared=0)
-    given = given_by(both)
+    given = collect_known_poses(both)
     assert given is not None
-    assert guided.with_more(both, {}, given) == {}
+    assert guided.add_guided_matches(both, {}, given) == {}

@@ -17,7 +17,7 @@ from tests.support.synthetic import photographs, renumbered, view_graph
 
 def registered(images: list[npt.NDArray[np.uint8]]) -> Registration:
     graph = view_graph(renumbered(images))
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None and len(registration.cameras) == len(images)
     return registration
 

@@ -12,7 +12,7 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching import two_view
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, epipolar, focal, mapper, resection, tracks, triangulation
-from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, PartialMap, View
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
 
 FOCAL = 900.0
 SIZE = (1024, 768)
@@ -77,15 +77,15 @@ def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, i
             wrong = generator.integers(0, len(taken.pixels[i]), (int(share_wrong * len(common)), 2))
             matches = np.concatenate([np.stack([common, common], 1), wrong])
             points1, points2 = taken.pixels[i][matches[:, 0]], taken.pixels[j][matches[:, 1]]
-            pair, _ = two_view.estimate(points1, points2, matches, SIZE, two_view.Config())
+            pair, _ = two_view.estimate(points1, points2, matches, SIZE, two_view.TwoViewConfig())
             if pair is not None:
                 pairs[i, j] = pair
     return pairs
 
 
 def built(taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tuple[float, ...]) -> mapper.Map:
-    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
-    found = mapper.build_map(views, [Lens(focals, 0.3)], pairs, mapper.Config())
+    views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
+    found = mapper.build_map(views, [Lens(focals, 0.3)], pairs, mapper.MapperConfig())
     assert found is not None
     return found
 
@@ -133,7 +133,7 @@ def test_unrelated_points_are_no_pair():
     generator = np.random.default_rng(0)
     points1, points2 = ((generator.random((300, 2)) - 0.5) * SIZE for _ in range(2))
     matches = np.stack([np.arange(300)] * 2, 1)
-    assert two_view.estimate(points1, points2, matches, SIZE, two_view.Config())[0] is None
+    assert two_view.estimate(points1, points2, matches, SIZE, two_view.TwoViewConfig())[0] is None
 
 
 def test_a_camera_that_only_turned_is_told():
@@ -142,7 +142,7 @@ def test_a_camera_that_only_turned_is_told():
     turned = rays @ cv2.Rodrigues(np.array([0.02, 0.15, 0.0]))[0].T
     points1, points2 = rays[:, :2] * FOCAL, turned[:, :2] / turned[:, 2:] * FOCAL
     points2 = points2 + generator.normal(size=points2.shape) * NOISE_PX
-    pair, _ = two_view.estimate(points1, points2, np.stack([np.arange(300)] * 2, 1), SIZE, two_view.Config())
+    pair, _ = two_view.estimate(points1, points2, np.stack([np.arange(300)] * 2, 1), SIZE, two_view.TwoViewConfig())
     assert pair is not None
     assert pair.is_pure_rotation
     assert pair.rotation_focal_ratio == pytest.approx(FOCAL / SIZE[0], rel=0.1)
@@ -196,8 +196,8 @@ def test_a_lens_of_which_little_is_told_is_taken_for_one_that_bends_no_lines(tak
 
 
 def test_what_is_known_of_a_lens_stays(taken, pairs):
-    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
-    found = mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, mapper.Config())
+    views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
+    found = mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, mapper.MapperConfig())
     assert found is not None
     assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
     assert not found.estimate.radials.any() and np.abs(found.estimate.shifts).max() == 0.0
@@ -209,8 +209,8 @@ def test_a_pair_that_shows_a_double_does_not_bend_the_map(taken, pairs):
     lying = compared(elsewhere)[0, 4]
     points = [np.concatenate([own, other]) for own, other in zip(taken.pixels, elsewhere.pixels, strict=True)]
     spoiled = {**pairs, (0, 4): replace(lying, matches=lying.matches + len(taken.pixels[0]))}
-    views = [View(of_view, 0, max(SIZE)) for of_view in points]
-    found = mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, mapper.Config())
+    views = [MapperView(of_view, 0, max(SIZE)) for of_view in points]
+    found = mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, mapper.MapperConfig())
     assert found is not None
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 0.3 and centre < 0.02
@@ -221,7 +221,7 @@ def test_a_view_that_shares_a_handful_of_points_is_placed_by_its_pair():
     taken = photographed(num_views=3, num_points=600)
     point = np.arange(600)
     seen = taken.visible & np.stack([point < 310, point >= 0, point >= 290])
-    assert 5 <= seen.all(0).sum() < resection.Config().min_points
+    assert 5 <= seen.all(0).sum() < resection.ResectionConfig().min_points
     apart = Photographed(taken.rotations, taken.translations, taken.pixels, seen)
     chain = {key: pair for key, pair in compared(apart, share_wrong=0.0).items() if key != (0, 2)}
     found = built(taken, chain, (FOCAL,))
@@ -236,12 +236,12 @@ def test_a_view_is_placed_as_well_through_a_lens_that_is_known_to_bend_lines(rad
     (seen,) = np.nonzero(taken.visible[0])
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 3)) * [2.0, 1.4, 1.2]  # those of `photographed`
     still, lens = np.zeros((1, 3)), (np.log([FOCAL]), np.array([[radial, 0.0]]), np.zeros((1, 2)))
-    bare = bundle.without_points(np.eye(3)[None], still, np.zeros(1, int), *lens)
+    bare = bundle.make_empty_problem(np.eye(3)[None], still, np.zeros(1, int), *lens)
     prior = bundle.focal_prior(lens[0], np.ones(1))
     partial = PartialMap((), replace(bare, points=points), prior, np.arange(400))
     observed = tracks.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
-    problem = MappingProblem((), (), {}, np.ones(1), observed, observed)
-    found = resection.resect(problem, partial, 0, resection.Config())
+    problem = MapperInput((), (), {}, np.ones(1), observed, observed)
+    found = resection.resect(problem, partial, 0, resection.ResectionConfig())
     assert found is not None and found.inlier_ratio > 0.99
     assert np.linalg.norm(found.rotation.T @ found.translation + taken.Ts_world_camera[0, :3, 3]) < 0.02
 
@@ -252,14 +252,14 @@ def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
     assert np.median(ahead) == pytest.approx(0.67 * NOISE_PX, rel=0.4)
     rotations, translations = found.estimate.rotations, found.estimate.translations
     towards = rotations[3] @ rotations[0].T @ translations[0]
-    flipped = bundle.with_pose(found.estimate, 3, rotations[3], 2 * towards - translations[3])
+    flipped = bundle.replace_pose(found.estimate, 3, rotations[3], 2 * towards - translations[3])
     behind = epipolar.sampson_errors(flipped, (0, 3), pairs[0, 3])
     assert np.isinf(behind).mean() > 0.9
 
 
 def test_no_pair_gives_no_map(taken):
-    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
-    assert mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, mapper.Config()) is None
+    views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
+    assert mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, mapper.MapperConfig()) is None
 
 
 def test_tracks_join_matches_and_drop_what_contradicts_itself():

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate, estimate_cameras
-from splatnode.recon.evaluate.stability.case import frames, world
-from splatnode.recon.evaluate.stability.lens_assumptions import KINDS, keystone_corrected, with_intrinsics, zoomed
-from splatnode.recon.evaluate.stability.outcome import compare
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of
-from splatnode.recon.evaluate.stability.places import Photo
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.evaluate.stability.case import make_frames, make_world
+from splatnode.recon.evaluate.stability.lens_assumptions import KINDS, correct_keystone, set_intrinsics, zoom_image
+from splatnode.recon.evaluate.stability.outcome import score_cameras
+from splatnode.recon.evaluate.stability.own_cameras import list_registered_cameras
+from splatnode.recon.evaluate.stability.places import TrialImage
 from splatnode.recon.evaluate.truth import TrueCamera
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.registration import bundle, lenses
@@ -30,31 +30,31 @@ PLACE = synthetic.Config(views=6, width=640, height=480)
 
 
 @lru_cache(maxsize=1)
-def photographs() -> tuple[Photo, ...]:
+def photographs() -> tuple[TrialImage, ...]:
     cameras = synthetic.scene_cameras(PLACE)
     found = []
     for frame, (T_world_camera, K) in zip(synthetic.stream(PLACE), cameras, strict=True):
         found.append(
-            Photo(frame.name, frame.image, TrueCamera(T_world_camera, K, PLACE.width, PLACE.height), "built-in")
+            TrialImage(frame.name, frame.image, TrueCamera(T_world_camera, K, PLACE.width, PLACE.height), "built-in")
         )
     return tuple(found)
 
 
-def estimate(photos: Sequence[Photo]) -> Estimate:
-    return estimate_cameras(view_graph(frames(photos)), (), Config())
+def estimate(photos: Sequence[TrialImage]) -> Reconstruction:
+    return estimate_cameras(view_graph(make_frames(photos)), (), ReconstructionConfig())
 
 
-def check_within_bounds(photos: Sequence[Photo], found: Estimate) -> None:
-    cameras = cameras_of(found)
+def check_within_bounds(photos: Sequence[TrialImage], found: Reconstruction) -> None:
+    cameras = list_registered_cameras(found)
     assert found.verdict.publishable, found.verdict.message
     assert len(cameras) == len(photos)
-    score = compare(cameras, (world(photos),))
+    score = score_cameras(cameras, (make_world(photos),))
     for error in score.errors:
-        for what, (size, bound) in error.claimed().items():
+        for what, (size, bound) in error.pair_with_bounds().items():
             assert size <= 1.5 * bound, (error.name, what, size, bound)
 
 
-def own(found: Estimate) -> list[str]:
+def own(found: Reconstruction) -> list[str]:
     assert found.registration is not None
     return [found.graph.names[camera.index] for camera in found.registration.cameras if camera.own_lens]
 
@@ -67,7 +67,7 @@ def test_images_of_one_lens_keep_it():
 
 @pytest.mark.parametrize("factor", [1.05, 1.3, 2.0])
 def test_a_digitally_zoomed_image_gets_a_lens_of_its_own(factor):
-    photos = [zoomed(photo, factor) if index == 3 else photo for index, photo in enumerate(photographs())]
+    photos = [zoom_image(photo, factor) if index == 3 else photo for index, photo in enumerate(photographs())]
     found = estimate(photos)
     check_within_bounds(photos, found)
     assert photos[3].name in own(found)
@@ -75,8 +75,8 @@ def test_a_digitally_zoomed_image_gets_a_lens_of_its_own(factor):
 
 @pytest.mark.parametrize("setting", ["exif", "given"])
 def test_an_image_that_contradicts_what_is_told_gets_a_lens_of_its_own(setting):
-    told = with_intrinsics(photographs(), setting)
-    photos = [zoomed(photo, 1.1) if index == 2 else photo for index, photo in enumerate(told)]
+    told = set_intrinsics(photographs(), setting)
+    photos = [zoom_image(photo, 1.1) if index == 2 else photo for index, photo in enumerate(told)]
     found = estimate(photos)
     check_within_bounds(photos, found)
     assert own(found) == [photos[2].name]
@@ -89,7 +89,7 @@ def test_what_no_image_shares_is_found(kind):
 
 
 def test_a_principal_point_that_all_images_have_elsewhere_is_found():
-    photos = [keystone_corrected(photo, 8.0) for photo in photographs()]
+    photos = [correct_keystone(photo, 8.0) for photo in photographs()]
     found = estimate(photos)
     assert found.registration is not None
     for camera in found.registration.cameras:
@@ -108,7 +108,7 @@ def test_tied_lenses_share_what_is_not_refuted():
         np.full(count, 0.5),
         np.zeros((count, 2)),
         np.zeros(count),
-        ties=bundle.Ties(np.array([-1, 0, -1]), sigmas),
+        ties=bundle.LensTies(np.array([-1, 0, -1]), sigmas),
     )
     covariance = np.linalg.inv(prior.information[::6, ::6])
     apart = np.array([1.0, -1.0, 0.0])
@@ -128,7 +128,7 @@ def test_a_group_has_the_covariance_of_common_and_own():
         np.full(count, own_sigma),
         np.zeros((count, 2)),
         np.zeros(count),
-        common=bundle.Common(np.zeros(count, np.int64), common),
+        common=bundle.CommonLensPrior(np.zeros(count, np.int64), common),
     )
     covariance = np.linalg.inv(prior.information[::6, ::6])
     assert np.allclose(covariance, own_sigma**2 * np.eye(count) + common_sigma**2)
@@ -137,7 +137,7 @@ def test_a_group_has_the_covariance_of_common_and_own():
 
 def test_what_is_not_refuted_widens_the_covariance():
     """A lens that is taken to be common may differ a little from image to image."""
-    graph, settings = view_graph(frames(photographs())), Config().registration
+    graph, settings = view_graph(make_frames(photographs())), ReconstructionConfig().registration
     tight = msgspec.structs.replace(settings.mapper.own_lenses, focal_sigma=1e-5, shift_sigma=1e-5, radial_sigma=1e-5)
     sure = msgspec.structs.replace(settings, mapper=msgspec.structs.replace(settings.mapper, own_lenses=tight))
     wide, narrow = (register(graph.keyframes, graph.pairs, each) for each in (settings, sure))
@@ -149,7 +149,7 @@ def test_what_is_not_refuted_widens_the_covariance():
 
 def test_images_of_different_cameras_share_no_lens():
     cameras = ("a", "a", "", "b", "b", "")
-    named = [replace(frame, camera=camera) for frame, camera in zip(frames(photographs()), cameras, strict=True)]
+    named = [replace(frame, camera=camera) for frame, camera in zip(make_frames(photographs()), cameras, strict=True)]
     keyframes = [Keyframe(frame, frame.image, Features(*(np.zeros(0),) * 4)) for frame in named]
     lens_of = lenses.group(keyframes, across_sizes=True).lens_of
     assert lens_of[0] == lens_of[1] == lens_of[2] and lens_of[3] == lens_of[4] != lens_of[0]

@@ -21,7 +21,7 @@ from tests.support.synthetic import photographs, renumbered, view_graph
 def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
     place = synthetic.Config(views=3, width=320, height=240)
     blank = np.full((200, 300, 3), 128, np.uint8)
-    config, settings = register.Config(), matching.Config()
+    config, settings = register.RegistrationConfig(), matching.MatchingConfig()
     frames = [*synthetic.stream(place), Frame(3, "another size", 3, blank, None)]
     keyframes = [Keyframe(frame, frame.image, features.extract(frame.image, settings.features)) for frame in frames]
     graph = match(keyframes, settings)
@@ -41,7 +41,7 @@ def test_a_focal_length_without_a_variance_is_infinitely_uncertain(monkeypatch, 
         return replace(found, log_focals=np.full_like(found.log_focals, variance))
 
     monkeypatch.setattr(bundle, "covariance", broken)
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None and registration.focal_sigma == np.inf
 
 

@@ -9,18 +9,18 @@ import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.registration.straightened import (
     LEAST_SHIFT,
+    apply_known_lenses,
     corner_shift,
     radial_of,
-    straight,
-    straightened,
-    with_lenses,
+    undistort_keyframe,
+    undistort_keyframes,
 )
 from tests.support.row_of_views import NO_FEATURES, graph_of, registration_of
 
@@ -46,7 +46,7 @@ def seen(lens: Intrinsics) -> tuple[ViewGraph, Registration, np.ndarray]:
     points = np.column_stack([generator.uniform(-0.6, 0.6, (400, 2)) * (1.0, 0.75), np.ones(400)]) * 3.0
     pixels = opencv.project(points, lens)
     features = Features(pixels, np.zeros((0, 128), np.uint8), np.zeros(0, np.int64), np.zeros(0))
-    graph = ViewGraph(matching.Config(), (Keyframe(frame, frame.image, features),))
+    graph = ViewGraph(matching.MatchingConfig(), (Keyframe(frame, frame.image, features),))
     camera = replace(
         registration_of(1).cameras[0],
         focal=lens.fx,
@@ -75,7 +75,7 @@ def test_a_corner_moves_by_the_cube_of_its_slope():
 
 def test_observations_are_those_of_the_pinhole():
     graph, registration, points = seen(LENS)
-    straight_graph, found = straightened(graph, registration)
+    straight_graph, found = undistort_keyframes(graph, registration)
     (keyframe,), (camera,) = straight_graph.keyframes, found.cameras
     lens = keyframe.lens
     assert lens == LENS and not camera.radial.any()
@@ -91,7 +91,7 @@ def test_observations_are_those_of_the_pinhole():
 
 def test_the_photograph_is_that_of_the_pinhole():
     graph, registration, _ = seen(LENS)
-    keyframe = straightened(graph, registration)[0].keyframes[0]
+    keyframe = undistort_keyframes(graph, registration)[0].keyframes[0]
     true, before = pattern(keyframe.frame.intrinsics), graph.keyframes[0].image
     errors, others = (np.abs(image.astype(float) - true).mean() for image in (keyframe.image, before))
     assert keyframe.image.shape == true.shape and errors < 1.0 < 5.0 < others
@@ -103,10 +103,10 @@ def test_a_large_photograph_and_its_mask_are_straightened_at_twice_the_modelled_
     mask[50:70, 70:90] = False
     small = np.ascontiguousarray(frame.image[1::4, 1::4])
     known = Keyframe(replace(frame, mask=mask), small, NO_FEATURES)
-    found = straight(known, LENS)
+    found = undistort_keyframe(known, LENS)
     assert found.image.shape == small.shape and (found.frame.width, found.frame.height) == (80, 60)
     assert found.mask is not None and 0.8 < found.mask.mean() < 1.0
-    exact = undistorted(replace(frame, intrinsics=LENS))
+    exact = undistort_frame(replace(frame, intrinsics=LENS))
     assert found.frame.intrinsics.fx == pytest.approx(exact.intrinsics.fx / 2, rel=1e-3)
 
 
@@ -115,14 +115,14 @@ def test_nothing_changes_where_the_shift_is_small(radial):
     lens = replace(LENS, distortion=(radial, 0.0))
     assert abs(corner_shift(lens)) < LEAST_SHIFT
     graph, registration, _ = seen(lens)
-    same = straightened(graph, registration)
+    same = undistort_keyframes(graph, registration)
     assert same[0] is graph and same[1] is registration
 
 
 def test_a_lens_that_folds_the_picture_over_is_not_believed(caplog):
     graph, registration, _ = seen(LENS)
     folds = replace(registration, cameras=(replace(registration.cameras[0], radial=np.array([-3.0, 0.0])),))
-    found = straightened(graph, folds)
+    found = undistort_keyframes(graph, folds)
     assert found[0] is graph and found[1] is folds
     assert "stay as they are" in caplog.text
 
@@ -130,7 +130,7 @@ def test_a_lens_that_folds_the_picture_over_is_not_believed(caplog):
 def test_only_the_photographs_of_a_bending_lens_are_straightened():
     graph, registration = graph_of(2), registration_of(2)
     cameras = registration.cameras[0], replace(registration.cameras[1], radial=np.array([-0.4, 0.0]))
-    found, straight_registration = straightened(graph, replace(registration, cameras=cameras))
+    found, straight_registration = undistort_keyframes(graph, replace(registration, cameras=cameras))
     assert found.keyframes[0] is graph.keyframes[0] and straight_registration.cameras[0] is cameras[0]
     assert found.keyframes[1].lens is not None and isinstance(found.keyframes[1].frame, Frame)
 
@@ -140,7 +140,7 @@ def test_a_known_lens_is_that_of_all_cameras_that_share_it():
     *shared, other = registration.cameras
     apart = replace(registration, cameras=(*shared, replace(other, lens=1)))
     lens = Intrinsics(64, 48, 80.0, 80.0, 33.0, 23.0, "estimated", (-0.4, 0.0, 0.0, 0.0))
-    found = with_lenses(apart, graph, {"00.png": lens, "02.png": None}).cameras
+    found = apply_known_lenses(apart, graph, {"00.png": lens, "02.png": None}).cameras
     known = [(camera.focal, *camera.principal, *camera.radial) for camera in found[:2]]
     assert known == [(40.0, 16.5, 11.5, -0.4, 0.0)] * 2
     assert found[2] is apart.cameras[2]

@@ -66,12 +66,12 @@ def problem(noise_px: float, views: tuple[int, ...] = (0, 1, 2)) -> bundle.Probl
 @pytest.fixture(scope="module")
 def images() -> list[PatchImage]:
     middle = np.array(SIZE) / 2.0
-    return [patch_image.patch_image(image, middle, patch_image.Config()) for image in photographs()]
+    return [patch_image.patch_image(image, middle, patch_image.PatchImageConfig()) for image in photographs()]
 
 
 def test_noisy_observations_become_exact(images):
     noisy = problem(noise_px=0.5)
-    refined = subpixel.refine(noisy, (0, 1, 2), images, subpixel.Config())
+    refined = subpixel.refine(noisy, (0, 1, 2), images, subpixel.SubpixelConfig())
     assert len(refined.points) > 70
     assert np.median(bundle.reprojection_errors(noisy)[noisy.camera_of != 1]) > 0.4
     aligned = bundle.reprojection_errors(refined)[refined.camera_of != 1]
@@ -79,12 +79,12 @@ def test_noisy_observations_become_exact(images):
 
 
 def test_points_are_found_in_a_view_that_had_not_matched_them(images):
-    refined = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1, 2), images, subpixel.Config())
+    refined = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1, 2), images, subpixel.SubpixelConfig())
     in_third = refined.camera_of == 2
     assert in_third.sum() > 60
     # The reference is camera 0 or 1: where that observation is noisy, the point itself is.
     assert np.median(bundle.reprojection_errors(refined)[in_third]) < 0.5
-    not_registered = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1), images, subpixel.Config())
+    not_registered = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1), images, subpixel.SubpixelConfig())
     assert (not_registered.camera_of != 2).all()
 
 
@@ -93,7 +93,7 @@ def test_observations_of_something_else_are_left_out(images):
     generator = np.random.default_rng(3)
     wrong = (start.camera_of == 2) & (start.point_of < 40)
     pixels = np.where(wrong[:, None], generator.uniform(-80, 80, start.pixels.shape), start.pixels)
-    refined = subpixel.refine(replace(start, pixels=pixels), (0, 1, 2), images, subpixel.Config())
+    refined = subpixel.refine(replace(start, pixels=pixels), (0, 1, 2), images, subpixel.SubpixelConfig())
     assert (bundle.reprojection_errors(refined) < 1.0).mean() > 0.97
     assert (np.diff(refined.point_of) >= 0).all()
     assert np.bincount(refined.point_of).min() >= 2
@@ -122,7 +122,7 @@ def test_the_affine_of_a_plane_is_the_derivative_of_its_projection():
 
 def test_large_images_are_shrunk_and_pixels_with_them():
     image = np.zeros((1000, 2000, 3), np.uint8)
-    shrunk = patch_image.patch_image(image, np.array([990.0, 505.0]), patch_image.Config(max_longer_side=500))
+    shrunk = patch_image.patch_image(image, np.array([990.0, 505.0]), patch_image.PatchImageConfig(max_longer_side=500))
     assert shrunk.grey.shape == (250, 500)
-    np.testing.assert_allclose(shrunk.to_grey(np.array([[10.0, -5.0]])), [[250.0, 125.0]])
-    np.testing.assert_allclose(shrunk.from_grey(np.array([[250.0, 125.0]])), [[10.0, -5.0]])
+    np.testing.assert_allclose(shrunk.map_to_grey(np.array([[10.0, -5.0]])), [[250.0, 125.0]])
+    np.testing.assert_allclose(shrunk.map_from_grey(np.array([[250.0, 125.0]])), [[10.0, -5.0]])

@@ -10,13 +10,15 @@ import pytest
 
 from splatnode.recon.geometry import Similarity, umeyama
 from splatnode.recon.registration import bundle, mapper, own_lenses, register, uncertainty
-from splatnode.recon.registration.register import in_first_camera
-from splatnode.recon.result.bounds import axes_of
+from splatnode.recon.registration.register import make_registration
+from splatnode.recon.result.bounds import compute_axes
 from tests.recon.registration.test_bundle import NOISE_PX, PRIOR, problem
 from tests.support.row_of_views import graph_of
 
-CONFIG = bundle.Config(robust_px=50.0, noise_px=NOISE_PX)  # nearly squares, for which the covariance is exact
-QUIET = bundle.Config(
+CONFIG = bundle.BundleAdjustmentConfig(
+    robust_px=50.0, noise_px=NOISE_PX
+)  # nearly squares, for which the covariance is exact
+QUIET = bundle.BundleAdjustmentConfig(
     robust_px=50.0, noise_px=0.05, tolerance=1e-9
 )  # errors so small that they are linear in the noise
 FIXED_LENS = bundle.LensPrior(np.log([900.0]), np.zeros(1), np.zeros((1, 2)), np.zeros(1))
@@ -64,13 +66,13 @@ def test_ellipsoids_of_cameras_that_know_their_depth_least_lie_along_the_view():
     """Translations are noisy along z of each camera, and centres so along its view; a similarity takes little out."""
     generator = np.random.default_rng(0)
     rotations = np.stack([cv2.Rodrigues(vector)[0] for vector in generator.normal(size=(30, 3))])
-    ring = bundle.without_points(
+    ring = bundle.make_empty_problem(
         rotations, generator.normal(size=(30, 3)), np.zeros(30, np.int64), np.zeros(1), *np.zeros((2, 1, 2))
     )
     of_pose = np.diag(np.square([0.0, 0.0, 0.0, 0.001, 0.001, 0.01]))
     covariance = bundle.Covariance(np.kron(np.eye(30), of_pose), np.zeros(1))
     for rotation, of_centre in zip(rotations, uncertainty.centre_covariances(ring, covariance, range(30)), strict=True):
-        longest, *others = np.array(axes_of(of_centre, 0.02))
+        longest, *others = np.array(compute_axes(of_centre, 0.02))
         assert abs(rotation[2] @ longest) > 0.95 * np.linalg.norm(longest)
         assert np.linalg.norm(longest) > 2.0 * max(np.linalg.norm(other) for other in others)
 
@@ -87,10 +89,10 @@ def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
         points=turn(true.points),
     )
     keyframes = graph_of(4).keyframes
-    sure = own_lenses.Config(focal_sigma=0.0, shift_sigma=0.0, radial_sigma=0.0)
-    config = register.Config(mapper=mapper.Config(own_lenses=sure))
+    sure = own_lenses.OwnLensesConfig(focal_sigma=0.0, shift_sigma=0.0, radial_sigma=0.0)
+    config = register.RegistrationConfig(mapper=mapper.MapperConfig(own_lenses=sure))
     one, other = (
-        in_first_camera(mapper.Map(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3, 1), keyframes, [1.0] * 4, config)
+        make_registration(mapper.Map(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3, 1), keyframes, [1.0] * 4, config)
         for of in (true, moved)
     )
     inside = uncertainty.centre_covariances(true, bundle.covariance(true, FIXED_LENS, QUIET), ALL)

@@ -8,17 +8,22 @@ import msgspec
 import pytest
 
 from splatnode.capture.messaging.wire import Header, WireError, decode, encode
-from splatnode.recon.result.consistent_depth import ADVICE, Config, percent, with_consistent_depth
-from splatnode.recon.result.depth_message import DepthHeader, depth_header, with_depth
+from splatnode.recon.result.consistent_depth import (
+    ADVICE,
+    ConsistentDepthConfig,
+    append_consistent_depth,
+    format_percent,
+)
+from splatnode.recon.result.depth_message import DepthHeader, add_depth_shares, make_depth_header
 from splatnode.recon.result.export.cameras import decode_cameras, encode_cameras
-from splatnode.recon.result.message import SceneHeader, from_message
+from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.recon.result.test_message import NUMBERED, sent, snapshot
 
 OK = Verdict(Code.OK, "All 2 photographs were placed.", "", (), publishable=True)
-LIMIT = Config(min_share=0.4)
+LIMIT = ConsistentDepthConfig(min_share=0.4)
 
 
 def shared(*shares: float | None) -> Snapshot:
@@ -34,22 +39,22 @@ def test_the_share_of_all_is_the_mean_of_the_views_and_unknown_where_one_is():
 
 
 def test_a_verdict_says_the_share_and_below_the_limit_that_other_views_are_guesses():
-    enough = with_consistent_depth(OK, 0.4, LIMIT)
+    enough = append_consistent_depth(OK, 0.4, LIMIT)
     assert enough.message == f"{OK.message} Other views confirm the depth of 40 % of the pixels."
     assert enough.advice == ""
-    few = with_consistent_depth(replace(OK, advice="Lock exposure."), 0.399, LIMIT)
+    few = append_consistent_depth(replace(OK, advice="Lock exposure."), 0.399, LIMIT)
     assert few.message == (
         f"{OK.message} Other views confirm the depth of only 39 % of the pixels: "
         "views away from the cameras are guesses."
     )
     assert few.advice == f"Lock exposure. {ADVICE}" and few.code is Code.OK and few.publishable
     refused = Verdict(Code.NO_OVERLAP, "They share nothing.", "Take others.")
-    assert with_consistent_depth(refused, 0.1, LIMIT) is refused and with_consistent_depth(OK, None, LIMIT) is OK
+    assert append_consistent_depth(refused, 0.1, LIMIT) is refused and append_consistent_depth(OK, None, LIMIT) is OK
 
 
 @pytest.mark.parametrize(("share", "words"), [(0.0, "0 %"), (0.29, "29 %"), (0.999, "99 %"), (1.0, "100 %")])
 def test_a_share_is_rounded_down(share, words):
-    assert percent(share) == words
+    assert format_percent(share) == words
 
 
 def test_the_report_and_the_cameras_file_tell_the_share_of_each_view_and_of_all():
@@ -98,17 +103,17 @@ def test_an_older_viewer_takes_the_scene_and_a_newer_one_joins_the_shares_to_it(
     message = sent(made)
     before = [bytes(part) for part in encode(message.header, message.arrays)]
     assert len(decode(before, SceneHeaderBefore).header.cameras) == 3
-    received = from_message(decode(before, SceneHeader)).snapshot
+    received = decode_snapshot(decode(before, SceneHeader)).snapshot
     assert received.consistent_depth is None
-    depth = depth_header(made, "scene-0002", message.header.sequence, NUMBERED)
+    depth = make_depth_header(made, "scene-0002", message.header.sequence, NUMBERED)
     parts = [bytes(part) for part in encode(depth)]
-    joined = with_depth(received, decode(parts, DepthHeader).header)
+    joined = add_depth_shares(received, decode(parts, DepthHeader).header)
     assert [camera.consistent_depth for camera in joined.cameras] == [0.25, None, 0.75]
 
 
 @pytest.mark.parametrize("wrong", [{"consistent_depth": 1.5}, {"views": [("a", -0.1)]}, {"scene_sequence": -1}])
 def test_a_share_beyond_its_range_is_refused(wrong):
-    header = depth_header(shared(0.5), "scene-0001", 7, NUMBERED)
+    header = make_depth_header(shared(0.5), "scene-0001", 7, NUMBERED)
     fields = msgspec.to_builtins(header) | wrong
     with pytest.raises(WireError):
         decode([bytes(part) for part in encode(msgspec.defstruct("Any", list(fields))(**fields))], DepthHeader)

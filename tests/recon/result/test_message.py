@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame, Intrinsics
-from splatnode.capture.messaging.jpeg import to_jpeg
+from splatnode.capture.messaging.jpeg import make_jpeg_array
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_record, from_message, to_message
+from splatnode.recon.result.message import (
+    CameraRecord,
+    SceneHeader,
+    decode_snapshot,
+    encode_snapshot,
+    make_camera_record,
+)
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -68,13 +74,13 @@ def snapshot(cameras: int = 3, count: int = 10) -> Snapshot:
 
 
 def sent(scene: Snapshot) -> Message[SceneHeader]:
-    header, arrays = to_message(scene, "scene-0002", NUMBERED)
+    header, arrays = encode_snapshot(scene, "scene-0002", NUMBERED)
     return decode([bytes(part) for part in encode(header, arrays)], SceneHeader)
 
 
 def test_a_scene_comes_out_as_it_went_in():
     scene = snapshot()
-    live = from_message(sent(scene))
+    live = decode_snapshot(sent(scene))
     assert (live.scene_id, live.session) == ("scene-0002", NUMBERED["session"])
     assert live.snapshot.verdict == scene.verdict and live.snapshot.dropped == scene.dropped
     assert (live.snapshot.sequence, live.snapshot.iterations, live.snapshot.final) == (7, 50, True)
@@ -95,9 +101,9 @@ def test_a_camera_tells_the_lens_that_was_taken_out_of_its_photograph():
     scene = snapshot()
     lens = Intrinsics(1280, 800, 900.0, 900.0, 640.0, 400.0, "estimated", (-0.2,))
     first, *others = scene.cameras
-    live = from_message(sent(replace(scene, cameras=(replace(first, lens=lens), *others)))).snapshot
+    live = decode_snapshot(sent(replace(scene, cameras=(replace(first, lens=lens), *others)))).snapshot
     assert [camera.lens for camera in live.cameras] == [lens, *(None for _ in others)]
-    plain, _ = to_message(scene, "scene-0002", NUMBERED)
+    plain, _ = encode_snapshot(scene, "scene-0002", NUMBERED)
     assert "lens" not in msgspec.to_builtins(plain.cameras[0])  # as a viewer that knows none expects it
 
 
@@ -109,21 +115,21 @@ def test_a_camera_tells_the_lens_that_was_taken_out_of_its_photograph():
     ],
 )
 def test_metres_and_the_reason_why_there_are_none_come_out_as_they_went_in(scale):
-    assert from_message(sent(replace(snapshot(), scale=scale))).snapshot.scale == scale
+    assert decode_snapshot(sent(replace(snapshot(), scale=scale))).snapshot.scale == scale
 
 
 def test_a_relative_scene_is_the_message_of_a_splatnode_that_knows_no_live_metres():
-    header, arrays = to_message(snapshot(), "scene-0002", NUMBERED)
+    header, arrays = encode_snapshot(snapshot(), "scene-0002", NUMBERED)
     fields, _ = msgspec.msgpack.decode(encode(header, arrays)[1])
     assert "scale" not in fields
-    assert from_message(sent(snapshot())).snapshot.scale == RELATIVE
+    assert decode_snapshot(sent(snapshot())).snapshot.scale == RELATIVE
 
 
 def test_a_viewer_of_before_live_metres_refuses_a_metric_scene_with_a_sentence():
     earlier = without(SceneHeader, "scale")
     metric = replace(snapshot(), scale=Scale(True, "marker 0 of 100 mm", (0.98, 1.02)))
     relative, new = (
-        encode(*to_message(scene, "scene-0002", NUMBERED)) for scene in (replace(metric, scale=RELATIVE), metric)
+        encode(*encode_snapshot(scene, "scene-0002", NUMBERED)) for scene in (replace(metric, scale=RELATIVE), metric)
     )
     assert decode(relative, earlier).header.publishable
     with pytest.raises(WireError, match="^header refused: Object contains unknown field `scale`"):
@@ -132,7 +138,7 @@ def test_a_viewer_of_before_live_metres_refuses_a_metric_scene_with_a_sentence()
 
 def test_thumbnails_are_small_and_look_like_the_photograph():
     scene = snapshot()
-    images = from_message(sent(scene)).snapshot.images
+    images = decode_snapshot(sent(scene)).snapshot.images
     assert list(images) == list(scene.images)
     for name, image in images.items():
         assert image.shape == (200, 320, 3)
@@ -141,7 +147,7 @@ def test_thumbnails_are_small_and_look_like_the_photograph():
 
 def test_a_scene_that_may_not_be_shown_is_a_message_too():
     refused = Snapshot(1, Verdict(Code.TOO_FEW_VIEWS, "One.", "More."), (), GaussianArrays.empty(), {}, (), 0)
-    live = from_message(sent(refused))
+    live = decode_snapshot(sent(refused))
     assert len(live.snapshot.gaussians) == 0 and not live.snapshot.verdict.publishable
 
 
@@ -154,15 +160,18 @@ def test_a_scene_that_may_not_be_shown_is_a_message_too():
         (lambda arrays: [arrays[0], arrays[1][:-1], *arrays[2:]], "quats"),
         (lambda arrays: [*arrays[:5], arrays[5].astype(np.int64), *arrays[6:]], "source_frame"),
         (lambda arrays: [*arrays[:-1], np.zeros((100, 100, 3), np.uint8)], "bytes of a JPEG"),
-        (lambda arrays: [*arrays[:-1], to_jpeg(np.zeros((321, 320, 3), np.uint8), 50)], "more than 102400 pixels"),
-        (lambda arrays: [*arrays[:-1], to_jpeg(np.zeros((321, 10, 3), np.uint8), 50)], "at most 320 pixels"),
+        (
+            lambda arrays: [*arrays[:-1], make_jpeg_array(np.zeros((321, 320, 3), np.uint8), 50)],
+            "more than 102400 pixels",
+        ),
+        (lambda arrays: [*arrays[:-1], make_jpeg_array(np.zeros((321, 10, 3), np.uint8), 50)], "at most 320 pixels"),
         (lambda arrays: [*arrays[:-1], np.zeros(50, np.uint8)], "cannot be shown"),
     ],
 )
 def test_arrays_that_do_not_belong_to_the_header_are_refused(change, words):
-    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
+    header, arrays = encode_snapshot(snapshot(), "scene-0001", NUMBERED)
     with pytest.raises(WireError, match=words):
-        from_message(Message(header, tuple(change(arrays))))
+        decode_snapshot(Message(header, tuple(change(arrays))))
 
 
 LEAVES = {
@@ -195,7 +204,7 @@ LEAVES = {
 
 def header_with(path: str, value: object) -> list[bytes]:
     """The parts of a scene whose header has this value in this place."""
-    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
+    header, arrays = encode_snapshot(snapshot(), "scene-0001", NUMBERED)
     parts = [bytes(part) for part in encode(header, arrays)]
     envelope = msgspec.msgpack.decode(parts[1])
     *way, last = (int(step) if step.isdigit() else step for step in path.split("."))
@@ -223,26 +232,28 @@ def test_a_camera_whose_picture_nobody_could_paint_does_not_pass_the_wire():
 
 @pytest.mark.parametrize("bases", [0, 2, 3, 5, 8, 17, 25, 1000])
 def test_a_number_of_bases_that_no_degree_has_is_refused(bases):
-    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
+    header, arrays = encode_snapshot(snapshot(), "scene-0001", NUMBERED)
     arrays[4] = np.zeros((10, bases, 3), np.float32)
     with pytest.raises(WireError, match="1, 4, 9, 16 bases"):
-        from_message(Message(header, tuple(arrays)))
+        decode_snapshot(Message(header, tuple(arrays)))
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf"), 3e38, -3e38])
 @pytest.mark.parametrize("field", range(5))
 def test_a_gaussian_with_an_absurd_number_is_left_out(field, number):
-    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
+    header, arrays = encode_snapshot(snapshot(), "scene-0001", NUMBERED)
     arrays[field] = arrays[field].copy()
     arrays[field].reshape(10, -1)[3, -1] = number
-    gaussians = from_message(Message(header, tuple(arrays))).snapshot.gaussians
+    gaussians = decode_snapshot(Message(header, tuple(arrays))).snapshot.gaussians
     assert len(gaussians) == 9 and gaussians.source_frame.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
 
 
 def test_what_is_said_of_a_scene_is_cut_to_what_a_message_holds():
     long = "a\n" * 5000
     verdict = Verdict(Code.OK, long, long, ("x",) * 3000)
-    live = from_message(sent(replace(snapshot(), verdict=verdict, dropped=(DroppedFrame("", long),) * 2500))).snapshot
+    live = decode_snapshot(
+        sent(replace(snapshot(), verdict=verdict, dropped=(DroppedFrame("", long),) * 2500))
+    ).snapshot
     assert len(live.verdict.message) == 1000 and "\n" not in live.verdict.message
     assert len(live.dropped) == 200 and len(live.verdict.frames) == 1000
 
@@ -250,10 +261,10 @@ def test_what_is_said_of_a_scene_is_cut_to_what_a_message_holds():
 def test_a_bound_that_cannot_be_reckoned_with_is_refused_and_never_sent():
     scene, tiny = snapshot(1), Bounds(1e-320, 0.0, 1e-15, 1.0, ((0.0, 0.0, 0.0),) * 3)
     exact = replace(scene.cameras[0], bounds=tiny)
-    live = from_message(sent(replace(scene, cameras=(exact,))))
+    live = decode_snapshot(sent(replace(scene, cameras=(exact,))))
     bounds = live.snapshot.cameras[0].bounds
     assert bounds is not None and (bounds.rotation_deg, bounds.centre, bounds.centre_percent) == (1e-9, 0.0, 1e-9)
-    record = msgspec.to_builtins(camera_record(exact))
+    record = msgspec.to_builtins(make_camera_record(exact))
     record["bounds"]["focal_percent"] = 1e-320
     with pytest.raises(msgspec.ValidationError, match="a bound must be 0 or at least 1e-09"):
         msgspec.convert(record, CameraRecord)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.result.preview import contact_sheet, render_camera
+from splatnode.recon.result.preview import make_contact_sheet, render_camera
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 
@@ -49,7 +49,7 @@ def test_the_gaussians_are_seen_from_the_camera():
 
 
 def test_photographs_above_renders_below():
-    sheet = decoded(contact_sheet(snapshot(2), height=HEIGHT))
+    sheet = decoded(make_contact_sheet(snapshot(2), height=HEIGHT))
     assert sheet.shape == (2 * HEIGHT, 2 * WIDTH, 3)
     assert (sheet[:HEIGHT, :WIDTH] == 0).all() and (sheet[:HEIGHT, WIDTH:] == 20).all()
     assert (sheet[HEIGHT:, :WIDTH] == render_camera(ball(), snapshot(1).cameras[0])).all()
@@ -59,5 +59,5 @@ def test_photographs_above_renders_below():
     ("num_cameras", "shown"), [(3, [0, 1, 2]), (4, [0, 1, 2, 3]), (7, [0, 2, 4, 6]), (12, [0, 4, 7, 11])]
 )
 def test_from_the_first_camera_to_the_last(num_cameras, shown):
-    sheet = decoded(contact_sheet(snapshot(num_cameras), max_views=4, height=HEIGHT))
+    sheet = decoded(make_contact_sheet(snapshot(num_cameras), max_views=4, height=HEIGHT))
     assert [int(value) for value in sheet[0, WIDTH // 2 :: WIDTH, 0]] == [20 * index for index in shown]

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
-from splatnode.recon.scene.background import SHELL, Config, far_shell
+from splatnode.recon.scene.background import SHELL, BackgroundConfig, far_shell
 from splatnode.recon.scene.gaussians import Gaussians
 from tests.support.synthetic import plane_pointmap
 
@@ -41,7 +41,7 @@ def directions(gaussians: Gaussians) -> np.ndarray:
 
 
 def test_the_shell_stands_at_its_distance_and_faces_the_cameras():
-    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(distance=4.0, spacing_deg=5.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], BackgroundConfig(distance=4.0, spacing_deg=5.0))
     assert len(shell) > 50
     np.testing.assert_allclose(np.linalg.norm(shell.means.numpy(), axis=1), 4.0 * 2.0, rtol=1e-5)
     axes = Rotation.from_quat(shell.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
@@ -51,7 +51,7 @@ def test_the_shell_stands_at_its_distance_and_faces_the_cameras():
 
 
 def test_neighbours_are_about_the_spacing_apart():
-    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=6.0, elsewhere_deg=0.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], BackgroundConfig(spacing_deg=6.0, elsewhere_deg=0.0))
     cosines = directions(shell) @ directions(shell).T - 2 * np.eye(len(shell))
     nearest = np.degrees(np.arccos(cosines.max(1)))
     assert nearest.min() > 0.7 * 6 and nearest.max() < 1.3 * 6
@@ -60,7 +60,7 @@ def test_neighbours_are_about_the_spacing_apart():
 def test_it_is_close_up_to_its_margin_beyond_the_image_and_no_further():
     view = pointmap(np.eye(4))
     for margin in (0.0, 0.5):
-        alone = Config(margin=margin, spacing_deg=2.0, elsewhere_deg=0.0)
+        alone = BackgroundConfig(margin=margin, spacing_deg=2.0, elsewhere_deg=0.0)
         ray = directions(far_shell([view], [two_colours()], alone))
         u = ray[:, 0] / ray[:, 2] * view.K[0, 0] / WIDTH + 0.5
         v = ray[:, 1] / ray[:, 2] * view.K[1, 1] / HEIGHT + 0.5
@@ -70,7 +70,7 @@ def test_it_is_close_up_to_its_margin_beyond_the_image_and_no_further():
 
 
 def test_it_has_the_colour_of_the_image_there():
-    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(margin=0.0, elsewhere_deg=0.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], BackgroundConfig(margin=0.0, elsewhere_deg=0.0))
     ray = directions(shell)
     left, right = ray[:, 0] < -0.1, ray[:, 0] > 0.1
     torch.testing.assert_close(shell.rgb[left], torch.tensor([[1.0, 0, 0]]).expand(left.sum(), 3), rtol=0, atol=0.03)
@@ -80,7 +80,7 @@ def test_it_has_the_colour_of_the_image_there():
 def test_beside_the_images_it_has_their_colour_at_that_elevation():
     sky_over_grass = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     sky_over_grass[: HEIGHT // 2, :, 2], sky_over_grass[HEIGHT // 2 :, :, 1] = 255, 255
-    ray = directions(shell := far_shell([pointmap(np.eye(4))], [sky_over_grass], Config()))
+    ray = directions(shell := far_shell([pointmap(np.eye(4))], [sky_over_grass], BackgroundConfig()))
     beside = (ray[:, 0] / ray[:, 2] > 0.8) & (ray[:, 2] > 0)  # the image ends at 0.5
     sky, grass = beside & (ray[:, 1] < -0.2), beside & (ray[:, 1] > 0.2)
     assert sky.sum() > 20 and grass.sum() > 20
@@ -92,7 +92,7 @@ def test_each_direction_has_the_colour_of_the_view_that_looks_there():
     green, white = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     green[..., 1] = 255
     shell = far_shell(
-        [pointmap(turned(0)), pointmap(turned(180))], [green, white], Config(margin=0.0, elsewhere_deg=0.0)
+        [pointmap(turned(0)), pointmap(turned(180))], [green, white], BackgroundConfig(margin=0.0, elsewhere_deg=0.0)
     )
     ahead = directions(shell)[:, 2] > 0
     assert ahead.any() and (~ahead).any()
@@ -104,7 +104,7 @@ def test_each_direction_has_the_colour_of_the_view_that_looks_there():
 @pytest.mark.parametrize("pitch_deg", [0, 50, -80])
 def test_no_gap_shows_through_wherever_one_looks(yaw_deg, pitch_deg):
     view, white = pointmap(np.eye(4)), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    shell = far_shell([view], [white], Config())
+    shell = far_shell([view], [white], BackgroundConfig())
     looking = np.eye(4)
     looking[:3, :3] = Rotation.from_euler("yx", [yaw_deg, pitch_deg], degrees=True).as_matrix()
     camera = torch.from_numpy(looking).float(), torch.from_numpy(view.K).float()
@@ -113,7 +113,7 @@ def test_no_gap_shows_through_wherever_one_looks(yaw_deg, pitch_deg):
 
 
 def test_elsewhere_it_has_the_colours_of_all_images_together():
-    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config())
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], BackgroundConfig())
     behind = directions(shell)[:, 2] < -0.5
     assert 50 < behind.sum() < 150  # about 10 degrees apart
     assert (shell.rgb[behind][:, 1] < 0.01).all()
@@ -124,15 +124,15 @@ def test_elsewhere_it_has_the_colours_of_all_images_together():
 def test_a_shell_of_spacing_zero_is_left_out():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=0.0))
+        shell = far_shell([pointmap(np.eye(4))], [two_colours()], BackgroundConfig(spacing_deg=0.0))
     assert len(shell) == 0
 
 
 @pytest.mark.parametrize("most", [40, 8, 0])
 def test_a_bounded_shell_is_coarser_not_torn(most):
     views = [pointmap(turned(yaw)) for yaw in (0, 60)]
-    assert len(far_shell(views, [two_colours()] * 2, Config())) > 40
-    shell = far_shell(views, [two_colours()] * 2, Config(), max_gaussians=most)
+    assert len(far_shell(views, [two_colours()] * 2, BackgroundConfig())) > 40
+    shell = far_shell(views, [two_colours()] * 2, BackgroundConfig(), max_gaussians=most)
     assert len(shell) <= most
     if most:
         assert len(shell) >= most // 2

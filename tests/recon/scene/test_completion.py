@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.completion import Config, complete, smooth_depth
+from splatnode.recon.scene.completion import DepthCompletionConfig, complete, smooth_depth
 from tests.support.synthetic import plane_pointmap, without
 
 WIDTH, HEIGHT = 64, 48
@@ -37,7 +37,7 @@ def slanted() -> Pointmap:
 
 @pytest.mark.parametrize("pointmap", [wall(), slanted()], ids=["facing", "slanted"])
 def test_a_hole_in_a_plane_is_filled_on_the_plane(pointmap):
-    config = Config()
+    config = DepthCompletionConfig()
     (filled,) = complete([without(pointmap, HOLE)], [GREY], config)
     np.testing.assert_allclose(filled.depth[HOLE], pointmap.depth[HOLE], rtol=0.01)
     np.testing.assert_allclose(filled.confidence[HOLE], config.confidence)
@@ -47,7 +47,7 @@ def test_a_hole_in_a_plane_is_filled_on_the_plane(pointmap):
 
 
 def test_filled_pixels_have_unit_normals_that_face_the_camera():
-    (filled,) = complete([without(wall(), HOLE)], [GREY], Config())
+    (filled,) = complete([without(wall(), HOLE)], [GREY], DepthCompletionConfig())
     rays = filled.points / filled.depth[..., None]
     np.testing.assert_allclose(np.linalg.norm(filled.normal[HOLE], axis=-1), 1, rtol=1e-5)
     assert ((filled.normal * rays).sum(-1)[HOLE] < 0).all()
@@ -56,7 +56,7 @@ def test_filled_pixels_have_unit_normals_that_face_the_camera():
 def test_the_input_is_left_alone():
     holed = without(wall(), HOLE)
     before = holed.depth.copy()
-    complete([holed], [GREY], Config())
+    complete([holed], [GREY], DepthCompletionConfig())
     assert np.array_equal(holed.depth, before)
 
 
@@ -65,17 +65,17 @@ def test_depth_jumps_at_the_edge_of_the_image_not_in_the_middle_of_the_hole():
     pointmap.depth[:, 32:] = 4.0
     image[:, :32], image[:, 32:] = 20, 230
     band = box(slice(None), slice(24, 52))  # the edge, at 32, is far from its middle
-    smooth = smooth_depth(without(pointmap, band), image, Config())
+    smooth = smooth_depth(without(pointmap, band), image, DepthCompletionConfig())
     np.testing.assert_allclose(smooth[:, :30], 2.0, rtol=0.05)
     np.testing.assert_allclose(smooth[:, 34:], 4.0, rtol=0.05)
-    without_edge = smooth_depth(without(pointmap, band), GREY, Config())
+    without_edge = smooth_depth(without(pointmap, band), GREY, DepthCompletionConfig())
     assert 2.2 < without_edge[24, 32] < 3.0  # inverse depth goes evenly across
 
 
 def test_smooth_depth_stays_within_twice_what_is_known():
     steep = plane_pointmap(np.eye(4), (0.86, 0.0, -0.51), (0, 0, 2), WIDTH, HEIGHT)
     known = box(slice(None), slice(28, 36))
-    smooth = smooth_depth(without(steep, ~known), GREY, Config())
+    smooth = smooth_depth(without(steep, ~known), GREY, DepthCompletionConfig())
     assert smooth.min() >= 0.5 * steep.depth[known].min() and smooth.max() <= 2 * steep.depth[known].max() * 1.001
 
 
@@ -83,7 +83,7 @@ def test_stereos_own_doubtful_depth_comes_first():
     pointmap = wall()
     pointmap.confidence[HOLE] = 0.2
     pointmap.depth[HOLE] = 2.6
-    config = Config(min_confidence=0.3)
+    config = DepthCompletionConfig(min_confidence=0.3)
     (filled,) = complete([pointmap], [GREY], config)
     np.testing.assert_allclose(filled.depth[HOLE], 2.6)
     np.testing.assert_allclose(filled.confidence[HOLE], config.confidence)
@@ -91,7 +91,7 @@ def test_stereos_own_doubtful_depth_comes_first():
 
 def test_what_another_view_shows_is_left_empty():
     first, second = without(wall(confidence=0.9), HOLE), wall(x=0.1)
-    filled, _ = complete([first, second], [GREY, GREY], Config())
+    filled, _ = complete([first, second], [GREY, GREY], DepthCompletionConfig())
     assert not filled.depth[HOLE].any()
     np.testing.assert_allclose(filled.depth[~HOLE], 2.0)
 
@@ -108,28 +108,28 @@ def contradicted() -> tuple[Pointmap, Pointmap]:
 def test_nothing_is_filled_before_a_known_surface_of_another_view():
     holed, beyond = contradicted()
     hole = holed.depth == 0
-    filled, _ = complete([holed, beyond], [GREY, GREY], Config(background_depth=1.5))
+    filled, _ = complete([holed, beyond], [GREY, GREY], DepthCompletionConfig(background_depth=1.5))
     assert not filled.depth[hole].any()  # neither on the wall, at 2, nor at 3: both would hide what is at 4
-    (alone,) = complete([holed], [GREY], Config(background_depth=1.5))
+    (alone,) = complete([holed], [GREY], DepthCompletionConfig(background_depth=1.5))
     np.testing.assert_allclose(alone.depth[hole], 2.0, rtol=1e-3)
 
 
 def test_the_background_is_taken_where_nothing_nearer_is_possible():
     holed, beyond = contradicted()
     hole = holed.depth == 0
-    filled, _ = complete([holed, beyond], [GREY, GREY], Config(background_depth=3.0))
+    filled, _ = complete([holed, beyond], [GREY, GREY], DepthCompletionConfig(background_depth=3.0))
     np.testing.assert_allclose(filled.depth[hole], 6.0, rtol=1e-5)
 
 
 def test_a_view_that_knows_nothing_stays_empty():
     nothing = without(wall(), np.ones((HEIGHT, WIDTH), bool))
-    filled, _ = complete([nothing, wall()], [GREY, GREY], Config())
+    filled, _ = complete([nothing, wall()], [GREY, GREY], DepthCompletionConfig())
     assert not filled.depth.any() and not filled.confidence.any()
 
 
 def test_views_keep_their_order():
     pointmaps = [replace(wall(confidence=c), frame_id=i) for i, c in enumerate((0.4, 0.9, 0.6))]
-    assert [pointmap.frame_id for pointmap in complete(pointmaps, [GREY] * 3, Config())] == [0, 1, 2]
+    assert [pointmap.frame_id for pointmap in complete(pointmaps, [GREY] * 3, DepthCompletionConfig())] == [0, 1, 2]
 
 
 @pytest.mark.parametrize(("step", "depth"), [(0.9, 0.8), (0.1, 0.0)])
@@ -139,7 +139,7 @@ def test_what_stands_before_another_views_surface_is_put_close_to_the_camera(ste
     image = GREY.copy()
     image[hole] = 255, 0, 0
     pointmaps = [without(wall(confidence=0.9), hole), wall(x=step)]
-    filled, _ = complete(pointmaps, [image, GREY], Config(foreground_depth=0.4))
+    filled, _ = complete(pointmaps, [image, GREY], DepthCompletionConfig(foreground_depth=0.4))
     inside = box(slice(19, 29), slice(43, 53))
     np.testing.assert_allclose(filled.depth[inside], depth, rtol=1e-5)
     assert np.array_equal(filled.depth[~hole], pointmaps[0].depth[~hole])
@@ -149,5 +149,7 @@ def test_a_few_pixels_of_another_colour_are_noise_and_not_an_object():
     hole = box(slice(20, 23), slice(45, 48))
     image = GREY.copy()
     image[hole] = 255, 0, 0
-    filled, _ = complete([without(wall(confidence=0.9), hole), wall(x=0.9)], [image, GREY], Config(min_object_px=7))
+    filled, _ = complete(
+        [without(wall(confidence=0.9), hole), wall(x=0.9)], [image, GREY], DepthCompletionConfig(min_object_px=7)
+    )
     assert not filled.depth[hole].any()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.denied import denied
+from splatnode.recon.scene.denied import find_transient_masks
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT, DEPTH = 160, 120, 2.0
@@ -42,12 +42,12 @@ def with_thing(pictures: list[np.ndarray], which: int = 1) -> list[np.ndarray]:
 def unknown_there(pointmaps: list[Pointmap], which: int = 1) -> list[Pointmap]:
     """Stereo knows nothing of what one photograph alone shows."""
     changed = list(pointmaps)
-    changed[which] = changed[which].masked(~THING)
+    changed[which] = changed[which].apply_mask(~THING)
     return changed
 
 
 def of(pointmaps: list[Pointmap], pictures: list[np.ndarray], used: np.ndarray = WHOLE) -> list[np.ndarray | None]:
-    return denied(pointmaps, pictures, [used] * len(pointmaps))
+    return find_transient_masks(pointmaps, pictures, [used] * len(pointmaps))
 
 
 def test_a_thing_that_others_see_through_is_found_and_nothing_else():
@@ -67,7 +67,7 @@ def test_nothing_is_found_where_photographs_agree_or_where_there_are_two():
     pictures = [photograph(each) for each in maps]
     assert of(maps, pictures) == [None] * 4
     two = with_thing(pictures[:2])
-    assert denied(unknown_there(maps[:2]), two, [WHOLE] * 2) == [None, None]
+    assert find_transient_masks(unknown_there(maps[:2]), two, [WHOLE] * 2) == [None, None]
 
 
 def test_a_thing_that_may_stand_near_the_camera_stays():
@@ -77,7 +77,7 @@ def test_a_thing_that_may_stand_near_the_camera_stays():
 
 def test_a_thing_of_which_two_views_know_the_depth_stays():
     maps = wall(0.03)
-    near = [each.masked(~THING) for each in maps]
+    near = [each.apply_mask(~THING) for each in maps]
     box = [plane_pointmap(each.T_world_camera, point=(0.0, 0.0, 1.0), width=WIDTH, height=HEIGHT) for each in maps]
     known = [
         replace(each, depth=np.where(THING, other.depth, each.depth)) for each, other in zip(near, box, strict=True)

@@ -65,7 +65,7 @@ def test_concatenation_keeps_the_order_and_pads_lower_degrees_with_zeros():
 def test_a_similarity_moves_means_and_covariances():
     gaussians = tiny_scene(dtype=torch.float64).gaussians
     rotation, translation = Rotation.random(random_state=1).as_matrix(), np.array([0.3, -2.0, 5.0])
-    moved = gaussians.transformed(3.0, torch.from_numpy(rotation), torch.from_numpy(translation))
+    moved = gaussians.transform(3.0, torch.from_numpy(rotation), torch.from_numpy(translation))
     np.testing.assert_allclose(moved.means, 3.0 * gaussians.means.numpy() @ rotation.T + translation, atol=1e-12)
     np.testing.assert_allclose(covariances(moved), 9.0 * rotation @ covariances(gaussians) @ rotation.T, atol=1e-12)
     assert torch.equal(moved.sh, gaussians.sh) and torch.equal(moved.logit_opacities, gaussians.logit_opacities)
@@ -77,9 +77,7 @@ def test_a_camera_moved_along_sees_the_same_image(scale):
     # Nothing is as near as the rasteriser's near plane or as small as its least footprint, at any of these scales.
     gaussians = replace(scene.gaussians, log_scales=scene.gaussians.log_scales.clamp_min(-2.5))
     similarity = Similarity(scale, Rotation.random(random_state=5).as_matrix(), np.array([1.0, -0.5, 2.0]))
-    moved = gaussians.transformed(
-        scale, torch.from_numpy(similarity.rotation), torch.from_numpy(similarity.translation)
-    )
+    moved = gaussians.transform(scale, torch.from_numpy(similarity.rotation), torch.from_numpy(similarity.translation))
     T = scene.Ts_world_camera[0]
     T_moved = torch.from_numpy(similarity.camera(T.double().numpy())).float()
     before, after = render(scene, gaussians, T), render(scene, moved, T_moved)

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.recon.result.sources import frame_of
+from splatnode.recon.result.sources import decode_frame_id
 from splatnode.recon.scene import background, light
-from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limited, without_views
-from splatnode.recon.scene.initialisation import Config
+from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limit_gaussians, remove_views
+from splatnode.recon.scene.initialisation import SceneInitializationConfig
 from tests.support.row_of_views import STEP, WIDTH, graph_of, maps_of, registration_of, scene_of
 
-CONFIG = Config()
-LIGHT = light.Config()
+CONFIG = SceneInitializationConfig()
+LIGHT = light.ExposureConfig()
 
 
 def test_growing_adds_a_further_views_gaussians_and_leaves_all_others_as_they_are():
@@ -27,7 +27,7 @@ def test_growing_adds_a_further_views_gaussians_and_leaves_all_others_as_they_ar
     assert [view.name for view in grown.views] == ["00.png", "01.png", "02.png", "03.png"]
     assert torch.equal(grown.gaussians.means[:count], scene.gaussians.means)
     added = grown.gaussians.subset(torch.arange(count, len(grown.gaussians)))
-    assert set(frame_of(added.source_frame).tolist()) == {3}
+    assert set(decode_frame_id(added.source_frame).tolist()) == {3}
     # Only what it sees to the right of the view before it is new: a step of 0.3 at depth 2 is 5.3 of 32 columns.
     visible_before = (STEP * 2) + 2.0 * (WIDTH / 2) / (1.1 * WIDTH)
     assert len(added) > 20 and float(added.means[:, 0].min()) > visible_before - 0.3
@@ -65,7 +65,7 @@ def test_a_bound_on_gaussians_keeps_those_that_cover_most():
     graph = graph_of(4)
     scene = scene_of(3, graph)
     limit = len(scene.gaussians) // 2
-    grown = limited(grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT), limit)
+    grown = limit_gaussians(grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT), limit)
     assert len(grown.gaussians) == limit
     assert int((grown.gaussians.source_frame == background.SHELL).sum()) > 0
 
@@ -73,13 +73,13 @@ def test_a_bound_on_gaussians_keeps_those_that_cover_most():
 def test_a_view_that_goes_takes_its_gaussians_along_and_the_next_becomes_the_world():
     graph = graph_of(3)
     scene = scene_of(3, graph)
-    rest = without_views(scene, {"00.png"})
+    rest = remove_views(scene, {"00.png"})
     assert [view.name for view in rest.views] == ["01.png", "02.png"]
-    assert 0 not in frame_of(rest.gaussians.source_frame)
+    assert 0 not in decode_frame_id(rest.gaussians.source_frame)
     np.testing.assert_allclose(rest.views[0].T_world_camera, np.eye(4), atol=1e-6)
-    kept = scene.gaussians.subset(frame_of(scene.gaussians.source_frame) != 0)
+    kept = scene.gaussians.subset(decode_frame_id(scene.gaussians.source_frame) != 0)
     torch.testing.assert_close(rest.gaussians.means, kept.means - torch.tensor([STEP, 0, 0]), rtol=0, atol=1e-5)
-    assert without_views(scene, {"00.png", "01.png", "02.png"}).views == ()
+    assert remove_views(scene, {"00.png", "01.png", "02.png"}).views == ()
 
 
 def test_growing_tells_how_much_of_the_depth_further_views_confirm_and_a_view_that_goes_takes_that_along():
@@ -93,5 +93,5 @@ def test_growing_tells_how_much_of_the_depth_further_views_confirm_and_a_view_th
     again = replace(grown, views=(more, *grown.views[1:3]))
     kept = grow(again, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT)
     assert kept.views[0].consistent_depth == 0.999
-    rest = without_views(grown, {"03.png"})
+    rest = remove_views(grown, {"03.png"})
     assert [view.consistent_depth for view in rest.views] == [None] * 3

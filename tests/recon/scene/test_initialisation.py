@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.capture.process.config import typed
-from splatnode.recon.config import Config
+from splatnode.capture.process.config import parse_config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.result.sources import frame_of
+from splatnode.recon.result.sources import decode_frame_id
 from splatnode.recon.scene import background, initialisation, pixelwise
-from splatnode.recon.scene.initialisation import initial_scene
+from splatnode.recon.scene.initialisation import initialize_scene
 from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 32, 24
 
 
-def begun(max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None) -> Scene:
+def begun(max_gaussians: int | None = None, by_pixel: pixelwise.PixelwiseConfig | None = None) -> Scene:
     """Two views of a wall of noise, one step apart."""
     step = np.eye(4)
     step[0, 3] = 0.3
@@ -32,19 +32,19 @@ def begun(max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = 
 
 
 def scene_of(
-    pointmaps: tuple[Pointmap, ...], max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None
+    pointmaps: tuple[Pointmap, ...], max_gaussians: int | None = None, by_pixel: pixelwise.PixelwiseConfig | None = None
 ) -> Scene:
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     images = {pointmap.name: noise for pointmap in pointmaps}
-    config = initialisation.Config(pixelwise=by_pixel, max_gaussians=max_gaussians)
-    return initial_scene(pointmaps, images, config)
+    config = initialisation.SceneInitializationConfig(pixelwise=by_pixel, max_gaussians=max_gaussians)
+    return initialize_scene(pointmaps, images, config)
 
 
 def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they_saw():
     scene = begun()
     assert [(view.name, view.frame_id) for view in scene.views] == [("00.png", 0), ("01.png", 1)]
     assert float(scene.views[1].T_world_camera[0, 3]) == pytest.approx(0.3)
-    sources = frame_of(scene.gaussians.source_frame)
+    sources = decode_frame_id(scene.gaussians.source_frame)
     # Every pixel of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.
     assert int((sources == 0).sum()) == 32 * 24
     assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
@@ -60,29 +60,29 @@ def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_sh
     assert torch.equal(scene_of(sure).gaussians.means, scene_of(doubtful).gaussians.means)
 
 
-@pytest.mark.parametrize("by_pixel", [None, pixelwise.Config()])
+@pytest.mark.parametrize("by_pixel", [None, pixelwise.PixelwiseConfig()])
 def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkeypatch):
     right = np.broadcast_to(np.arange(WIDTH) >= 8, (HEIGHT, WIDTH))
     monkeypatch.setattr(border, "valid_masks", lambda images: [right] * len(images))
     scene = begun(by_pixel=by_pixel)
     for view in scene.views:
         assert view.pointmap is not None and not view.pointmap.depth[~right].any()
-        own = scene.gaussians.means[frame_of(scene.gaussians.source_frame) == view.frame_id]
+        own = scene.gaussians.means[decode_frame_id(scene.gaussians.source_frame) == view.frame_id]
         x, _, z = ((own - view.T_world_camera[:3, 3]) @ view.K.T).unbind(1)
         assert len(own) > 0 and bool((x / z > 7.9).all())
 
 
 @pytest.mark.parametrize("most", [None, 100])
 def test_by_pixel_a_scene_has_what_stereo_knows_and_nothing_else(most):
-    scene = begun(most, pixelwise.Config(opacity=0.1))
+    scene = begun(most, pixelwise.PixelwiseConfig(opacity=0.1))
     assert len(scene.views) == 2 and set(scene.gaussians.source_frame.tolist()) == {0, 1}
     assert len(scene.gaussians) == most or len(scene.gaussians) > WIDTH * HEIGHT
     torch.testing.assert_close(scene.gaussians.opacities, torch.full((len(scene.gaussians),), 0.1))
 
 
 def test_a_gaussian_a_pixel_is_asked_for_by_naming_it_in_the_configuration():
-    assert Config().pixelwise is None
-    chosen = typed({"pixelwise": {"opacity": 0.2}}, Config).pixelwise
+    assert ReconstructionConfig().pixelwise is None
+    chosen = parse_config({"pixelwise": {"opacity": 0.2}}, ReconstructionConfig).pixelwise
     assert chosen is not None and chosen.opacity == 0.2
 
 
@@ -111,7 +111,10 @@ def test_a_gaussian_a_pixel_may_begin_with_our_surroundings():
     pointmaps = tuple(plane_pointmap(np.eye(4), confidence=c, frame_id=i) for i, c in enumerate((0.9, 0.8)))
     for pointmap in pointmaps:
         pointmap.confidence[:4] = 0.01
-    begun = {each: scene_of(pointmaps, None, pixelwise.Config(surroundings=each)) for each in ("none", "shell", "fill")}
+    begun = {
+        each: scene_of(pointmaps, None, pixelwise.PixelwiseConfig(surroundings=each))
+        for each in ("none", "shell", "fill")
+    }
     shell = {each: int((scene.gaussians.source_frame == background.SHELL).sum()) for each, scene in begun.items()}
     surfaces = {each: len(scene.gaussians) - shell[each] for each, scene in begun.items()}
     assert shell["none"] == 0 and shell["shell"] == shell["fill"] > 10
@@ -119,5 +122,5 @@ def test_a_gaussian_a_pixel_may_begin_with_our_surroundings():
     assert surfaces["fill"] == 24 * WIDTH
     filled = begun["fill"].views[0].pointmap
     assert filled is not None and (filled.depth[:4] > 0).all() and (filled.confidence[:4] > 0.05).all()
-    limited = scene_of(pointmaps, 200, pixelwise.Config(surroundings="fill"))
+    limited = scene_of(pointmaps, 200, pixelwise.PixelwiseConfig(surroundings="fill"))
     assert len(limited.gaussians) <= 200

@@ -12,7 +12,15 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.light import Config, alike, differing, joining, log_gains, relit, with_headroom
+from splatnode.recon.scene.light import (
+    ExposureConfig,
+    apply_exposure,
+    apply_headroom,
+    compensate_image,
+    estimate_exposures,
+    estimate_further_exposures,
+    estimate_log_gains,
+)
 from splatnode.recon.scene.scene import Exposure
 
 PLACE = synthetic.Config(views=5, width=240, height=180)
@@ -29,7 +37,7 @@ def place() -> tuple[list[Pointmap], list[np.ndarray]]:
         known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
         normal = np.zeros((*depth.shape, 3), np.float32)
         maps.append(Pointmap(f"{index}", index, known, (known > 0).astype(np.float32), normal, T, K))
-        images.append((0.45 * synthetic.photograph(PLACE, (T, K), index)).astype(np.uint8))
+        images.append((0.45 * synthetic.render_image(PLACE, (T, K), index)).astype(np.uint8))
     return maps, images
 
 
@@ -43,51 +51,51 @@ def by_name(values: list[Any]) -> dict[str, Any]:
 
 def test_gains_are_found_within_three_per_cent():
     maps, images = place()
-    found = np.exp(log_gains(maps, exposed(images)))
+    found = np.exp(estimate_log_gains(maps, exposed(images)))
     expected = GAINS / np.median(GAINS, axis=0)
     assert np.abs(found / expected - 1.0).max() < 0.03
 
 
 def test_photographs_of_one_light_are_left_as_they_are():
     maps, images = place()
-    assert np.abs(log_gains(maps, images)).max() < 0.03
-    assert differing(maps, by_name(images), Config()) == {}
+    assert np.abs(estimate_log_gains(maps, images)).max() < 0.03
+    assert estimate_exposures(maps, by_name(images), ExposureConfig()) == {}
 
 
 def test_a_small_difference_is_left_and_a_large_one_is_not_unless_it_is_switched_off():
     maps, images = place()
     slightly = exposed(images, np.array([1.0, 1.05, 1.0, 1.0, 0.95])[:, None])
-    assert differing(maps, by_name(slightly), Config()) == {}
+    assert estimate_exposures(maps, by_name(slightly), ExposureConfig()) == {}
     widely = by_name(exposed(images))
-    assert set(differing(maps, widely, Config())) == set(widely)
-    assert differing(maps, widely, Config(enabled=False)) == {}
-    assert differing(maps[:1], widely, Config()) == {}
+    assert set(estimate_exposures(maps, widely, ExposureConfig())) == set(widely)
+    assert estimate_exposures(maps, widely, ExposureConfig(enabled=False)) == {}
+    assert estimate_exposures(maps[:1], widely, ExposureConfig()) == {}
 
 
 def test_an_exposure_that_drifts_along_the_way_is_left_unless_it_drifts_far():
     maps, images = place()
     along = np.arange(len(maps)) - len(maps) // 2
     drifting = by_name(exposed(images, 1.2 ** along[:, None]))
-    assert differing(maps, drifting, Config()) == {}
+    assert estimate_exposures(maps, drifting, ExposureConfig()) == {}
     far = by_name(exposed(images, 1.45 ** along[:, None]))
-    assert set(differing(maps, far, Config())) == set(far)
+    assert set(estimate_exposures(maps, far, ExposureConfig())) == set(far)
     shuffled = by_name(exposed(images, 1.2 ** along[[2, 4, 0, 3, 1], None]))
-    assert set(differing(maps, shuffled, Config())) == set(shuffled)
+    assert set(estimate_exposures(maps, shuffled, ExposureConfig())) == set(shuffled)
 
 
 def test_one_light_gives_back_the_photographs():
     maps, images = place()
     changed = by_name(exposed(images))
-    found = differing(maps, changed, Config())
+    found = estimate_exposures(maps, changed, ExposureConfig())
     for name, image in by_name(images).items():
-        off = np.abs(alike(changed[name], found[name]).astype(float) - image * np.median(GAINS, axis=0))
+        off = np.abs(apply_exposure(changed[name], found[name]).astype(float) - image * np.median(GAINS, axis=0))
         assert np.median(off) <= 2.0  # a gain that is halved doubles what rounding took
 
 
 def test_pixels_that_do_not_tell_their_brightness_are_known():
     maps, images = place()
     changed = by_name(exposed([np.minimum(2 * image.astype(int), 140).astype(np.uint8) for image in images]))
-    found = differing(maps, changed, Config())
+    found = estimate_exposures(maps, changed, ExposureConfig())
     brightest = found["2"].saturated
     assert brightest is not None and np.array_equal(brightest, changed["2"] >= 250) and brightest.any()
     assert found["0"].saturated is None  # darker than the median: what it shows white, others do, too
@@ -100,23 +108,23 @@ def test_what_a_dark_photograph_tells_is_kept_though_it_is_brighter_than_white_i
     maps, images = place()
     natural = [np.minimum(2 * image.astype(int), 255).astype(np.uint8) for image in images]
     changed = by_name(exposed(natural, BRIGHT))
-    about_the_median = differing(maps, changed, Config())
-    kept, headroom = with_headroom(changed, about_the_median)
-    clipped = [float((alike(changed["0"], of["0"]) == 255).any(-1).mean()) for of in (about_the_median, kept)]
+    about_the_median = estimate_exposures(maps, changed, ExposureConfig())
+    kept, headroom = apply_headroom(changed, about_the_median)
+    clipped = [float((apply_exposure(changed["0"], of["0"]) == 255).any(-1).mean()) for of in (about_the_median, kept)]
     assert clipped[0] > 0.05 and clipped[1] < 0.02
     assert 1.1 < headroom <= 2.0
     assert gains_of(kept) == pytest.approx(headroom * gains_of(about_the_median))
-    published = headroom * alike(changed["0"], kept["0"]).astype(float)
+    published = headroom * apply_exposure(changed["0"], kept["0"]).astype(float)
     assert np.median(np.abs(published - 1.5 * natural[0])) < 4.0  # the median of the gains, unclipped
 
 
 def test_photographs_that_fit_below_white_need_no_headroom():
     maps, images = place()
     changed = by_name(exposed(images))
-    found = differing(maps, changed, Config())
-    assert with_headroom(changed, found) == (found, 1.0)
-    assert with_headroom(changed, {}) == ({}, 1.0)
-    assert with_headroom(by_name([np.full_like(images[0], 255)]), {"0": found["0"]})[1] == 1.0  # nothing is told
+    found = estimate_exposures(maps, changed, ExposureConfig())
+    assert apply_headroom(changed, found) == (found, 1.0)
+    assert apply_headroom(changed, {}) == ({}, 1.0)
+    assert apply_headroom(by_name([np.full_like(images[0], 255)]), {"0": found["0"]})[1] == 1.0  # nothing is told
 
 
 def test_photographs_that_share_nothing_keep_their_light():
@@ -124,30 +132,30 @@ def test_photographs_that_share_nothing_keep_their_light():
     away = np.eye(4)
     away[:3, 3] = 100.0
     apart = [maps[0], replace(maps[1], T_world_camera=away)]
-    assert np.array_equal(log_gains(apart, exposed(images)[:2]), np.zeros((2, 3)))
+    assert np.array_equal(estimate_log_gains(apart, exposed(images)[:2]), np.zeros((2, 3)))
 
 
 def test_a_photograph_that_joins_others_gets_the_exposure_by_which_it_differs_from_them():
     maps, images = place()
     changed = by_name(exposed(images, np.where(np.arange(5)[:, None] == 4, [0.6, 0.5, 0.7], 1.0)))
-    found = joining(maps, changed, {"4": 0.0}, {}, Config())
+    found = estimate_further_exposures(maps, changed, {"4": 0.0}, {}, ExposureConfig())
     assert set(found) == {"4"} and np.abs(np.array(found["4"].gains) / [0.6, 0.5, 0.7] - 1.0).max() < 0.03
 
 
 def test_a_photograph_that_joins_as_the_others_are_is_left_as_it_is_where_they_are():
     maps, images = place()
     alike_all = by_name(exposed(images, np.ones((5, 3))))
-    assert joining(maps, alike_all, {"4": 0.0}, {}, Config()) == {}
-    assert joining(maps, alike_all, {"4": 0.0}, LIT, Config(enabled=False)) == {}
-    (found,) = joining(maps, alike_all, {"4": 0.0}, LIT, Config()).values()
+    assert estimate_further_exposures(maps, alike_all, {"4": 0.0}, {}, ExposureConfig()) == {}
+    assert estimate_further_exposures(maps, alike_all, {"4": 0.0}, LIT, ExposureConfig(enabled=False)) == {}
+    (found,) = estimate_further_exposures(maps, alike_all, {"4": 0.0}, LIT, ExposureConfig()).values()
     assert np.abs(np.array(found.gains) - 1.0).max() < 0.03
 
 
 def test_a_photograph_is_brought_to_the_light_of_its_scene_by_its_gains_alone():
     image = np.minimum(2 * exposed(place()[1])[2].astype(int), 255).astype(np.uint8)
-    assert relit(image, None) == (image, None)
-    shown, exposure = relit(image, (2.0, 2.0, 1.8))
-    assert exposure is not None and np.array_equal(shown, alike(image, exposure))
+    assert compensate_image(image, None) == (image, None)
+    shown, exposure = compensate_image(image, (2.0, 2.0, 1.8))
+    assert exposure is not None and np.array_equal(shown, apply_exposure(image, exposure))
     assert exposure.saturated is not None and np.array_equal(exposure.saturated, image >= 250)
 
 
@@ -172,56 +180,65 @@ def gains_of(found: Mapping[str, Exposure]) -> np.ndarray:
 
 def test_photographs_that_share_nothing_get_the_light_that_their_cameras_tell():
     changed = by_name(exposed(place()[1], GREY[:, None]))
-    assert differing(apart(), changed, Config()) == {}
-    found = gains_of(differing(apart(), changed, Config(), TOLD))
+    assert estimate_exposures(apart(), changed, ExposureConfig()) == {}
+    found = gains_of(estimate_exposures(apart(), changed, ExposureConfig(), TOLD))
     assert found == pytest.approx(np.repeat(GREY[:, None], 3, 1), rel=0.03)
     some = {name: TOLD[name] for name in ("0", "1", "2")}
-    assert gains_of(differing(apart(), changed, Config(), some))[:3] == pytest.approx(found[:3], rel=0.03)
-    assert differing(apart(), changed, Config(), {"2": TOLD["2"]}) == {}  # one alone tells no difference
-    assert differing(apart(), changed, Config(enabled=False), TOLD) == {}
+    assert gains_of(estimate_exposures(apart(), changed, ExposureConfig(), some))[:3] == pytest.approx(
+        found[:3], rel=0.03
+    )
+    assert (
+        estimate_exposures(apart(), changed, ExposureConfig(), {"2": TOLD["2"]}) == {}
+    )  # one alone tells no difference
+    assert estimate_exposures(apart(), changed, ExposureConfig(enabled=False), TOLD) == {}
 
 
 def test_a_small_or_a_drifting_difference_that_cameras_tell_is_left():
     along = np.arange(5) - 2
-    assert differing(apart(), by_name(place()[1]), Config(), by_name(list(0.05 * along))) == {}
+    assert estimate_exposures(apart(), by_name(place()[1]), ExposureConfig(), by_name(list(0.05 * along))) == {}
     maps, images = place()
     drifting = by_name(exposed(images, 1.2 ** along[:, None]))
-    assert differing(maps, drifting, Config(), by_name(list(np.log(1.2) * along))) == {}
+    assert estimate_exposures(maps, drifting, ExposureConfig(), by_name(list(np.log(1.2) * along))) == {}
 
 
 def test_what_photographs_share_counts_for_more_than_what_their_cameras_tell():
     maps, images = place()
     changed = by_name(exposed(images))
-    alone = gains_of(differing(maps, changed, Config()))
-    assert gains_of(differing(maps, changed, Config(), TOLD)) == pytest.approx(alone, rel=0.01)
+    alone = gains_of(estimate_exposures(maps, changed, ExposureConfig()))
+    assert gains_of(estimate_exposures(maps, changed, ExposureConfig(), TOLD)) == pytest.approx(alone, rel=0.01)
     for nonsense in (np.log(0.2), np.log(5.0), 20.0):
         wrong = TOLD | {"1": TOLD["1"] + nonsense}
-        assert gains_of(differing(maps, changed, Config(), wrong)) == pytest.approx(alone, rel=0.03)
+        assert gains_of(estimate_exposures(maps, changed, ExposureConfig(), wrong)) == pytest.approx(alone, rel=0.03)
     upside_down = {name: -told for name, told in TOLD.items()}
-    assert gains_of(differing(maps, changed, Config(), upside_down)) == pytest.approx(alone, rel=0.03)
-    assert differing(maps, by_name(images), Config(), TOLD) == {}
+    assert gains_of(estimate_exposures(maps, changed, ExposureConfig(), upside_down)) == pytest.approx(alone, rel=0.03)
+    assert estimate_exposures(maps, by_name(images), ExposureConfig(), TOLD) == {}
 
 
 def test_a_wrong_word_of_a_camera_that_alone_could_spoil_its_photograph_is_not_believed():
-    found = gains_of(differing(apart(), by_name(place()[1]), Config(), TOLD | {"1": TOLD["1"] + 20.0}))
+    found = gains_of(estimate_exposures(apart(), by_name(place()[1]), ExposureConfig(), TOLD | {"1": TOLD["1"] + 20.0}))
     assert found[1] == pytest.approx([1.0] * 3, rel=0.25)
 
 
 def test_without_a_word_of_these_photographs_all_is_the_same_to_the_bit():
     maps, images = place()
     changed = by_name(exposed(images))
-    plain, other = differing(maps, changed, Config()), differing(maps, changed, Config(), {"elsewhere": 2.0})
+    plain, other = (
+        estimate_exposures(maps, changed, ExposureConfig()),
+        estimate_exposures(maps, changed, ExposureConfig(), {"elsewhere": 2.0}),
+    )
     assert [each.gains for each in plain.values()] == [each.gains for each in other.values()]
 
 
 def test_a_photograph_that_joins_others_and_shares_nothing_has_the_light_that_its_camera_tells():
     changed = by_name(exposed(place()[1], GREY[:, None]))
     lit = {name: Exposure((gain, gain, gain), 0.0, None) for name, gain in zip("0123", GREY[:4], strict=True)}
-    in_light = {name: alike(image, lit[name]) if name in lit else image for name, image in changed.items()}
-    (found,) = joining(apart(), in_light, {"4": 0.0}, lit, Config(), TOLD).values()
+    in_light = {name: apply_exposure(image, lit[name]) if name in lit else image for name, image in changed.items()}
+    (found,) = estimate_further_exposures(apart(), in_light, {"4": 0.0}, lit, ExposureConfig(), TOLD).values()
     assert np.array(found.gains) == pytest.approx([0.8] * 3, rel=0.03)
     told = {name: 0.0 for name in "0123"} | {"4": np.log(0.6)}
-    (joined,) = joining(apart(), changed, {"4": 0.0}, {}, Config(), told).values()
+    (joined,) = estimate_further_exposures(apart(), changed, {"4": 0.0}, {}, ExposureConfig(), told).values()
     assert np.array(joined.gains) == pytest.approx([0.6] * 3, rel=0.03)
-    assert joining(apart(), changed, {"4": 0.0}, {}, Config(), told | {"4": np.log(0.9)}) == {}
-    assert joining(apart(), changed, {"4": 0.0}, {}, Config(), {"4": np.log(0.6)}) == {}
+    assert (
+        estimate_further_exposures(apart(), changed, {"4": 0.0}, {}, ExposureConfig(), told | {"4": np.log(0.9)}) == {}
+    )
+    assert estimate_further_exposures(apart(), changed, {"4": 0.0}, {}, ExposureConfig(), {"4": np.log(0.6)}) == {}

@@ -10,16 +10,16 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.start import continued, find_start
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.start import continue_reconstruction, find_start
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene, TrainingView
-from splatnode.recon.scene.seeding import initial_gaussians
+from splatnode.recon.scene.seeding import initialize_gaussians
 from tests.support.synthetic import photographs, plane_pointmap, repeated
 
-SHORT = refinement.Config(iterations=20, checkpoints=())
-CONFIG = Config(size=160, optimize=SHORT)
+SHORT = refinement.RefinementConfig(iterations=20, checkpoints=())
+CONFIG = ReconstructionConfig(size=160, optimize=SHORT)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def start() -> bytes:
 
 
 def made(start: bytes, **limits: float) -> Snapshot:
-    *_, final = continued(pickle.loads(start), structs.replace(CONFIG, **limits))
+    *_, final = continue_reconstruction(pickle.loads(start), structs.replace(CONFIG, **limits))
     return final
 
 
@@ -76,7 +76,7 @@ def refined_wall(image: np.ndarray) -> int:
     pointmap = plane_pointmap(np.eye(4), width=size, height=size)
     T, K = torch.eye(4), torch.from_numpy(pointmap.K).float()
     view = TrainingView("0.png", 0, image, T, K)
-    scene = Scene((view,), initial_gaussians([pointmap], [image], CONFIG.seeding))
+    scene = Scene((view,), initialize_gaussians([pointmap], [image], CONFIG.seeding))
     return len(list(refinement.refine(scene, SHORT, seed=0))[-1].gaussians)
 
 

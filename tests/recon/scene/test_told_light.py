@@ -10,14 +10,14 @@ import pytest
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.scene.told_light import told_logs
+from splatnode.recon.scene.told_light import compute_exposure_priors
 from tests.support.row_of_views import NO_FEATURES
 
 
 def told(*exposures: ExposureSettings | None) -> dict[str, float]:
     image = np.zeros((6, 8, 3), np.uint8)
     frames = [Frame(i, f"{i}", 0, image, None, exposure=each) for i, each in enumerate(exposures)]
-    return told_logs(Keyframe(frame, image, NO_FEATURES) for frame in frames)
+    return compute_exposure_priors(Keyframe(frame, image, NO_FEATURES) for frame in frames)
 
 
 PLAIN = ExposureSettings(0.01, 100.0)

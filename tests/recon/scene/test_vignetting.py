@@ -6,29 +6,35 @@ import numpy as np
 import pytest
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.light import Config, alike, differing, joining, relit
-from splatnode.recon.scene.shared_pixels import Shared, shared_pixels, squared_radius
-from splatnode.recon.scene.vignetting import falloffs, light_at, without_falloff
+from splatnode.recon.scene.light import (
+    ExposureConfig,
+    apply_exposure,
+    compensate_image,
+    estimate_exposures,
+    estimate_further_exposures,
+)
+from splatnode.recon.scene.shared_pixels import SharedPixels, compute_squared_radius, find_shared_pixels
+from splatnode.recon.scene.vignetting import estimate_falloffs, relative_illumination, remove_falloff
 from tests.recon.scene.test_light import LIT, by_name, exposed, place
 
 FALLOFF = 0.9  # two fifths of the light reach the corners
 
 
 def dimmed(images: list[np.ndarray], falloff: float = FALLOFF) -> list[np.ndarray]:
-    light = light_at(falloff, images[0].shape[1], images[0].shape[0])[..., None]
+    light = relative_illumination(falloff, images[0].shape[1], images[0].shape[0])[..., None]
     return [np.rint(image * light).astype(np.uint8) for image in images]
 
 
 def found_in(maps: list[Pointmap], images: list[np.ndarray], lens_of: list[int] | None = None, least: float = 0.5):
-    return falloffs(shared_pixels(maps, images), lens_of or [0] * len(maps), least)
+    return estimate_falloffs(find_shared_pixels(maps, images), lens_of or [0] * len(maps), least)
 
 
 def test_light_falls_off_to_what_reaches_the_corners():
-    light = light_at(FALLOFF, 200, 150)
+    light = relative_illumination(FALLOFF, 200, 150)
     assert light.shape == (150, 200) and light.max() == pytest.approx(1.0, abs=1e-3)
     assert light[0, 0] == light[-1, -1] == pytest.approx(np.exp(-FALLOFF), rel=0.02)
-    assert squared_radius(199.5, 149.5, 200, 150) == pytest.approx(1.0)
-    assert (light_at(0.0, 20, 10) == 1.0).all()
+    assert compute_squared_radius(199.5, 149.5, 200, 150) == pytest.approx(1.0)
+    assert (relative_illumination(0.0, 20, 10) == 1.0).all()
 
 
 def test_a_falloff_is_found_whatever_the_gains():
@@ -51,27 +57,27 @@ def test_each_lens_has_its_own_falloff():
 
 
 def test_ratios_of_colours_are_as_without_falloff():
-    shared = Shared((0, 1), np.log([[2.0, 2.0, 2.0]]), np.array([[1.0, 0.5]]))
-    (plain,) = without_falloff([shared], np.array([0.8, 0.2]))
+    shared = SharedPixels((0, 1), np.log([[2.0, 2.0, 2.0]]), np.array([[1.0, 0.5]]))
+    (plain,) = remove_falloff([shared], np.array([0.8, 0.2]))
     assert plain.logs == pytest.approx(np.log(2.0) + 0.8 * 1.0 - 0.2 * 0.5)
 
 
 def test_photographs_are_brought_to_what_a_lens_without_falloff_shows():
     maps, images = place()
     changed = by_name(dimmed(images))
-    found = differing(maps, changed, Config())
+    found = estimate_exposures(maps, changed, ExposureConfig())
     assert set(found) == set(changed) and all(each.gains == (1.0, 1.0, 1.0) for each in found.values())
     for name, image in by_name(images).items():
-        off = np.abs(alike(changed[name], found[name]).astype(float) - image)
+        off = np.abs(apply_exposure(changed[name], found[name]).astype(float) - image)
         assert np.mean(off) < 4.0 < np.abs(changed[name].astype(float) - image).mean()
-    assert differing(maps, changed, Config(least_falloff=1.2)) == {}
-    assert differing(maps, changed, Config(enabled=False)) == {}
+    assert estimate_exposures(maps, changed, ExposureConfig(least_falloff=1.2)) == {}
+    assert estimate_exposures(maps, changed, ExposureConfig(enabled=False)) == {}
 
 
 def test_falloff_and_gains_are_found_together():
     maps, images = place()
-    found = differing(maps, by_name(exposed(dimmed(images))), Config())
-    alone = differing(maps, by_name(exposed(images)), Config())
+    found = estimate_exposures(maps, by_name(exposed(dimmed(images))), ExposureConfig())
+    alone = estimate_exposures(maps, by_name(exposed(images)), ExposureConfig())
     for name, exposure in found.items():
         assert exposure.falloff == pytest.approx(FALLOFF, abs=0.08)
         assert exposure.gains == pytest.approx(alone[name].gains, rel=0.05)
@@ -80,17 +86,17 @@ def test_falloff_and_gains_are_found_together():
 def test_a_photograph_that_joins_gets_the_light_of_the_scene_by_its_lens():
     maps, images = place()
     changed = by_name([*images[:4], *dimmed(images[4:])])
-    (found,) = joining(maps, changed, {"4": FALLOFF}, LIT, Config()).values()
+    (found,) = estimate_further_exposures(maps, changed, {"4": FALLOFF}, LIT, ExposureConfig()).values()
     assert found.falloff == FALLOFF and found.gains == pytest.approx((1.0, 1.0, 1.0), rel=0.04)
-    image, exposure = relit(changed["4"], found.gains, found.falloff)
+    image, exposure = compensate_image(changed["4"], found.gains, found.falloff)
     assert exposure is not None and exposure.falloff == FALLOFF
     assert np.abs(image.astype(float) - images[4]).mean() < 4.0
 
 
 def test_dim_corners_are_not_called_saturated_and_bright_ones_are_not_believed():
     white = np.full((30, 40, 3), 255, np.uint8)
-    image, exposure = relit(white, (2.0, 2.0, 2.0), 0.5)
+    image, exposure = compensate_image(white, (2.0, 2.0, 2.0), 0.5)
     assert exposure is not None and exposure.saturated is not None and exposure.saturated[15, 20].all()
     assert image[0, 0, 0] > image[15, 20, 0]
-    _, dark = relit(white, (1.0, 1.0, 1.0), 0.5)
+    _, dark = compensate_image(white, (1.0, 1.0, 1.0), 0.5)
     assert dark is not None and dark.saturated is None

@@ -13,13 +13,8 @@ from splatnode.capture.frame import Intrinsics
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.registration.straightened import straight
-from splatnode.recon.scene.warping import (
-    registration_in_scene_world,
-    updated_pointmaps,
-    warped_scene,
-    with_photographs,
-)
+from splatnode.recon.registration.straightened import undistort_keyframe
+from splatnode.recon.scene.warping import registration_in_scene_world, replace_images, update_pointmaps, warp_scene
 from tests.support.row_of_views import HEIGHT, STEP, WIDTH, camera, graph_of, maps_of, registration_of, scene_of
 
 WORLD = Similarity(1.7, Rotation.from_euler("xyz", [20, -40, 10], degrees=True).as_matrix(), np.array([0.3, -1.0, 2.0]))
@@ -61,7 +56,7 @@ def observed(registration: Registration, depth: float) -> Registration:
 
 def test_point_maps_are_carried_to_where_the_registration_has_its_points():
     graph = graph_of(3)
-    maps = updated_pointmaps(maps_of(range(2)), observed(registration_of(3, WORLD), 2.0 * WORLD.scale), graph)
+    maps = update_pointmaps(maps_of(range(2)), observed(registration_of(3, WORLD), 2.0 * WORLD.scale), graph)
     assert list(maps) == ["00.png", "01.png"]
     for index, pointmap in enumerate(maps.values()):
         np.testing.assert_allclose(pointmap.depth, WORLD.scale * 2.0, rtol=1e-6)
@@ -72,8 +67,8 @@ def test_a_scene_moves_with_its_point_maps():
     graph, scene, before = graph_of(3), scene_of(3, graph_of(3)), maps_of(range(3))
     wider = registration_of(3)
     wider = replace(wider, cameras=tuple(replace(each, focal=each.focal / 1.25) for each in wider.cameras))
-    after = updated_pointmaps(before, observed(wider, 1.6), graph)
-    changed_ = warped_scene(scene, before, after, 0.1)
+    after = update_pointmaps(before, observed(wider, 1.6), graph)
+    changed_ = warp_scene(scene, before, after, 0.1)
     # The same pixels show the same Gaussians: with a focal length of 1 / 1.25, at 1.6 / 2 of the depth.
     of_view = scene.gaussians.source_frame == 1
     means, were = changed_.gaussians.means[of_view], scene.gaussians.means[of_view]
@@ -92,7 +87,7 @@ def test_gaussians_turn_with_their_camera():
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("y", 2, degrees=True).as_matrix()
     after = before | {"01.png": replace(before["01.png"], T_world_camera=before["01.png"].T_world_camera @ turn)}
-    turned = warped_scene(scene, before, after, 0.1)
+    turned = warp_scene(scene, before, after, 0.1)
     of_view = scene.gaussians.source_frame == 1
     centre = torch.tensor([STEP, 0.0, 0.0])
     expected = (scene.gaussians.means[of_view] - centre) @ torch.from_numpy(turn[:3, :3]).float().T + centre
@@ -112,22 +107,22 @@ def test_a_scene_that_would_not_hold_together_is_not_moved(what):
         after["02.png"] = replace(last, depth=np.float32(3) * last.depth)
     else:
         del after["02.png"]
-    assert warped_scene(scene, before, after, 0.1) is None
+    assert warp_scene(scene, before, after, 0.1) is None
 
 
 def test_photographs_follow_a_lens_that_changed_little_and_a_scene_begins_anew_after_another():
     graph = graph_of(2)
     scene = scene_of(2, graph)
-    assert with_photographs(scene, graph).views == scene.views
+    assert replace_images(scene, graph).views == scene.views
 
     def bent(radial: float) -> ViewGraph:
         lens = Intrinsics(WIDTH, HEIGHT, 35.0, 35.0, 16.0, 12.0, "estimated", (radial, 0.0, 0.0, 0.0))
-        return replace(graph, keyframes=tuple(straight(keyframe, lens) for keyframe in graph.keyframes))
+        return replace(graph, keyframes=tuple(undistort_keyframe(keyframe, lens) for keyframe in graph.keyframes))
 
-    assert with_photographs(scene, bent(-0.2)) is None  # it was not bent before
+    assert replace_images(scene, bent(-0.2)) is None  # it was not bent before
     first, second = bent(-0.2), bent(-0.205)
     views = [replace(view, image=k.image, lens=k.lens) for view, k in zip(scene.views, first.keyframes, strict=True)]
-    found = with_photographs(replace(scene, views=tuple(views)), second)
+    found = replace_images(replace(scene, views=tuple(views)), second)
     assert [view.lens for view in found.views] == [keyframe.lens for keyframe in second.keyframes]
     assert all(view.image is keyframe.image for view, keyframe in zip(found.views, second.keyframes, strict=True))
-    assert with_photographs(replace(scene, views=tuple(views)), graph_of(1)) is None
+    assert replace_images(replace(scene, views=tuple(views)), graph_of(1)) is None

@@ -9,7 +9,7 @@ import pytest
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification.decision import Config, decide, refuse_before_registration
+from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
 from splatnode.recon.verification.lens import Distortion, FreedLens
 from splatnode.recon.verification.reflection import Reflection
 from splatnode.recon.verification.weakest_link import WeakestLink
@@ -34,23 +34,25 @@ def test_all_frames_placed_is_ok():
 def test_frames_left_out_are_named():
     pairs = {key: value for key, value in all_pairs(5).items() if 3 not in key}
     left = (0, 1, 2, 4)
-    given = decide(graph(5, pairs), registration(left), evidence(left), Config())
+    given = decide(graph(5, pairs), registration(left), evidence(left), DecisionConfig())
     assert given.code == Code.OUTLIER_VIEW and given.publishable
     assert given.frames == names(3) and "3.png" in given.message
-    given = decide(graph(5, all_pairs(5)), registration(left), evidence(left), Config())
+    given = decide(graph(5, all_pairs(5)), registration(left), evidence(left), DecisionConfig())
     assert given.code == Code.OK_PARTIAL and given.publishable
     assert given.frames == names(3) and "3.png" in given.advice
 
 
 def test_two_frames_of_somewhere_else_are_a_place():
     pairs = {**all_pairs(3), (3, 4): pair()}
-    given = decide(graph(5, pairs), registration((0, 1, 2)), evidence((0, 1, 2)), Config())
+    given = decide(graph(5, pairs), registration((0, 1, 2)), evidence((0, 1, 2)), DecisionConfig())
     assert given.code == Code.SPLIT and given.publishable and given.frames == names(3, 4)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_too_few_frames(count):
-    given = refused(refuse_before_registration(graph(count, all_pairs(count)), (), Config()), Code.TOO_FEW_VIEWS)
+    given = refused(
+        refuse_before_registration(graph(count, all_pairs(count)), (), DecisionConfig()), Code.TOO_FEW_VIEWS
+    )
     assert given.frames == names(*range(count)) and str(count) in given.message
 
 
@@ -65,38 +67,38 @@ def test_too_few_frames(count):
 )
 def test_what_the_screening_left_out_is_the_reason(kept, codes, expected):
     rejected = [Rejected(f"r{i}.png", code, "that is why") for i, code in enumerate(codes)]
-    given = refused(refuse_before_registration(graph(kept, all_pairs(kept)), rejected, Config()), expected)
+    given = refused(refuse_before_registration(graph(kept, all_pairs(kept)), rejected, DecisionConfig()), expected)
     assert "that is why" in given.message or expected in (Code.STATIC_CAMERA, Code.LOW_TEXTURE)
 
 
 def test_frames_without_texture():
-    given = refused(refuse_before_registration(graph(4, {}, plain=(0, 2, 3)), (), Config()), Code.LOW_TEXTURE)
+    given = refused(refuse_before_registration(graph(4, {}, plain=(0, 2, 3)), (), DecisionConfig()), Code.LOW_TEXTURE)
     assert given.frames == names(0, 2, 3)
 
 
 def test_rich_frames_that_do_not_overlap():
-    refused(refuse_before_registration(graph(4, {}, plain=(1,)), (), Config()), Code.NO_OVERLAP)
+    refused(refuse_before_registration(graph(4, {}, plain=(1,)), (), DecisionConfig()), Code.NO_OVERLAP)
 
 
 def test_frames_that_stand_still():
     still = {key: replace(value, points2=value.points1 + 0.01) for key, value in all_pairs(3).items()}
-    refused(refuse_before_registration(graph(3, still), (), Config()), Code.STATIC_CAMERA)
+    refused(refuse_before_registration(graph(3, still), (), DecisionConfig()), Code.STATIC_CAMERA)
 
 
 def test_a_camera_that_only_turned():
     pairs = all_pairs(4, turned=((0, 1), (0, 2), (0, 3), (1, 2), (1, 3)))  # 5 of 6
-    given = refused(refuse_before_registration(graph(4, pairs), (), Config()), Code.NO_PARALLAX)
+    given = refused(refuse_before_registration(graph(4, pairs), (), DecisionConfig()), Code.NO_PARALLAX)
     assert given.frames == names(0, 1, 2, 3) and "5 of 6" in given.message
-    assert refuse_before_registration(graph(4, all_pairs(4, turned=((0, 1), (2, 3)))), (), Config()) is None
+    assert refuse_before_registration(graph(4, all_pairs(4, turned=((0, 1), (2, 3)))), (), DecisionConfig()) is None
 
 
 def test_only_two_frames_that_overlap():
-    given = refused(decide(graph(4, {(0, 1): pair()}), registration((0, 1)), None, Config()), Code.NO_OVERLAP)
+    given = refused(decide(graph(4, {(0, 1): pair()}), registration((0, 1)), None, DecisionConfig()), Code.NO_OVERLAP)
     assert "2 of 4" in given.message
 
 
 def test_frames_that_overlap_and_still_cannot_be_placed():
-    refused(decide(graph(4, all_pairs(4)), None, None, Config()), Code.NO_OVERLAP)
+    refused(decide(graph(4, all_pairs(4)), None, None, DecisionConfig()), Code.NO_OVERLAP)
 
 
 def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
@@ -106,7 +108,7 @@ def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
     told = replace(
         silent, keyframes=tuple(replace(k, frame=replace(k.frame, intrinsics=lens)) for k in silent.keyframes)
     )
-    given = refused(decide(told, None, None, Config()), Code.FOCAL_SUSPECT)
+    given = refused(decide(told, None, None, DecisionConfig()), Code.FOCAL_SUSPECT)
     assert "64 pixels" in given.message and "+40 %" in given.message
 
 
@@ -160,6 +162,6 @@ def test_different_exposures_are_noted():
 
 def test_limits_come_from_the_configuration():
     seen = evidence((0, 1, 2), {1: {"errors": unsure(rotation=12.0)}}, travel=10.0)
-    wide = Config(max_rotation_deg=90.0, min_log_odds=-100.0)
+    wide = DecisionConfig(max_rotation_deg=90.0, min_log_odds=-100.0)
     assert decide(graph(3, all_pairs(3)), registration((0, 1, 2)), seen, wide).code == Code.OK_ROUGH
-    refused(refuse_before_registration(graph(3, all_pairs(3)), (), Config(min_cameras=4)), Code.TOO_FEW_VIEWS)
+    refused(refuse_before_registration(graph(3, all_pairs(3)), (), DecisionConfig(min_cameras=4)), Code.TOO_FEW_VIEWS)

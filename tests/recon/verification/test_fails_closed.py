@@ -14,14 +14,14 @@ import pytest
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification import flatness, likelihood, refit, reflection, reversal
-from splatnode.recon.verification.checks import Case
-from splatnode.recon.verification.decision import CHECKS, Config, decide
+from splatnode.recon.verification.checks import VerificationCase
+from splatnode.recon.verification.decision import CHECKS, DecisionConfig, decide
 from splatnode.recon.verification.errors import Errors
 from splatnode.recon.verification.evidence import Evidence
-from splatnode.recon.verification.finiteness import not_finite
+from splatnode.recon.verification.finiteness import find_non_finite
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.lens import FreedLens
-from splatnode.recon.verification.undetermined import WORDS, undetermined
+from splatnode.recon.verification.undetermined import WORDS, check_finite
 from tests.recon.verification.test_refit import made_up
 from tests.support.verdicts import all_pairs, evidence, graph, registration, unsure
 
@@ -57,7 +57,7 @@ def with_number(record: Any, path: Path, value: float) -> Any:
 
 
 def weighed(seen: Evidence) -> likelihood.Odds:
-    return likelihood.weigh(seen, FITTED.many.claims, FITTED.many.odds)
+    return likelihood.compute_log_odds(seen, FITTED.many.claims, FITTED.many.odds)
 
 
 EVERY_NUMBER = tuple(numbers_of(Evidence))
@@ -71,7 +71,7 @@ def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
         ("rms_px",),
     ):
         assert path in EVERY_NUMBER
-    assert decide(graph(3, all_pairs(3)), registration(ALL), GOOD, Config()).code == Code.OK
+    assert decide(graph(3, all_pairs(3)), registration(ALL), GOOD, DecisionConfig()).code == Code.OK
 
 
 @pytest.mark.filterwarnings("error")
@@ -79,7 +79,7 @@ def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
 @pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
 def test_every_number_of_the_evidence_that_could_not_be_computed_refuses(path, value):
     seen = with_number(GOOD, path, value)
-    given = decide(graph(3, all_pairs(3)), registration(ALL), seen, Config())
+    given = decide(graph(3, all_pairs(3)), registration(ALL), seen, DecisionConfig())
     assert given.code == Code.UNDETERMINED and not given.publishable
     assert WORDS[path[0]] in given.message and given.message.endswith(".") and given.advice.endswith(".")
     assert given.frames == (("0.png",) if path[0] == "cameras" else ("0.png", "1.png", "2.png"))
@@ -92,14 +92,14 @@ def test_no_limit_lets_a_number_pass_that_could_not_be_computed(path, monkeypatc
     good, odds = (weighed(seen) for seen in (GOOD, with_number(GOOD, path, math.nan)))
     before, after = ([*each.terms.values()] for each in (good, odds))
     if before != after:
-        given = decide(graph(3, all_pairs(3)), registration(ALL), with_number(GOOD, path, math.nan), Config())
+        given = decide(graph(3, all_pairs(3)), registration(ALL), with_number(GOOD, path, math.nan), DecisionConfig())
         assert any(math.isnan(piece) for piece in after) and not given.publishable
 
 
 @pytest.mark.parametrize("limited", ["travel", "mirrored_cost", "flatness", "inlier_ratio"])
 def test_every_limit_refuses_nan_by_itself(limited, monkeypatch):
     monkeypatch.setattr("splatnode.recon.verification.decision.CHECKS", CHECKS[1:])
-    given = decide(graph(3, all_pairs(3)), registration(ALL), replace(GOOD, **{limited: math.nan}), Config())
+    given = decide(graph(3, all_pairs(3)), registration(ALL), replace(GOOD, **{limited: math.nan}), DecisionConfig())
     assert not given.publishable
 
 
@@ -111,7 +111,7 @@ def test_a_pose_that_is_not_a_number_refuses(field, value):
     wrong = np.full_like(camera.T_world_camera, value) if field == "T_world_camera" else value
     wrong = np.full(2, value) if field == "principal" else np.array([value, 0.0]) if field == "radial" else wrong
     cameras = (found.cameras[0], replace(camera, **{field: wrong}), found.cameras[2])
-    given = decide(graph(3, all_pairs(3)), replace(found, cameras=cameras), GOOD, Config())
+    given = decide(graph(3, all_pairs(3)), replace(found, cameras=cameras), GOOD, DecisionConfig())
     assert given.code == Code.UNDETERMINED and "the poses themselves" in given.message
 
 
@@ -122,7 +122,7 @@ def test_the_root_of_a_negative_variance_refuses():
     found = replace(found, cameras=(*found.cameras[:2], of_third), focal_sigma=math.inf)
     of_unsure = replace(GOOD.cameras[2], errors=unsure(math.inf, math.inf))
     seen = replace(GOOD, cameras=(*GOOD.cameras[:2], of_unsure), focal=Errors(math.inf, math.inf, math.inf))
-    given = decide(graph(3, all_pairs(3)), found, seen, Config())
+    given = decide(graph(3, all_pairs(3)), found, seen, DecisionConfig())
     assert given.code == Code.UNDETERMINED and given.frames == ("2.png",)
     assert "how certain the focal length is" in given.message and "how certain each pose is" in given.message
 
@@ -132,13 +132,13 @@ def test_each_field_of_the_evidence_has_words_for_the_user():
 
 
 def test_what_is_finite_is_let_pass():
-    assert undetermined(Case(GOOD, Config(), FITTED.many, graph(3, {}), registration(ALL))) is None
-    assert list(not_finite(GOOD)) == []
+    assert check_finite(VerificationCase(GOOD, DecisionConfig(), FITTED.many, graph(3, {}), registration(ALL))) is None
+    assert list(find_non_finite(GOOD)) == []
 
 
 def test_arrays_and_mappings_are_walked_too():
     found = replace(registration(ALL), points=np.array([[0.0, np.nan, 1.0]]), inlier_ratios={(0, 1): math.inf})
-    assert list(not_finite(found)) == [("points",), ("inlier_ratios", "(0, 1)")]
+    assert list(find_non_finite(found)) == [("points",), ("inlier_ratios", "(0, 1)")]
     assert {field.name for field in fields(Registration)} >= {"points", "inlier_ratios"}
     assert is_dataclass(RegisteredCamera)
 
@@ -148,7 +148,7 @@ def test_arrays_and_mappings_are_walked_too():
 @pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
 def test_what_is_not_finite_is_none_in_the_report(path, value):
     broken = with_number(GOOD, path, value)
-    written = json.loads(json.dumps(likelihood.record(broken, weighed(broken)), allow_nan=False))
+    written = json.loads(json.dumps(likelihood.make_evidence_record(broken, weighed(broken)), allow_nan=False))
     found = written
     for step in path:
         found = found[step]
@@ -163,18 +163,22 @@ def test_a_mirrored_answer_that_could_not_be_computed_is_not_the_lack_of_a_rival
     broken = replace(fit, problem=replace(fit.problem, points=np.full_like(fit.problem.points, np.nan)))
     assert math.isnan(replace(fit, problem=replace(fit.problem, translations=np.full((4, 3), np.nan))).cost)
     adjusted = iter([fit, replace(broken, problem=replace(fit.problem, translations=np.full((4, 3), np.nan)))])
-    monkeypatch.setattr(refit, "adjusted", lambda start: next(adjusted))
-    assert math.isnan(reversal.mirrored_cost(fit))
+    monkeypatch.setattr(refit, "adjust", lambda start: next(adjusted))
+    assert math.isnan(reversal.compute_reversal_cost_ratio(fit))
 
 
 def test_flatness_of_points_that_are_nowhere_is_not_known():
     points = np.random.default_rng(0).uniform(size=(50, 3))
     points[7, 2] = np.nan
-    assert math.isnan(flatness.share_on_plane(points))
+    assert math.isnan(flatness.compute_share_on_plane(points))
 
 
 def test_a_gain_by_mirroring_that_is_not_a_number_is_not_passed_over(monkeypatch):
     gains = iter([0.0, math.nan, 0.0])
-    monkeypatch.setattr(reflection, "_gain", lambda *_: next(gains))
-    monkeypatch.setattr(reflection, "_strongest", lambda features, count: np.zeros((4, 128), np.uint8))
-    assert math.isnan(reflection.measure(graph(3, {}).keyframes, [(0, 1), (0, 2), (1, 2)], reflection.Config()).gain)
+    monkeypatch.setattr(reflection, "_compute_gain", lambda *_: next(gains))
+    monkeypatch.setattr(reflection, "_select_descriptors", lambda features, count: np.zeros((4, 128), np.uint8))
+    assert math.isnan(
+        reflection.measure_reflection(
+            graph(3, {}).keyframes, [(0, 1), (0, 2), (1, 2)], reflection.ReflectionConfig()
+        ).gain
+    )

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.masks import masked
-from splatnode.recon.config import Config
+from splatnode.capture.masks import apply_mask
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.match import match
@@ -29,12 +29,12 @@ REFUSED = Verdict(Code.NO_OVERLAP, "Only 0 of 4 photographs could be placed.", "
 
 def prepared(images) -> list[Keyframe]:
     frames = images if isinstance(images[0], Frame) else renumbered(images)
-    return prepare_all(frames, Config())[0]
+    return prepare_all(frames, ReconstructionConfig())[0]
 
 
 @lru_cache(maxsize=8)
 def graph_of(*frames: Frame) -> ViewGraph:
-    return match(prepared(list(frames)), Config().matching)
+    return match(prepared(list(frames)), ReconstructionConfig().matching)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +94,7 @@ def test_photographs_that_are_twice_as_wide_as_high_are_none_of_360_degrees():
 
 def test_a_turntable_before_a_room_is_told_instead_of_what_it_leads_to():
     frames, _ = turned(4)
-    estimate = estimate_cameras(graph_of(*frames), (), Config())
+    estimate = estimate_cameras(graph_of(*frames), (), ReconstructionConfig())
     assert estimate.verdict.code is Code.TURNTABLE
     assert "6 of 6 pairs" in estimate.verdict.message and "--masks" in estimate.verdict.advice
     assert estimate.verdict.frames == tuple(frame.name for frame in frames)
@@ -111,7 +111,7 @@ def test_a_scene_that_is_published_is_no_turntable_and_a_plain_background_makes_
 
 def test_masks_that_hide_the_background_leave_no_turntable():
     frames, masks = turned(4)
-    hidden = [masked(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
+    hidden = [apply_mask(frame, mask) for frame, mask in zip(frames, masks, strict=True)]
     assert explain_refusal(REFUSED, graph_of(*[frame for frame in hidden if isinstance(frame, Frame)])) is REFUSED
 
 

@@ -20,14 +20,12 @@ from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.matching.appearance_check import matches_look_alike
 from splatnode.recon.registration import register
-from splatnode.recon.verification.decision import Config as DecisionConfig
-from splatnode.recon.verification.decision import decide, refuse_before_registration
-from splatnode.recon.verification.verify import Config as VerificationConfig
-from splatnode.recon.verification.verify import verify
+from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
+from splatnode.recon.verification.verify import VerificationConfig, verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 WIDTH, HEIGHT = 192, 144
-SETTINGS = matching.Config(features=features.Config(num_features=500, min_longer_side=WIDTH))
+SETTINGS = matching.MatchingConfig(features=features.FeatureConfig(num_features=500, min_longer_side=WIDTH))
 FOCAL = 180.0
 GRID = np.stack(np.meshgrid(np.arange(6.0, WIDTH, 7.0), np.arange(6.0, HEIGHT, 7.0)), -1).reshape(-1, 2)
 
@@ -106,7 +104,7 @@ LIARS = {"surface": SurfaceLiar(), "flat": SurfaceLiar(flat=True), "snapping": S
 @pytest.mark.parametrize("lie", LIARS)
 def test_what_a_prior_invents_is_refused(lie, photographed):
     graph = view_graph(photographed(), LIARS[lie], SETTINGS)
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     evidence = verify(graph, registration, VerificationConfig())
     verdict = refuse_before_registration(graph, (), DecisionConfig()) or decide(
         graph, registration, evidence, DecisionConfig()
@@ -119,7 +117,7 @@ def test_the_best_lie_looks_right_to_all_but_the_photographs(monkeypatch):
     monkeypatch.setattr("splatnode.recon.matching.appearance_check.matches_look_alike", lambda *asked: True)
     graph = view_graph(noise(), SurfaceLiar(), SETTINGS)
     assert sorted(graph.pairs) == [(0, 1), (0, 2), (1, 2)]
-    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert registration is not None and len(registration.cameras) == 3 and registration.rms_px < 1.0
 
 

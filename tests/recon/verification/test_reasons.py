@@ -10,13 +10,13 @@ import pytest
 from splatnode.recon.evaluate.stability.fitting.odds import FOR
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification.claims import claims
-from splatnode.recon.verification.cycles import Cycles
-from splatnode.recon.verification.decision import Config, decide
+from splatnode.recon.verification.claims import predict_bounds
+from splatnode.recon.verification.cycles import CycleConsistency
+from splatnode.recon.verification.decision import DecisionConfig, decide
 from splatnode.recon.verification.errors import Errors
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.likelihood import OddsModel
-from splatnode.recon.verification.models import Fitted
+from splatnode.recon.verification.models import VerdictModels
 from splatnode.recon.verification.reflection import Reflection
 from tests.support.verdicts import (
     all_pairs,
@@ -39,7 +39,7 @@ def turning(count: int) -> ViewGraph:
     return graph(count, {key: replace(value, num_rotation=150) for key, value in all_pairs(count).items()})
 
 
-WHATEVER_THE_ODDS = Config(min_log_odds=-100.0)
+WHATEVER_THE_ODDS = DecisionConfig(min_log_odds=-100.0)
 OPEN_FOCAL = Errors(0.5, 0.5, 0.5)
 
 
@@ -57,7 +57,7 @@ OPEN_FOCAL = Errors(0.5, 0.5, 0.5)
 )
 def test_bounds_that_are_too_wide_are_refused_for_their_cause(graph, what, code, said):
     seen = evidence((0, 1, 2, 3), {2: {"errors": unsure(rotation=20.0)}}, **what)
-    given = refused(decide(graph(4), registration((0, 1, 2, 3)), seen, Config()), code)
+    given = refused(decide(graph(4), registration((0, 1, 2, 3)), seen, DecisionConfig()), code)
     assert said in given.message
     assert ("further to the side" in given.advice) == (code == Code.BASELINE_TOO_SMALL)
 
@@ -65,7 +65,7 @@ def test_bounds_that_are_too_wide_are_refused_for_their_cause(graph, what, code,
 def test_a_camera_that_hangs_on_few_points_is_named_with_its_neighbour():
     pairs = {**all_pairs(4), (1, 2): pair(300)}
     seen = evidence((0, 1, 2, 3), {2: {"errors": unsure(centre=0.3), "confirmed": 8}})
-    given = refused(decide(graph(4, pairs), registration((0, 1, 2, 3)), seen, Config()), Code.NO_OVERLAP)
+    given = refused(decide(graph(4, pairs), registration((0, 1, 2, 3)), seen, DecisionConfig()), Code.NO_OVERLAP)
     assert given.frames == names(2, 1) and "2.png shares only 8 points" in given.message
     assert given.advice == "Add a photograph between 2.png and 1.png."
 
@@ -93,19 +93,19 @@ def test_a_rough_scene_is_published_and_says_how_rough_it_is():
 def test_who_requires_more_than_is_known_gets_a_refusal_that_says_what_is_known():
     rough = {2: {"errors": unsure(centre=0.01)}}
     seen = evidence((0, 1, 2, 3), rough)
-    positions = max(bounds.centre_percent for bounds in claims(seen, FITTED.many.claims).values())
+    positions = max(bounds.centre_percent for bounds in predict_bounds(seen, FITTED.many.claims).values())
     given = decide(
         graph(4, all_pairs(4)),
         registration((0, 1, 2, 3)),
         seen,
-        Config(require_percent=positions + 0.1, min_log_odds=-100.0),
+        DecisionConfig(require_percent=positions + 0.1, min_log_odds=-100.0),
     )
     assert given.code == Code.OK_ROUGH
     given = decide(
         graph(4, all_pairs(4)),
         registration((0, 1, 2, 3)),
         seen,
-        Config(require_percent=positions - 0.1, min_log_odds=-100.0),
+        DecisionConfig(require_percent=positions - 0.1, min_log_odds=-100.0),
     )
     assert f"{positions:.2g} % of the distance" in refused(given, Code.TOO_ROUGH).message
 
@@ -115,11 +115,11 @@ def test_cameras_that_moved_less_than_their_centres_are_uncertain_show_no_depth(
     assert "0.3 degrees" in given.message
 
 
-def doubting(measure: str) -> Fitted:
+def doubting(measure: str) -> VerdictModels:
     """Numbers by which only one measure counts, against the poses where it is worse than in right registrations."""
     term = replace(FITTED.many.odds.terms[measure], slope=30.0 if measure in FOR else -30.0)
     numbers = replace(FITTED.many, odds=OddsModel(2.0, {measure: term}))
-    return Fitted(numbers, numbers)
+    return VerdictModels(numbers, numbers)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def doubting(measure: str) -> Fitted:
         (
             "directions",
             {2: {"inlier_ratio": 0.45}},
-            {"cycles": Cycles(4, 0.5, 1.0, 25.0, 30.0)},
+            {"cycles": CycleConsistency(4, 0.5, 1.0, 25.0, 30.0)},
             Code.AMBIGUOUS,
             (2,),
             "disagree by 25 degrees",
@@ -168,9 +168,9 @@ def doubting(measure: str) -> Fitted:
 def test_what_speaks_most_against_the_poses_is_the_reason(measure, what, whole, code, frames, said):
     seen = evidence((0, 1, 2, 3), what, **whole)
     at = (graph(4, all_pairs(4)), registration((0, 1, 2, 3)))
-    given = refused(decide(*at, seen, Config(), doubting(measure)), code)
+    given = refused(decide(*at, seen, DecisionConfig(), doubting(measure)), code)
     assert said in given.message and given.frames == names(*(frames or (0, 1, 2, 3)))
-    assert decide(*at, evidence((0, 1, 2, 3)), Config(), doubting(measure)).code == Code.OK
+    assert decide(*at, evidence((0, 1, 2, 3)), DecisionConfig(), doubting(measure)).code == Code.OK
 
 
 def test_frames_of_another_size_that_do_not_fit_are_named():
@@ -180,7 +180,7 @@ def test_frames_of_another_size_that_do_not_fit_are_named():
     smaller = np.zeros((30, 40, 3), np.uint8)
     keyframes[1] = replace(keyframes[1], frame=replace(keyframes[1].frame, image=smaller, intrinsics=None))
     found = replace(found, keyframes=tuple(keyframes))
-    given = refused(decide(found, registration((0, 1, 2, 3)), uncertain, Config(), doubted), Code.MIXED_CAMERAS)
+    given = refused(decide(found, registration((0, 1, 2, 3)), uncertain, DecisionConfig(), doubted), Code.MIXED_CAMERAS)
     assert given.frames == names(1)
 
 

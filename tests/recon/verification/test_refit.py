@@ -14,7 +14,7 @@ from splatnode.recon.verification import jackknife, lens, refit, reversal
 FOCAL = 900.0
 
 
-def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, focal: float = FOCAL) -> refit.Fit:
+def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, focal: float = FOCAL) -> refit.BundleFit:
     """Four cameras on an arc around 200 points, `depth` deep at distance 4; `focal` is what the fit is told."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.0, 1.0, (200, 3)) * (1.2, 0.9, depth)
@@ -41,17 +41,17 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
     problem = replace(exact, pixels=seen, log_focals=np.log([focal]), radials=pinhole)
     prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros((1, 2)), np.zeros(1))
     unknown = np.full(1, np.nan), np.full(1, np.inf), np.zeros(1, bool)
-    return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), 1.0, *unknown, np.ones(1))
+    return refit.BundleFit(problem, prior, bundle.BundleAdjustmentConfig(robust_px=1.0), 1.0, *unknown, np.ones(1))
 
 
-def given(fit: refit.Fit) -> refit.Fit:
+def given(fit: refit.BundleFit) -> refit.BundleFit:
     """The fit with a focal length that is held as it is."""
     return replace(fit, prior=replace(fit.prior, sigmas=np.zeros(1)), told=np.exp(fit.problem.log_focals))
 
 
 def test_nothing_moves_between_a_fit_and_itself():
-    fit = refit.adjusted(made_up())
-    between = refit.shift(fit, fit)
+    fit = refit.adjust(made_up())
+    between = refit.compute_shift(fit, fit)
     assert between.rotation_deg < 1e-5 and between.centre_rel < 1e-9 and between.focal_rel == 0.0
 
 
@@ -68,7 +68,7 @@ def test_a_moved_camera_is_measured_whatever_the_world_is():
         rotations=rotations @ world.T,
         translations=2.0 * translations,  # twice as large a world
     )
-    between = refit.shift(fit, replace(fit, problem=moved))
+    between = refit.compute_shift(fit, replace(fit, problem=moved))
     assert between.rotation_deg == pytest.approx(2.0, abs=1e-4)
     assert between.centre_rel < 0.02  # the common rotation is shared out, and turns the centres a little
 
@@ -76,14 +76,14 @@ def test_a_moved_camera_is_measured_whatever_the_world_is():
 def test_a_fit_that_came_to_nothing_is_lost():
     fit = made_up()
     broken = replace(fit, problem=replace(fit.problem, translations=np.full((4, 3), np.nan)))
-    assert refit.shift(fit, broken) == refit.LOST
+    assert refit.compute_shift(fit, broken) == refit.LOST
 
 
 def test_without_points_only_their_observations_go():
     fit = made_up()
     left_out = np.zeros(200, bool)
     left_out[::3] = True
-    smaller = refit.without_points(fit, left_out).problem
+    smaller = refit.remove_points(fit, left_out).problem
     assert len(smaller.points) == 133 and len(smaller.pixels) == 4 * 133
     assert np.allclose(smaller.points, fit.problem.points[~left_out])
     assert np.abs(bundle.reprojection_errors(smaller)).max() < 1.5
@@ -91,7 +91,9 @@ def test_without_points_only_their_observations_go():
 
 def test_the_spread_grows_with_what_the_model_leaves_out():
     """Four times the noise, or distortion that is not modelled: both must show."""
-    quiet, noisy, bent = (jackknife.by_regions(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1)))
+    quiet, noisy, bent = (
+        jackknife.estimate_spread(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1))
+    )
     assert max(quiet.rotation_deg) < 0.1 and max(quiet.centre) < 0.01
     assert max(noisy.centre) > 2 * max(quiet.centre)
     assert max(bent.rotation_deg) > 3 * max(quiet.rotation_deg) and max(bent.centre) > 2 * max(quiet.centre)
@@ -99,7 +101,7 @@ def test_the_spread_grows_with_what_the_model_leaves_out():
 
 
 def test_perspective_tells_a_scene_from_its_mirror_image():
-    assert reversal.mirrored_cost(made_up(depth=1.0)) > 5.0
+    assert reversal.compute_reversal_cost_ratio(made_up(depth=1.0)) > 5.0
 
 
 def test_the_mirrored_scene_of_a_camera_far_away_cannot_be_told():
@@ -111,30 +113,30 @@ def test_the_mirrored_scene_of_a_camera_far_away_cannot_be_told():
         log_focals=near.problem.log_focals + np.log(100.0),
     )
     pixels = bundle.project(far)[0] + np.random.default_rng(1).normal(0, 0.5, near.problem.pixels.shape)
-    assert reversal.mirrored_cost(given(replace(near, problem=replace(far, pixels=pixels)))) < 1.2
+    assert reversal.compute_reversal_cost_ratio(given(replace(near, problem=replace(far, pixels=pixels)))) < 1.2
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])
 def test_a_given_focal_length_is_found_right_or_wrong(factor):
-    (freed,) = lens.freed(given(made_up(focal=factor * FOCAL)))
+    (freed,) = lens.free_lenses(given(made_up(focal=factor * FOCAL)))
     assert freed.trusted and freed.given == pytest.approx(factor * FOCAL)
     assert freed.found == pytest.approx(FOCAL, rel=0.02)
     assert (freed.cost_ratio < 0.5) == (factor != 1.0)
 
 
 def test_a_nominal_focal_length_is_doubted_too():
-    (freed,) = lens.freed(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
+    (freed,) = lens.free_lenses(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
     assert not freed.trusted and freed.found == pytest.approx(FOCAL, rel=0.02) and freed.cost_ratio < 0.5
 
 
 def test_no_lens_is_freed_that_did_not_come_with_the_frames():
-    assert lens.freed(made_up()) == ()
+    assert lens.free_lenses(made_up()) == ()
 
 
 def test_distortion_that_the_observations_ask_for():
-    bent = lens.distortion(made_up(radial=-0.2))
+    bent = lens.measure_distortion(made_up(radial=-0.2))
     # A corner is 0.6 * 1024 pixels from the middle.
     assert bent.corner_shift == pytest.approx(0.2 * (0.6 * 1024 / FOCAL) ** 2, rel=0.1)
     assert bent.cost_ratio < 0.6
-    straight = lens.distortion(made_up())
+    straight = lens.measure_distortion(made_up())
     assert straight.corner_shift < 0.01 and straight.cost_ratio > 0.97

@@ -68,4 +68,4 @@ def test_an_entry_that_is_filled_in_is_a_verdict_without_a_scene():
 
 
 def test_whether_all_was_computed_is_asked_first():
-    assert CHECKS[0] is undetermined.undetermined
+    assert CHECKS[0] is undetermined.check_finite

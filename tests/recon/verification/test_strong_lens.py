@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.config import Config
+from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.decision import decide
 from splatnode.recon.verification.strong_lens import STRONG
 from tests.support.verdicts import all_pairs, evidence, graph, registration
@@ -21,7 +21,7 @@ def verdict(radial: tuple[float, float], focal: float) -> Verdict:
     found = registration(ALL)
     lens = {"radial": np.array(radial), "focal": focal, "principal": np.array([32.0, 24.0])}
     cameras = tuple(replace(camera, **lens) for camera in found.cameras)
-    return decide(graph(3, all_pairs(3)), replace(found, cameras=cameras), evidence(ALL), Config())
+    return decide(graph(3, all_pairs(3)), replace(found, cameras=cameras), evidence(ALL), DecisionConfig())
 
 
 def test_the_photographs_here_are_64_pixels_wide():

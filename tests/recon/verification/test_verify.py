@@ -12,14 +12,14 @@ import pytest
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import register
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.result.bounds import widest
+from splatnode.recon.result.bounds import find_widest
 from splatnode.recon.verification import flatness, likelihood, verify, weakest_link
-from splatnode.recon.verification.claims import claims
+from splatnode.recon.verification.claims import predict_bounds
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
 from tests.support.synthetic import photographs, view_graph
 
-CONFIG = verify.Config()
+CONFIG = verify.VerificationConfig()
 VIEWS = 4
 
 
@@ -27,7 +27,7 @@ VIEWS = 4
 def placed() -> tuple[ViewGraph, Registration]:
     """Four photographs, registered."""
     graph = view_graph(photographs()[:VIEWS])
-    found = register.register(graph.keyframes, graph.pairs, register.Config())
+    found = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
     assert found is not None and len(found.cameras) == VIEWS
     return graph, found
 
@@ -54,11 +54,11 @@ def turned(degrees: float, index: int = 1) -> Registration:
 
 def test_a_right_answer_has_evidence_from_every_source():
     evidence = good()
-    odds = likelihood.weigh(evidence, FITTED.many.claims, FITTED.many.odds)
+    odds = likelihood.compute_log_odds(evidence, FITTED.many.claims, FITTED.many.odds)
     assert odds.total > 1.5
     assert evidence.inlier_ratio > 0.9 and evidence.weakest_link.shared_points > 100
     assert all(camera.confirmed > 50 and not camera.own_lens for camera in evidence.cameras)
-    bounds = widest(claims(evidence, FITTED.many.claims).values())
+    bounds = find_widest(predict_bounds(evidence, FITTED.many.claims).values())
     assert (
         bounds is not None and bounds.rotation_deg < 2.0 and bounds.centre_percent < 2.0 and bounds.focal_percent < 20.0
     )
@@ -107,7 +107,7 @@ def test_two_places_that_share_no_points_are_found_as_two_parts():
         observed_point=found.observed_point[kept],
         observed_pixels=found.observed_pixels[kept],
     )
-    link = weakest_link.measure(apart, graph.names, graph.pairs)
+    link = weakest_link.measure_weakest_link(apart, graph.names, graph.pairs)
     assert link.shared_points == 0 and link.smaller_part in (tuple(graph.names[:2]), tuple(graph.names[2:]))
 
 
@@ -119,21 +119,21 @@ def test_points_shared_by_two_frames_are_counted():
         observed_by=np.array([0, 1, 2, 0, 1, 3]),
         observed_point=np.array([0, 0, 0, 1, 1, 2]),
     )
-    shared = weakest_link.shared_points(few)
+    shared = weakest_link.count_shared_points(few)
     assert shared[0, 1] == 2 and shared[0, 2] == 1 and shared[0, 3] == 0
 
 
 def test_frames_that_pairs_contradict_are_disconnected():
     graph, found = placed()
-    assert weakest_link.disconnected(found, graph.pairs) == ()
+    assert weakest_link.find_disconnected_frames(found, graph.pairs) == ()
     doubted = {key: 0.4 if 3 in key else share for key, share in found.inlier_ratios.items()}
-    assert weakest_link.disconnected(replace(found, inlier_ratios=doubted), graph.pairs) == (3,)
+    assert weakest_link.find_disconnected_frames(replace(found, inlier_ratios=doubted), graph.pairs) == (3,)
 
 
 def test_the_share_of_points_on_a_plane():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.ones(300)])
-    assert flatness.share_on_plane(wall) == 1.0
+    assert flatness.compute_share_on_plane(wall) == 1.0
     relief = wall + (0.0, 0.0, 1.0) * rng.choice([0.0, 0.2], (300, 1), p=[0.7, 0.3])
-    assert flatness.share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
-    assert flatness.share_on_plane(wall[:2]) == 0.0
+    assert flatness.compute_share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
+    assert flatness.compute_share_on_plane(wall[:2]) == 0.0

@@ -15,12 +15,12 @@ from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.messaging import keys
 from splatnode.capture.messaging.commands import Answer
 from splatnode.capture.messaging.keyframe_messages import (
+    ConsumerStatus,
     Delivery,
     DroppedHeader,
     FrameHeader,
     Request,
-    Served,
-    received,
+    decode_frame,
 )
 from splatnode.capture.messaging.message_file import read_message
 from splatnode.capture.messaging.spool import Config as SpoolConfig
@@ -32,16 +32,16 @@ from splatnode.capture.process.config import ConfigError, load_config
 from splatnode.capture.status import CaptureStatus, Heartbeat
 from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import Config as ReconConfig
+from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
 from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.occupancy.message import MapHeader
-from splatnode.recon.occupancy.message import from_message as map_from
+from splatnode.recon.occupancy.message import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.message import SceneHeader, from_message
+from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.viewer.sources import load_result
 from tests.support.adversary import cameras, documents, images, messages, scenes, stored
 from tests.support.adversary.boundary import Boundary, Reader, attempt, case_of, cases_of
@@ -67,14 +67,14 @@ def _read_frame(case: Any, folder: Path) -> object:
     delivery = decode(case[0], Delivery, _LIMITS).header
     message = decode(case[1], FrameHeader | DroppedHeader, _LIMITS).header
     with contextlib.suppress(WireError):  # it is of another frame
-        received(Key(delivery.session, delivery.sequence), case[1], _LIMITS)
-    return received(Key(message.session, message.sequence), case[1], _LIMITS)
+        decode_frame(Key(delivery.session, delivery.sequence), case[1], _LIMITS)
+    return decode_frame(Key(message.session, message.sequence), case[1], _LIMITS)
 
 
 def _read_scene(parts: Any, folder: Path) -> object:
-    from splatnode.viewer.sources import _safe
+    from splatnode.viewer.sources import _sanitize_snapshot
 
-    return _safe(from_message(decode(parts, SceneHeader, _LIMITS)).snapshot)
+    return _sanitize_snapshot(decode_snapshot(decode(parts, SceneHeader, _LIMITS)).snapshot)
 
 
 def _read_map(parts: Any, folder: Path) -> object:
@@ -247,7 +247,7 @@ def _read_preview(parts: Any, folder: Path) -> object:
 _MESSAGES = (
     Boundary("keyframes", _draw_frame, _read_frame, _FRAMES, 10, 6, mutants=4, tidy=False),
     Boundary("keyframe requests", _of(Request), _decoding(Request), _WIRE, 10, 4, mutants=4, tidy=False),
-    Boundary("keyframe answers", _of(Served), _decoding(Served), _WIRE, 10, 1, mutants=4, tidy=False),
+    Boundary("keyframe answers", _of(ConsumerStatus), _decoding(ConsumerStatus), _WIRE, 10, 1, mutants=4, tidy=False),
     Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1, mutants=4, tidy=False),
     Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3, mutants=4, tidy=False),
     Boundary("maps", _of(MapHeader, _states), _read_map, _WIRE, 20, 1, mutants=4, tidy=False),

@@ -23,32 +23,32 @@ from splatnode.capture.last_run import LastRun
 from splatnode.capture.messaging.quarantine import Config as QuarantineConfig
 from splatnode.capture.messaging.quarantine import Quarantine
 from splatnode.capture.name_time import name_time
-from splatnode.capture.process.printable import is_printable, printable_name
-from splatnode.capture.process.private import NotPrivate
+from splatnode.capture.process.printable import is_printable, sanitize_name
+from splatnode.capture.process.private import NotOwnerOnly
 from splatnode.capture.process.records import record_in
 from splatnode.command_line import build_parser
 from splatnode.recon.batch import answer, ledger
-from splatnode.recon.batch.sources import Recording, listed
+from splatnode.recon.batch.sources import BatchRecording, read_list
 from splatnode.recon.jobs.child import End
 from splatnode.recon.result import whole
 from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.manifest import digests
-from splatnode.recon.result.message import SceneHeader, from_message
+from splatnode.recon.result.export.manifest import read_digests
+from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer import words
 from splatnode.viewer.ground import ground
 from splatnode.viewer.moment import Moment
-from splatnode.viewer.sources import _safe
+from splatnode.viewer.sources import _sanitize_snapshot
 from splatnode.viewer.web import server as web
-from splatnode.viewer.web.access import kept_key
+from splatnode.viewer.web.access import load_or_create_key
 from splatnode.viewer.web.board import Board
 from splatnode.viewer.web.content import Content
 from tests.support.adversary import documents, edges, images, messages, requests, stored
 from tests.support.adversary.boundary import Boundary, Reader
 from tests.support.adversary.schema_values import value
 
-_RECORDING, _END = Recording("a", "/a"), End(0, "", 1.0, 1.0)
+_RECORDING, _END = BatchRecording("a", "/a"), End(0, "", 1.0, 1.0)
 
 
 class Refused(ValueError):
@@ -79,11 +79,11 @@ def _written(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path
 
 
 def _read_whole(path: Path) -> object:
-    return whole.read_whole(path.parent)
+    return whole.read_map_set(path.parent)
 
 
 def _read_report(path: Path) -> object:
-    found = answer.outcome(_RECORDING, path.parent, _END)
+    found = answer.read_outcome(_RECORDING, path.parent, _END)
     if not is_printable(found.message) or not is_printable(found.verdict):
         raise AssertionError(f"a row that is not printable: {found.message!a}")
     return found
@@ -130,11 +130,11 @@ def _read_last_run(data: bytes, folder: Path) -> object:
 
 
 def _read_manifest(path: Path) -> object:
-    return digests(path)
+    return read_digests(path)
 
 
 def _read_list(path: Path) -> object:
-    return [os.fsencode(each) for each in listed(path, ())]
+    return [os.fsencode(each) for each in read_list(path, ())]
 
 
 def _draw_list(rng: random.Random) -> bytes:
@@ -158,7 +158,7 @@ def _draw_name(rng: random.Random) -> bytes:
 
 def _read_name(data: bytes, folder: Path) -> object:
     name = os.fsdecode(data.replace(b"\0", b""))
-    shown = printable_name(name)
+    shown = sanitize_name(name)
     if not is_printable(shown, 255):
         raise AssertionError(f"a name that is not printable: {shown!a}")
     told = name_time(name)
@@ -223,7 +223,7 @@ def _server(key: str | None) -> web.Server:
     web._WAIT_S = 0.0
     server = web.Server(Board(), "127.0.0.1", 0, key)
     server.access = replace(server.access, port=8347)
-    server.board.put({"good": None}, Content(Moment(_snapshot(), 0.0), None), live=False)
+    server.board.publish({"good": None}, Content(Moment(_snapshot(), 0.0), None), live=False)
     return server
 
 
@@ -262,8 +262,8 @@ def _read_shown(parts: messages.Parts, folder: Path) -> object:
     """A scene as far as the browser's page and the panel show it."""
     from splatnode.capture.messaging.wire import Limits, decode
 
-    snapshot = from_message(decode(parts, SceneHeader, Limits(1 << 16, 64, 4, 1 << 20))).snapshot
-    moment = Moment(_safe(snapshot), time.monotonic(), "scene-1")
+    snapshot = decode_snapshot(decode(parts, SceneHeader, Limits(1 << 16, 64, 4, 1 << 20))).snapshot
+    moment = Moment(_sanitize_snapshot(snapshot), time.monotonic(), "scene-1")
     content = Content(moment, None)
     lines = [
         *words.verdict_lines(moment),
@@ -272,7 +272,7 @@ def _read_shown(parts: messages.Parts, folder: Path) -> object:
         *words.view_depth_lines(moment, 100),
         *words.count_lines(moment),
         *words.place_lines(moment),
-        *words.dropped_lines(moment, 200),
+        *words.rejection_lines(moment, 200),
         *words.scale_lines(moment, ground(moment)),
     ]
     shapes = np.frombuffer(content.shapes, np.uint8).size + len(content.gaussians)
@@ -281,7 +281,7 @@ def _read_shown(parts: messages.Parts, folder: Path) -> object:
 
 def _read_key(path: Path) -> object:
     path.chmod(0o600)
-    return kept_key(path)
+    return load_or_create_key(path)
 
 
 def _draw_key(rng: random.Random) -> bytes:
@@ -313,7 +313,7 @@ _NAMES = Reader((ValueError,), ("splatnode.capture.name_time", "splatnode.captur
 _ARGUMENTS = Reader((Refused,), ("splatnode.capture.process.arguments", "splatnode.capture.process.lengths"))
 _REQUESTS = Reader((Refused,), (f"{_WEB}.server", f"{_WEB}.access"))
 _SHOWN = Reader((ValueError,), (f"{_WEB}.content", "splatnode.viewer.words"))
-_KEYS = Reader((ValueError, NotPrivate), (f"{_WEB}.access",))
+_KEYS = Reader((ValueError, NotOwnerOnly), (f"{_WEB}.access",))
 
 DOCUMENTS = (
     Boundary(

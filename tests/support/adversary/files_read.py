@@ -21,10 +21,10 @@ from splatnode.capture.logged.calibration import lens
 from splatnode.capture.logged.message import Calibration, UnusableMessage
 from splatnode.capture.logged.pixels import rgb
 from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES
-from splatnode.capture.masks import UnusableMask, masked, read_mask
+from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
 from splatnode.capture.orientation import ORIENTATION
 from splatnode.capture.poses_file import PosesFileError, read_poses
-from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.depth_file import decode_depths
 from splatnode.recon.result.export.error import SceneFileError
@@ -66,7 +66,7 @@ def written(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path]
 def _read_poses(files: stored.Files, folder: Path) -> object:
     stored.lay(files, folder)
     trajectory = read_poses(folder / next(iter(files)))
-    return trajectory, trajectory.of(_FRAMES)
+    return trajectory, trajectory.find_poses(_FRAMES)
 
 
 def _read_exif(tiff: bytes, folder: Path) -> object:
@@ -79,7 +79,7 @@ def _read_header(data: bytes, folder: Path) -> object:
     check_whole(data)
     size = upright_size(data)
     if size is None and jpeg2000.is_jpeg2000(data):
-        return jpeg2000.stated_size(data)
+        return jpeg2000.read_size(data)
     return size
 
 
@@ -103,7 +103,7 @@ def _measure(data: bytes, folder: Path) -> object:
 
 def _read_logged(case: tuple[bytes, bytes], folder: Path) -> object:
     kind, data = case
-    with foreign(UnusableMessage):
+    with guard_untrusted(UnusableMessage):
         found = _KINDS[kind.decode() if kind.decode("ascii", "replace") in _KINDS else "raw cdr"](data)
         if isinstance(found, Calibration):
             return lens("/front/image_rect", found), lens("/front/image_raw", found)
@@ -118,7 +118,7 @@ def _read_data_set(files: stored.Files, folder: Path) -> object:
     (folder / "meta" / "episodes" / "chunk-000").mkdir(parents=True, exist_ok=True)
     (folder / data_set.INFO).write_bytes(files["info.json"] or b"")
     (folder / data_set.EPISODES / "chunk-000" / "file-000.parquet").write_bytes(files["file-000.parquet"] or b"")
-    found = [data_set.film(folder, part) for part in data_set.parts(folder)[:2]]
+    found = [data_set.film(folder, part) for part in data_set.list_parts(folder)[:2]]
     if any(folder not in film.video.parents for film in found):
         raise AssertionError(f"leads out of the folder: {[film.video for film in found]}")
     return found
@@ -134,7 +134,7 @@ def _read_weights(files: stored.Files, folder: Path) -> object:
 def _read_mask(data: bytes, folder: Path) -> object:
     path = folder / "view_0.png"
     path.write_bytes(data)
-    return masked(_FRAMES[0], read_mask(path, _FRAMES[0]))
+    return apply_mask(_FRAMES[0], read_mask(path, _FRAMES[0]))
 
 
 def _draw_exif(rng: random.Random) -> bytes:

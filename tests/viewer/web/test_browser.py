@@ -14,11 +14,11 @@ from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.paint import paint_gaussians
-from splatnode.viewer.sources import Finished
-from splatnode.viewer.state import State
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, look_at, orbited, panned, zoomed
-from splatnode.viewer.web.said import said
-from splatnode.viewer.web.stage import Place, newest, serving
+from splatnode.viewer.sources import FixedSource
+from splatnode.viewer.state import ViewerState
+from splatnode.viewer.viewpoint import Viewpoint, look_at, move_to_camera, orbit, pan, zoom
+from splatnode.viewer.web.said import describe_session
+from splatnode.viewer.web.stage import ListenAddress, make_content, open_server
 from tests.bench.viewer.drive_web import WINDOW, drive, fact, settle, watched
 from tests.support.chromium import NAMES, browser, chromium
 from tests.viewer.test_scene import camera, moment, wall
@@ -77,8 +77,10 @@ def test_the_picture_is_that_of_the_projects_own_rasteriser(visit):
         page.press(key)
     settle(page)
     width, height = page.value("[document.getElementById('picture').clientWidth, innerHeight]")
-    view = at_camera(start(), whole.cameras[4])
-    ours = paint_gaussians(whole.gaussians, view.T_world_camera, view.K(width, height), State(), width, height).image
+    view = move_to_camera(start(), whole.cameras[4])
+    ours = paint_gaussians(
+        whole.gaussians, view.T_world_camera, view.K(width, height), ViewerState(), width, height
+    ).image
     theirs = cv2.cvtColor(page.picture()[:height, :width], cv2.COLOR_BGR2RGB)
     assert (np.abs(ours.astype(int) - BACKGROUND).max(2) > 20).mean() > 0.2  # there is something to compare
     difference = np.abs(ours.astype(int) - theirs)
@@ -94,10 +96,10 @@ def test_it_moves_as_the_window_does(visit):
     given |= {"lens": {"K": view.lens[0].ravel().tolist(), "size": view.lens[1:]}}
     answer = page.value(f"({script})({json.dumps(given)})")
     for name, ours in (
-        ("orbited", orbited(view, 0.3, -0.2)),
-        ("high", orbited(view, 0.0, 3.0)),
-        ("panned", panned(view, 12.0, -7.0, float(K[0, 0]))),
-        ("zoomed", zoomed(view, 0.7)),
+        ("orbited", orbit(view, 0.3, -0.2)),
+        ("high", orbit(view, 0.0, 3.0)),
+        ("panned", pan(view, 12.0, -7.0, float(K[0, 0]))),
+        ("zoomed", zoom(view, 0.7)),
     ):
         assert np.allclose(np.reshape(answer[name]["T"], (4, 4)), ours.T_world_camera, atol=1e-9), name
         assert answer[name]["distance"] == pytest.approx(ours.distance)
@@ -126,13 +128,13 @@ def test_a_page_that_stays_open_shows_what_another_viewer_at_that_address_shows(
     with browser(*WINDOW) as page:
         told = 0
         for number, count in enumerate((15, 24), start=1):
-            with serving(Finished(scene(count)), Place(port=port)) as (server, session):
+            with open_server(FixedSource(scene(count)), ListenAddress(port=port)) as (server, session):
                 if number == 1:
                     port = server.server_address[1]
                     page.open(server.access.url())
                 assert page.wait(f"{fetched('/told')} > {told}") is not None
                 session.receive()
-                server.board.put(said(session), newest(session, None), live=False)
+                server.board.publish(describe_session(session), make_content(session, None), live=False)
                 assert page.wait(f"{fact('gaussians')} == {len(wall(count))}") is not None
                 assert page.wait(f"{fetched('/thumbnail/')} == {number}") is not None
                 told = page.value(fetched("/told"))

@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.recon.result.bounds import Bounds, ball
+from splatnode.recon.result.bounds import Bounds, make_ball
 from splatnode.recon.result.export.formats.splat import decode
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.moment import Moment
-from splatnode.viewer.sources import Finished
+from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.web import server as server_module
 from splatnode.viewer.web.board import Board
 from splatnode.viewer.web.content import Content
-from splatnode.viewer.web.said import said
+from splatnode.viewer.web.said import describe_session
 from splatnode.viewer.web.server import Server
-from splatnode.viewer.web.stage import Place, newest, serving
+from splatnode.viewer.web.stage import ListenAddress, make_content, open_server
 from tests.capture.messaging.test_sockets import wait_for
 from tests.viewer.test_scene import camera, moment, wall
 
@@ -51,9 +51,9 @@ def scene(count: int = 15, **changes: object) -> Moment:
 @contextlib.contextmanager
 def shown(what: Moment, key: str | None = None) -> Iterator[Server]:
     """A server of one moment."""
-    with serving(Finished(what), Place(port=0, key=key)) as (server, session):
+    with open_server(FixedSource(what), ListenAddress(port=0, key=key)) as (server, session):
         session.receive()
-        server.board.put(said(session), newest(session, None), live=False)
+        server.board.publish(describe_session(session), make_content(session, None), live=False)
         yield server
 
 
@@ -130,7 +130,7 @@ def test_what_strangers_named_is_printable_and_stays_json():
 
 @pytest.mark.parametrize("number", [1e-320, 5e-324, 1e-12, 1e300, 1.7e308])
 def test_no_number_of_a_scene_ends_the_viewer(number):
-    bounds = Bounds(number, number, number, number, ball(number))
+    bounds = Bounds(number, number, number, number, make_ball(number))
     one = moment(wall(3), replace(camera(0.0), bounds=bounds), scale=Scale(True, "a ruler"))
     with shown(one) as server:
         assert "(95 % bounds)" in json.dumps(told(server))
@@ -164,21 +164,21 @@ def test_news_reach_who_waits_and_say_what_is_new():
     server.start()
     try:
         first = Content(scene(), None)
-        board.put({"state": "one"}, first, live=True)
+        board.publish({"state": "one"}, first, live=True)
         one = told(server)
         waiter = threading.Thread(target=lambda: heard.append(told(server, one["run"], one["number"])))
         waiter.start()
         time.sleep(0.2)
         assert not heard  # nothing is new
-        board.put({"state": "one"}, first, live=True)
+        board.publish({"state": "one"}, first, live=True)
         time.sleep(0.1)
         assert not heard  # nor is the same
-        board.put({"state": "two"}, first, live=True)
+        board.publish({"state": "two"}, first, live=True)
         waiter.join(5)
         assert heard[0]["said"] == {"state": "two"} and (heard[0]["gaussians"], heard[0]["shapes"]) == (1, 1)
-        board.put({"state": "two"}, Content(first.moment, None), live=True)  # only its advice is another
+        board.publish({"state": "two"}, Content(first.moment, None), live=True)  # only its advice is another
         assert (told(server)["gaussians"], told(server)["shapes"]) == (1, 2)
-        board.put({"state": "two"}, Content(scene(7), None), live=True)
+        board.publish({"state": "two"}, Content(scene(7), None), live=True)
         now = told(server, "another", one["number"])
         assert (now["gaussians"], now["shapes"]) == (2, 3) and now["age_s"] is not None
         assert ask(server, "/gaussians/1")[0] == 404 and len(ask(server, "/gaussians/2")[2]) == 49 * 32

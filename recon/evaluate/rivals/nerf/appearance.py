@@ -13,7 +13,7 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.appearance import FieldSnapshot
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.nerf.field import Field
-from splatnode.recon.evaluate.rivals.nerf.fit import Learnt
+from splatnode.recon.evaluate.rivals.nerf.fit import FieldCheckpoint
 from splatnode.recon.evaluate.rivals.nerf.volume_rendering import render_rays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
@@ -40,13 +40,13 @@ class FieldAppearance:
         with torch.no_grad():
             return float(
                 render_rays(
-                    self._field, torch.from_numpy(T_world_camera).float(), K, spread_pixels(100, 100)
+                    self._field, torch.from_numpy(T_world_camera).float(), K, sample_pixels(100, 100)
                 ).depth.median()
             )
 
     def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor, used: Tensor | None = None) -> Tensor:
         """On the same pixels whenever it is asked, evenly spread over the image, or over what is `used` of it."""
-        pixels = spread_pixels(image.shape[1], image.shape[0]) if used is None else _spread_over(used)
+        pixels = sample_pixels(image.shape[1], image.shape[0]) if used is None else _sample_used_pixels(used)
         columns, rows = pixels.long().unbind(1)
         return (render_rays(self._field, T_world_camera, K, pixels).rgb - image[rows, columns]).abs().mean()
 
@@ -59,14 +59,14 @@ class FieldAppearance:
         return rgb.view(height, width, 3)
 
 
-def spread_pixels(width: int, height: int, count: int = COMPARED_PIXELS) -> Tensor:
+def sample_pixels(width: int, height: int, count: int = COMPARED_PIXELS) -> Tensor:
     """(M, 2) centres of pixels that cover an image evenly: the additive sequence of the plastic number."""
     plastic = 1.32471795724474602596
     shares = torch.arange(1, count + 1)[:, None] * torch.tensor([1 / plastic, 1 / plastic**2]) % 1.0
     return (shares * torch.tensor([width, height])).floor() + 0.5
 
 
-def _spread_over(used: Tensor) -> Tensor:
+def _sample_used_pixels(used: Tensor) -> Tensor:
     """(M, 2) centres of pixels among those of `used` (H, W): the additive sequence of the golden ratio."""
     rows, columns = torch.nonzero(used, as_tuple=True)
     shares = torch.arange(1, COMPARED_PIXELS + 1) * 0.61803398874989484820 % 1.0
@@ -74,13 +74,14 @@ def _spread_over(used: Tensor) -> Tensor:
     return torch.stack([columns[chosen], rows[chosen]], 1) + 0.5
 
 
-def snapshot_of_field(frames: Sequence[Frame], registered: Sequence[Frame], learnt: Learnt) -> FieldSnapshot:
+def make_field_snapshot(frames: Sequence[Frame], registered: Sequence[Frame], learnt: FieldCheckpoint) -> FieldSnapshot:
     """A field and the cameras that were learnt with it, those of the frames `registered`."""
     return FieldSnapshot(
         sequence=0,
-        verdict=outcome.verdict(frames, {frame.name for frame in registered}),
+        verdict=outcome.make_verdict(frames, {frame.name for frame in registered}),
         cameras=tuple(
-            _camera(frame, T, learnt.focal) for frame, T in zip(registered, learnt.Ts_world_camera, strict=True)
+            _make_camera_estimate(frame, T, learnt.focal)
+            for frame, T in zip(registered, learnt.Ts_world_camera, strict=True)
         ),
         gaussians=GaussianArrays.empty(),
         images={},
@@ -90,7 +91,7 @@ def snapshot_of_field(frames: Sequence[Frame], registered: Sequence[Frame], lear
     )
 
 
-def _camera(frame: Frame, T_world_camera: Tensor, focal: float) -> CameraEstimate:
+def _make_camera_estimate(frame: Frame, T_world_camera: Tensor, focal: float) -> CameraEstimate:
     width, height = frame.width, frame.height
     pixels = focal * max(width, height)
     K = np.array([[pixels, 0, width / 2], [0, pixels, height / 2], [0, 0, 1.0]])

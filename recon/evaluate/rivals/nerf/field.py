@@ -31,14 +31,14 @@ class Field(nn.Module):
 
     def forward(self, points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         z = points[:, 2:].clamp_min(_NEAREST_Z)
-        features = encoded(torch.cat([points[:, :2] / z, 1 / z], 1), POINT_OCTAVES)
+        features = encode_frequencies(torch.cat([points[:, :2] / z, 1 / z], 1), POINT_OCTAVES)
         for layer in self.hidden:
             features = functional.relu(layer(features))
         density = functional.softplus(self.density(features)[:, 0])
-        return density, self.colour(torch.cat([features, encoded(directions, DIRECTION_OCTAVES)], 1))
+        return density, self.colour(torch.cat([features, encode_frequencies(directions, DIRECTION_OCTAVES)], 1))
 
 
-def encoded(x: Tensor, octaves: int) -> Tensor:
+def encode_frequencies(x: Tensor, octaves: int) -> Tensor:
     """(M, D + 2 D octaves) x (M, D) with its sines and cosines at frequencies of pi / 2, pi, 2 pi, ..."""
     scaled = x[:, None] * (2.0 ** torch.arange(-1, octaves - 1, dtype=x.dtype, device=x.device) * math.pi)[:, None]
     return torch.cat([x, scaled.sin().flatten(1), scaled.cos().flatten(1)], 1)

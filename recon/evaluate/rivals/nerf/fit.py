@@ -16,7 +16,7 @@ from splatnode.recon.evaluate.rivals.nerf.field import Field
 from splatnode.recon.evaluate.rivals.nerf.volume_rendering import RenderedRays, render_rays
 
 
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FitConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: int = 1500
     checkpoints: tuple[int, ...] = (400,)
     rays: int = 384  # of one photograph, in each iteration
@@ -27,7 +27,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Learnt:
+class FieldCheckpoint:
     """A field with its cameras after a number of iterations."""
 
     field: Field
@@ -37,8 +37,8 @@ class Learnt:
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """What an iteration has rendered, for further losses."""
+class FitStep:
+    """The renders of an iteration, for further losses."""
 
     view: int
     pixels: Tensor  # (M, 2)
@@ -47,16 +47,16 @@ class Step:
     progress: float  # of all iterations, in [0, 1)
 
 
-def learn(
+def fit_field(
     images: Sequence[Tensor],  # (h, w, 3) in [0, 1]
     used: Sequence[Tensor | None],  # (h, w) where the colours of each count; None: everywhere
     focal: Focal,
-    config: Config,
+    config: FitConfig,
     *,
     seed: int,
-    further: Callable[[Step], Tensor] | None = None,
+    further: Callable[[FitStep], Tensor] | None = None,
     beside: Sequence[nn.Parameter] = (),
-) -> Iterator[Learnt]:
+) -> Iterator[FieldCheckpoint]:
     """The field at every checkpoint and at the end.
 
     The loss is the mean squared difference of the colours of random pixels, plus what `further` gives; `beside` are
@@ -84,18 +84,18 @@ def learn(
         pixels = pixels.floor() + 0.5
         rays = render_rays(field, cameras.T_world_camera(view), focal.K(width, height), pixels, draws)
         columns, rows = pixels.long().unbind(1)
-        loss = _colours((rays.rgb - images[view][rows, columns]).square(), used[view], rows, columns)
+        loss = _compute_colour_loss((rays.rgb - images[view][rows, columns]).square(), used[view], rows, columns)
         if further is not None:
-            loss = loss + further(Step(view, pixels, rays, cameras, progress))
+            loss = loss + further(FitStep(view, pixels, rays, cameras, progress))
         adam.zero_grad()
         loss.backward()
         adam.step()
         if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
-            yield _learnt(field, cameras, focal, iteration + 1)
-    yield _learnt(field, cameras, focal, config.iterations)
+            yield _make_checkpoint(field, cameras, focal, iteration + 1)
+    yield _make_checkpoint(field, cameras, focal, config.iterations)
 
 
-def _colours(squares: Tensor, used: Tensor | None, rows: Tensor, columns: Tensor) -> Tensor:
+def _compute_colour_loss(squares: Tensor, used: Tensor | None, rows: Tensor, columns: Tensor) -> Tensor:
     """The mean of the squared differences (M, 3) of the pixels that are used."""
     if used is None:
         return squares.mean()
@@ -103,6 +103,6 @@ def _colours(squares: Tensor, used: Tensor | None, rows: Tensor, columns: Tensor
     return (squares.mean(1) * counted).sum() / counted.sum().clamp_min(1)
 
 
-def _learnt(field: Field, cameras: Cameras, focal: Focal, iterations: int) -> Learnt:
+def _make_checkpoint(field: Field, cameras: Cameras, focal: Focal, iterations: int) -> FieldCheckpoint:
     Ts = tuple(cameras.T_world_camera(index).detach() for index in range(len(cameras.turns)))
-    return Learnt(deepcopy(field), Ts, float(focal.root.detach() ** 2), iterations)
+    return FieldCheckpoint(deepcopy(field), Ts, float(focal.root.detach() ** 2), iterations)

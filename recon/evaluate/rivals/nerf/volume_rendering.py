@@ -38,11 +38,11 @@ def render_rays(
     points = T_world_camera[:3, 3] + directions[:, None] * z[..., None]
     unit = functional.normalize(directions, dim=1)[:, None].expand_as(points)
     density, rgb = field(points.reshape(-1, 3), unit.reshape(-1, 3))
-    weights = _weights(density.view(z.shape), z * directions.norm(dim=1, keepdim=True))
+    weights = _compute_weights(density.view(z.shape), z * directions.norm(dim=1, keepdim=True))
     return RenderedRays((weights[..., None] * rgb.view(*z.shape, 3)).sum(1), (weights * z).sum(1))
 
 
-def _weights(density: Tensor, distance: Tensor) -> Tensor:
+def _compute_weights(density: Tensor, distance: Tensor) -> Tensor:
     """(M, S) what each sample adds to its ray, the last of them all that is left: nothing lies behind it."""
     optical = (density[:, :-1] * (distance[:, 1:] - distance[:, :-1])).clamp_max(_OPAQUE)
     opacity = torch.cat([1.0 - torch.exp(-optical), torch.ones_like(density[:, :1])], 1)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.optimize import lsq_linear
 
 from splatnode.recon.evaluate.stability.fitting.samples import Sample
-from splatnode.recon.verification.claims import MIN_INLIER_RATIO, BoundModel, ClaimModel
+from splatnode.recon.verification.claims import MIN_INLIER_RATIO, BoundModel, ErrorModel
 from splatnode.recon.verification.errors import Errors
 
 Array = npt.NDArray[np.float64]
@@ -27,7 +27,7 @@ FLOORS = {"rotation": 0.1, "centre": 2e-4, "focal": 2e-3}
 
 
 @dataclass(frozen=True)
-class _Line:
+class _ErrorSample:
     """One camera's error and what was said of it."""
 
     scene: str
@@ -40,21 +40,21 @@ class _Line:
     broken: bool  # what its set takes for granted of lenses, on purpose
 
 
-def fit(samples: Sequence[Sample]) -> ClaimModel:
+def fit(samples: Sequence[Sample]) -> ErrorModel:
     """From registrations that are not grossly wrong, each scene with the square root of its number of cameras.
 
     Sets that break what is assumed of lenses say how much wider bounds are where an image has a lens of its own, and
     nothing else: where nothing tells that they do, they look like any other.
     """
-    usable = [sample for sample in samples if not sample.gross and (sample.own_lens or not sample.broken)]
-    return ClaimModel(
-        rotation=_fitted(_lines(usable, "rotation"), FLOORS["rotation"]),
-        centre=_fitted(_lines(usable, "centre"), FLOORS["centre"], link=True),
-        focal=_fitted(_lines(usable, "focal"), FLOORS["focal"], profile=True),
+    usable = [sample for sample in samples if not sample.is_gross and (sample.own_lens or not sample.broken)]
+    return ErrorModel(
+        rotation=_fit_bound_model(_collect_samples(usable, "rotation"), FLOORS["rotation"]),
+        centre=_fit_bound_model(_collect_samples(usable, "centre"), FLOORS["centre"], link=True),
+        focal=_fit_bound_model(_collect_samples(usable, "focal"), FLOORS["focal"], profile=True),
     )
 
 
-def _lines(samples: Sequence[Sample], kind: str) -> list[_Line]:
+def _collect_samples(samples: Sequence[Sample], kind: str) -> list[_ErrorSample]:
     lines = []
     for sample in samples:
         count, link = len(sample.evidence.cameras), sample.evidence.weakest_link.inlier_ratio
@@ -63,17 +63,19 @@ def _lines(samples: Sequence[Sample], kind: str) -> list[_Line]:
             found = sample.errors[camera.name]
             if kind == "rotation":
                 sizes = found.rotation_deg, camera.errors.rotation
-                lines.append(_Line(sample.scene, *sizes, camera.inlier_ratio, *of_set))
+                lines.append(_ErrorSample(sample.scene, *sizes, camera.inlier_ratio, *of_set))
             elif kind == "centre":
                 centre = (found.centre_pct or 0.0) / 100.0
-                lines.append(_Line(sample.scene, centre, camera.errors.centre, camera.inlier_ratio, *of_set))
+                lines.append(_ErrorSample(sample.scene, centre, camera.errors.centre, camera.inlier_ratio, *of_set))
             else:
                 focal = float(np.abs(np.log1p(max(found.focal_pct, -99.0) / 100.0)))
-                lines.append(_Line(sample.scene, focal, camera.focal, 1.0, 1.0, *of_set[1:]))
+                lines.append(_ErrorSample(sample.scene, focal, camera.focal, 1.0, 1.0, *of_set[1:]))
     return lines
 
 
-def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: bool = False) -> BoundModel:
+def _fit_bound_model(
+    lines: Sequence[_ErrorSample], floor: float, profile: bool = False, link: bool = False
+) -> BoundModel:
     """The powers, then the quantile of what is left.
 
     More of a source never narrows a bound, and more explained matches never widen it. The profile counts if `profile`
@@ -86,7 +88,7 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
     wanted = np.log(np.hypot([line.error for line in lines], floor / 3.0))
     varies = len({line.count for line in lines}) > 1
     used = {"sigma": True, "regions": True, "profile": profile, "inlier_ratio": True, "link": link, "count": varies}
-    columns = np.array([_logarithms(line, floor) for line in lines])
+    columns = np.array([_compute_logarithms(line, floor) for line in lines])
     columns = columns * np.array([float(each) for each in used.values()])
     design = np.column_stack([np.ones(len(lines)), columns])
     least = np.array([-np.inf, 0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf])
@@ -105,7 +107,7 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
     found |= {"factor": np.exp(powers[0] + of_common), "floor": floor}
     mixed = [line for line in whole if line.own_lens]
     if len(mixed) >= MIN_OWN_LENSES:
-        columns = np.array([_logarithms(line, floor) for line in mixed]) * np.array(
+        columns = np.array([_compute_logarithms(line, floor) for line in mixed]) * np.array(
             [float(each) for each in used.values()]
         )
         errors = np.log(np.hypot([line.error for line in mixed], floor / 3.0))
@@ -115,7 +117,7 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
     return BoundModel(**{name: float(f"{number:.3g}") for name, number in found.items()})
 
 
-def _logarithms(line: _Line, floor: float) -> list[float]:
+def _compute_logarithms(line: _ErrorSample, floor: float) -> list[float]:
     sources = (line.errors.sigma, line.errors.regions, line.errors.profile)
     shares = (_log_share(line.inlier_ratio), _log_share(line.link))
     return [*(float(np.log(np.hypot(each, floor))) for each in sources), *shares, float(np.log(line.count))]

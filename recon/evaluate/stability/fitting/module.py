@@ -6,28 +6,28 @@ from dataclasses import fields
 
 from splatnode.recon.verification.claims import BoundModel
 from splatnode.recon.verification.likelihood import Term
-from splatnode.recon.verification.models import Fitted, Numbers
+from splatnode.recon.verification.models import VerdictModel, VerdictModels
 
 HEAD = '''"""The numbers of the verdict. Written by `python -m tests.bench fit`; do not edit."""
 
 from __future__ import annotations
 
-from splatnode.recon.verification.claims import BoundModel, ClaimModel
+from splatnode.recon.verification.claims import BoundModel, ErrorModel
 from splatnode.recon.verification.likelihood import OddsModel, Term
-from splatnode.recon.verification.models import Fitted, Numbers
+from splatnode.recon.verification.models import VerdictModels, VerdictModel
 
 '''
 
 
-def source(numbers: Fitted) -> str:
+def format_module(numbers: VerdictModels) -> str:
     return HEAD + "\n".join(
-        ["FITTED = Fitted(", *_numbers("many", numbers.many), *_numbers("pair", numbers.pair), ")", ""]
+        ["FITTED = Fitted(", *_format_model("many", numbers.many), *_format_model("pair", numbers.pair), ")", ""]
     )
 
 
-def _numbers(name: str, numbers: Numbers) -> list[str]:
-    bounds = [f"            {f.name}={_call(getattr(numbers.claims, f.name))}," for f in fields(numbers.claims)]
-    terms = [f'                "{name}": {_call(term)},' for name, term in numbers.odds.terms.items()]
+def _format_model(name: str, numbers: VerdictModel) -> list[str]:
+    bounds = [f"            {f.name}={_format_call(getattr(numbers.claims, f.name))}," for f in fields(numbers.claims)]
+    terms = [f'                "{name}": {_format_call(term)},' for name, term in numbers.odds.terms.items()]
     return [
         f"    {name}=Numbers(",
         "        claims=ClaimModel(",
@@ -43,7 +43,7 @@ def _numbers(name: str, numbers: Numbers) -> list[str]:
     ]
 
 
-def _call(record: BoundModel | Term) -> str:
+def _format_call(record: BoundModel | Term) -> str:
     """The record as Python, in one line."""
     numbers = ", ".join(f"{field.name}={getattr(record, field.name)!r}" for field in fields(record))
     return f"{type(record).__name__}({numbers})"

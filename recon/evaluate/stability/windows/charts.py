@@ -17,19 +17,24 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator, PercentFormatter
 
 from splatnode.recon.evaluate.stability.windows.campaign import read_rows
-from splatnode.recon.evaluate.stability.windows.row import Found, Row
-from splatnode.recon.evaluate.stability.windows.summary import by_angle, by_count, by_method, within
+from splatnode.recon.evaluate.stability.windows.row import WindowOutcome, WindowRow
+from splatnode.recon.evaluate.stability.windows.summary import (
+    compute_share_within,
+    group_by_angle,
+    group_by_count,
+    group_by_method,
+)
 from splatnode.recon.result.export.staged import write_files
 
 _INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
 # Blue is right and vermilion is dangerous, as in the other charts: told apart with any colour vision.
 _FOUND = {  # from the bottom of a bar to its top
-    Found.RIGHT: ("#2F7FB5", "published: right, all photographs placed"),
-    Found.RIGHT_PART: ("#9CC9E8", "published: right, some photographs left out"),
-    Found.BETWEEN: ("#F2D98B", "published: less exact, not wrong"),
-    Found.WRONG: ("#D55E00", "published: wrong"),
-    Found.REFUSED: ("#ECECEC", "no cameras published"),
-    Found.FAILED: ("#7F7F7F", "no answer"),
+    WindowOutcome.RIGHT: ("#2F7FB5", "published: right, all photographs placed"),
+    WindowOutcome.RIGHT_PART: ("#9CC9E8", "published: right, some photographs left out"),
+    WindowOutcome.BETWEEN: ("#F2D98B", "published: less exact, not wrong"),
+    WindowOutcome.WRONG: ("#D55E00", "published: wrong"),
+    WindowOutcome.REFUSED: ("#ECECEC", "no cameras published"),
+    WindowOutcome.FAILED: ("#7F7F7F", "no answer"),
 }
 _COUNT_COLOURS = ("#CC79A7", "#0072B2", "#009E73", "#E69F00")
 _NAMES = {"colmap": "COLMAP", "glomap": "GLOMAP"}
@@ -42,13 +47,13 @@ _WRONG_BELOW = (
 )
 
 
-def draw(rows: Sequence[Row], out: Path) -> list[str]:
+def draw(rows: Sequence[WindowRow], out: Path) -> list[str]:
     """Writes the charts to `out` and returns their names; those that there is nothing to draw for are left out."""
     figures = {}
     if rows:
-        figures["windows.png"] = figure_of_shares(rows)
-    if any(camera.claimed() for row in rows if row.published for camera in row.cameras):
-        figures["calibration.png"] = figure_of_claims(rows)
+        figures["windows.png"] = make_shares_figure(rows)
+    if any(camera.pair_with_bounds() for row in rows if row.published for camera in row.cameras):
+        figures["calibration.png"] = make_bounds_figure(rows)
     for name, figure in figures.items():
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", facecolor="white")
@@ -56,18 +61,18 @@ def draw(rows: Sequence[Row], out: Path) -> list[str]:
     return list(figures)
 
 
-def figure_of_shares(rows: Sequence[Row]) -> Figure:
+def make_shares_figure(rows: Sequence[WindowRow]) -> Figure:
     """A panel a method: shares of what was published, by the angle between neighbouring views."""
-    methods = by_method(rows)
+    methods = group_by_method(rows)
     width, height = 1.0 + 3.6 * max(len(methods), 2), 4.6
     figure = Figure(figsize=(width, height), dpi=150)
     for number, (method, mine) in enumerate(methods.items()):
         share = (width - 1.0) / len(methods) / width
         axes = figure.add_axes((0.7 / width + number * share, 1.3 / height, share - 0.15 / width, 2.6 / height))
-        _shares(axes, method, mine, labelled=number == 0)
+        _draw_shares(axes, method, mine, labelled=number == 0)
     title = "Windows of 3, 6 and 12 consecutive photographs, by the angle between neighbouring views"
     figure.text(0.1 / width, 1.0 - 0.3 / height, title, color=_INK, fontsize=11 if len(methods) > 2 else 8.5)
-    there = {row.found for row in rows}
+    there = {row.outcome for row in rows}
     handles = [Patch(color=colour, label=text) for found, (colour, text) in _FOUND.items() if found in there]
     figure.legend(
         handles=handles, loc="lower left", bbox_to_anchor=(0.0, 0.42 / height), ncols=3, frameon=False, fontsize=7.5
@@ -76,16 +81,16 @@ def figure_of_shares(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _shares(axes: Axes, method: str, rows: Sequence[Row], *, labelled: bool) -> None:
-    bins = {name: some for name, some in by_angle(rows).items() if some}
+def _draw_shares(axes: Axes, method: str, rows: Sequence[WindowRow], *, labelled: bool) -> None:
+    bins = {name: some for name, some in group_by_angle(rows).items() if some}
     for x, some in enumerate(bins.values()):
         bottom = 0.0
         for found, (colour, _) in _FOUND.items():
-            count = sum(row.found is found for row in some)
+            count = sum(row.outcome is found for row in some)
             share = count / len(some)
             axes.bar(x, share, 0.82, bottom=bottom, color=colour, edgecolor="white", linewidth=0.8)
             if count:
-                ink = "white" if found in (Found.RIGHT, Found.WRONG, Found.FAILED) else _INK
+                ink = "white" if found in (WindowOutcome.RIGHT, WindowOutcome.WRONG, WindowOutcome.FAILED) else _INK
                 axes.text(x, bottom + share / 2, str(count), ha="center", va="center", fontsize=6.5, color=ink)
             bottom += share
     axes.set_xticks(range(len(bins)), [f"{name}°\n{len(some)} sets" for name, some in bins.items()])
@@ -94,31 +99,36 @@ def _shares(axes: Axes, method: str, rows: Sequence[Row], *, labelled: bool) -> 
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.tick_params(length=0, labelsize=6.5, colors=_INK, labelleft=labelled)
     axes.spines[:].set_visible(False)
-    right = sum(row.found in (Found.RIGHT, Found.RIGHT_PART) for row in rows)
-    wrong = sum(row.found is Found.WRONG for row in rows)
+    right = sum(row.outcome in (WindowOutcome.RIGHT, WindowOutcome.RIGHT_PART) for row in rows)
+    wrong = sum(row.outcome is WindowOutcome.WRONG for row in rows)
     name = _NAMES.get(method, method)
     axes.set_title(f"{name}: {right} of {len(rows)} right, {wrong} wrong", loc="left", fontsize=9, color=_INK)
     if labelled:
         axes.set_ylabel("share of the sets", fontsize=7.5, color=_MUTED)
 
 
-def figure_of_claims(rows: Sequence[Row]) -> Figure:
+def make_bounds_figure(rows: Sequence[WindowRow]) -> Figure:
     """A panel a kind of error: what was found against what was claimed, a dot a published camera."""
     width, height = 9.6, 5.0
     figure = Figure(figsize=(width, height), dpi=150)
     for number, (kind, text) in enumerate(_CLAIMS.items()):
         axes = figure.add_axes(((0.75 + 4.75 * number) / width, 0.55 / height, 3.95 / width, 3.85 / height))
-        _claims(axes, kind, text, by_count([row for row in rows if row.published]))
+        _draw_bounds(axes, kind, text, group_by_count([row for row in rows if row.published]))
     title = "What the 95 % bounds are worth: the error of each published camera against its bound"
     figure.text(0.1 / width, 1.0 - 0.3 / height, title, color=_INK, fontsize=11)
     return figure
 
 
-def _claims(axes: Axes, kind: str, text: str, rows: dict[int, list[Row]]) -> None:
+def _draw_bounds(axes: Axes, kind: str, text: str, rows: dict[int, list[WindowRow]]) -> None:
     everything: list[tuple[float, float]] = []
     for (count, some), colour in zip(rows.items(), _COUNT_COLOURS * len(rows), strict=False):
-        pairs = [camera.claimed()[kind] for row in some for camera in row.cameras if kind in camera.claimed()]
-        share = within(pairs)
+        pairs = [
+            camera.pair_with_bounds()[kind]
+            for row in some
+            for camera in row.cameras
+            if kind in camera.pair_with_bounds()
+        ]
+        share = compute_share_within(pairs)
         if share is None:
             continue
         error, bound = np.maximum(np.array(pairs).T, _LEAST)

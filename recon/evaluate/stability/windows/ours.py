@@ -11,47 +11,47 @@ from typing import Literal
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate, estimate_cameras
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
-from splatnode.recon.evaluate.stability.places import Place
-from splatnode.recon.evaluate.stability.windows.row import Answer
-from splatnode.recon.evaluate.stability.windows.store import Key, Pieces, matched, plain_features
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.evaluate.stability.own_cameras import ensure_registration, list_registered_cameras
+from splatnode.recon.evaluate.stability.places import TrialScene
+from splatnode.recon.evaluate.stability.windows.row import WindowAnswer
+from splatnode.recon.evaluate.stability.windows.store import Key, Pieces, load_plain_features, match_keyframes
 from splatnode.recon.evaluate.stability.windows.window import Window
-from splatnode.recon.evaluate.timing import Timing, timing
+from splatnode.recon.evaluate.timing import Timing, measure_timing
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.jobs.alone import now
-from splatnode.recon.ladder.ladder import climbed
+from splatnode.recon.ladder.ladder import run_fallbacks
 from splatnode.recon.matching.match import match
-from splatnode.recon.matching.moving import without_moving
+from splatnode.recon.matching.moving import mask_moving_objects
 from splatnode.recon.preparation import load_prior, prepare
 
 Told = Literal["nothing", "exif", "given"]  # of the lens
 EXIF_ERROR = 0.03  # by which EXIF's focal length is off at most, of its logarithm
 
 
-def answered(
-    place: Place, window: Window, config: Config, fresh: bool, told: Told, known: Pieces
-) -> tuple[Answer, dict[Key, bytes]]:
+def answer_window(
+    place: TrialScene, window: Window, config: ReconstructionConfig, fresh: bool, told: Told, known: Pieces
+) -> tuple[WindowAnswer, dict[Key, bytes]]:
     """The answer, and what was found for it that is not `known` of the scene. It is called in a process of its own.
 
     `told`: what comes with the photographs, see `frames_of`; `fresh`: measures the seconds from photographs on, too.
     """
-    matcher, frames = load_prior(config).matcher, frames_of(place, window, told)
+    matcher, frames = load_prior(config).matcher, load_window_frames(place, window, told)
     kept, _, rejected = screen_all(frames, config.screening)
-    keyframes = [prepare(frame, config, plain_features(known, frame.name)) for frame in kept]
-    graph, found = matched(keyframes, known, config.matching, matcher)
-    graph = without_moving(graph, matcher)
+    keyframes = [prepare(frame, config, load_plain_features(known, frame.name)) for frame in kept]
+    graph, found = match_keyframes(keyframes, known, config.matching, matcher)
+    graph = mask_moving_objects(graph, matcher)
     since, started = now(), time.perf_counter()
-    estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
-    seconds, timed_on = time.perf_counter() - started, timing(since)
-    fresh_seconds, fresh_on = _fresh_seconds(frames, config) if fresh else (None, None)
-    estimate = registered(estimate, config)
-    cameras, evidence = cameras_of(estimate), estimate.evidence_record
-    return Answer(estimate.verdict, cameras, seconds, timed_on, fresh_seconds, fresh_on, evidence), found
+    estimate = run_fallbacks(estimate_cameras(graph, rejected, config), rejected, config)
+    seconds, timed_on = time.perf_counter() - started, measure_timing(since)
+    fresh_seconds, fresh_on = _time_fresh_run(frames, config) if fresh else (None, None)
+    estimate = ensure_registration(estimate, config)
+    cameras, evidence = list_registered_cameras(estimate), estimate.evidence_record
+    return WindowAnswer(estimate.verdict, cameras, seconds, timed_on, fresh_seconds, fresh_on, evidence), found
 
 
-def frames_of(place: Place, window: Window, told: Told = "nothing") -> list[Frame]:
+def load_window_frames(place: TrialScene, window: Window, told: Told = "nothing") -> list[Frame]:
     """The photographs without what masks hide; their ids are their positions in the scene.
 
     Nothing is known about the camera; or the true intrinsics are given; or EXIF tells the focal length alone, within
@@ -71,15 +71,15 @@ def frames_of(place: Place, window: Window, told: Told = "nothing") -> list[Fram
     return frames
 
 
-def from_scratch(frames: Sequence[Frame], config: Config) -> Estimate:
+def estimate_without_store(frames: Sequence[Frame], config: ReconstructionConfig) -> Reconstruction:
     """Cameras and verdict of the frames, with nothing kept of other windows."""
     kept, _, rejected = screen_all(frames, config.screening)
     matcher = load_prior(config).matcher
-    graph = without_moving(match([prepare(frame, config) for frame in kept], config.matching, matcher), matcher)
-    return climbed(estimate_cameras(graph, rejected, config), rejected, config)
+    graph = mask_moving_objects(match([prepare(frame, config) for frame in kept], config.matching, matcher), matcher)
+    return run_fallbacks(estimate_cameras(graph, rejected, config), rejected, config)
 
 
-def _fresh_seconds(frames: Sequence[Frame], config: Config) -> tuple[float, Timing]:
+def _time_fresh_run(frames: Sequence[Frame], config: ReconstructionConfig) -> tuple[float, Timing]:
     since, started = now(), time.perf_counter()
-    from_scratch(frames, config)
-    return time.perf_counter() - started, timing(since)
+    estimate_without_store(frames, config)
+    return time.perf_counter() - started, measure_timing(since)

@@ -7,9 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError, all_right, errors_of, whole_errors
+from splatnode.recon.evaluate.stability.claim import (
+    ROUGH,
+    CameraError,
+    has_only_right_cameras,
+    measure_camera_errors,
+    measure_set_errors,
+)
 from splatnode.recon.evaluate.stability.windows.window import Window
-from splatnode.recon.evaluate.timing import Timing, had_alone, most_taken
+from splatnode.recon.evaluate.timing import Timing, find_largest_share, had_alone
 from splatnode.recon.evaluate.truth import TrueCamera
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Verdict
@@ -19,8 +25,8 @@ FAILED = "FAILED"
 Key = tuple[str, int, int, int, str]
 
 
-class Found(enum.Enum):
-    """What became of a window, by what was published: right is within 2 degrees and 5 % of the centres' spread."""
+class WindowOutcome(enum.Enum):
+    """The outcome of a window, by what was published: right is within 2 degrees and 5 % of the spread."""
 
     RIGHT = "right"  # all photographs are placed
     RIGHT_PART = "right_part"  # those that are placed
@@ -31,8 +37,8 @@ class Found(enum.Enum):
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What a method says of a window."""
+class WindowAnswer:
+    """The answer of a method to a window."""
 
     verdict: Verdict | None  # None: there was no answer, `message` says why
     cameras: tuple[CameraEstimate, ...] = ()  # where nothing is published, those that were registered all the same
@@ -45,7 +51,7 @@ class Answer:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class WindowRow:
     """One line of windows.json. What was not measured is None."""
 
     scene: str
@@ -75,7 +81,7 @@ class Row:
     @property
     def right(self) -> bool:
         """Whether all cameras are right that there are, published or not."""
-        return all_right(self.cameras)
+        return has_only_right_cameras(self.cameras)
 
     @property
     def whole(self) -> bool:
@@ -83,29 +89,29 @@ class Row:
         return len(self.cameras) == self.count
 
     @property
-    def found(self) -> Found:
+    def outcome(self) -> WindowOutcome:
         if self.verdict == FAILED:
-            return Found.FAILED
+            return WindowOutcome.FAILED
         if not self.published:
-            return Found.REFUSED
-        if not self.cameras or any(camera.wrong(self.verdict == ROUGH) for camera in self.cameras):
-            return Found.WRONG
+            return WindowOutcome.REFUSED
+        if not self.cameras or any(camera.is_wrong(self.verdict == ROUGH) for camera in self.cameras):
+            return WindowOutcome.WRONG
         if self.right:
-            return Found.RIGHT if self.whole else Found.RIGHT_PART
-        return Found.BETWEEN
+            return WindowOutcome.RIGHT if self.whole else WindowOutcome.RIGHT_PART
+        return WindowOutcome.BETWEEN
 
 
-def key_of(window: Window, method: str) -> Key:
+def make_key(window: Window, method: str) -> Key:
     return window.scene, window.count, window.stride, window.start, method
 
 
-def judged(window: Window, method: str, answer: Answer, truth: Mapping[str, TrueCamera]) -> Row:
+def judge_window(window: Window, method: str, answer: WindowAnswer, truth: Mapping[str, TrueCamera]) -> WindowRow:
     """The answer against the true cameras of all photographs of the window."""
-    whole = whole_errors(answer.cameras, truth)
+    whole = measure_set_errors(answer.cameras, truth)
     verdict, timed_on = answer.verdict, answer.timed_on
-    others = most_taken((timed_on, answer.fresh_on))
+    others = find_largest_share((timed_on, answer.fresh_on))
     alone = had_alone(others)
-    return Row(
+    return WindowRow(
         scene=window.scene,
         count=window.count,
         stride=window.stride,
@@ -118,7 +124,7 @@ def judged(window: Window, method: str, answer: Answer, truth: Mapping[str, True
         message=answer.message if verdict is None else verdict.message,
         seconds=answer.seconds if alone else None,
         fresh_seconds=answer.fresh_seconds if alone else None,
-        cameras=errors_of(answer.cameras, truth),
+        cameras=measure_camera_errors(answer.cameras, truth),
         rotation_deg=whole.rotation_pair_deg,
         centre_pct=whole.centre_pct,
         evidence=answer.evidence,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from splatnode.recon.evaluate.stability.windows.row import Found, Row
+from splatnode.recon.evaluate.stability.windows.row import WindowOutcome, WindowRow
 
 ANGLE_BINS = (
     ("below 8", 0.0, 8.0),
@@ -54,41 +54,41 @@ class Coverage:
     ratio: dict[str, dict[str, float] | None]  # error over bound, by percentile
 
 
-def summarise(rows: Sequence[Row]) -> dict[str, Any]:
-    """What windows.json holds besides its rows, by method."""
+def summarise(rows: Sequence[WindowRow]) -> dict[str, Any]:
+    """Returns what windows.json holds besides its rows, by method."""
     return {
         method: {
-            "all": asdict(tally(mine)),
-            "by_angle": {name: asdict(tally(some)) for name, some in by_angle(mine).items()},
-            "by_count": {str(count): asdict(tally(some)) for count, some in by_count(mine).items()},
+            "all": asdict(tally_rows(mine)),
+            "by_angle": {name: asdict(tally_rows(some)) for name, some in group_by_angle(mine).items()},
+            "by_count": {str(count): asdict(tally_rows(some)) for count, some in group_by_count(mine).items()},
             "coverage": {
-                "all": asdict(coverage(mine)),
-                **{str(count): asdict(coverage(some)) for count, some in by_count(mine).items()},
+                "all": asdict(measure_coverage(mine)),
+                **{str(count): asdict(measure_coverage(some)) for count, some in group_by_count(mine).items()},
             },
         }
-        for method, mine in by_method(rows).items()
+        for method, mine in group_by_method(rows).items()
     }
 
 
-def by_method(rows: Sequence[Row]) -> dict[str, list[Row]]:
+def group_by_method(rows: Sequence[WindowRow]) -> dict[str, list[WindowRow]]:
     return {name: [row for row in rows if row.method == name] for name in dict.fromkeys(row.method for row in rows)}
 
 
-def by_angle(rows: Sequence[Row]) -> dict[str, list[Row]]:
+def group_by_angle(rows: Sequence[WindowRow]) -> dict[str, list[WindowRow]]:
     return {name: [row for row in rows if least <= row.angle_deg < most] for name, least, most in ANGLE_BINS}
 
 
-def by_count(rows: Sequence[Row]) -> dict[int, list[Row]]:
+def group_by_count(rows: Sequence[WindowRow]) -> dict[int, list[WindowRow]]:
     return {count: [row for row in rows if row.count == count] for count in sorted({row.count for row in rows})}
 
 
-def tally(rows: Iterable[Row]) -> Tally:
+def tally_rows(rows: Iterable[WindowRow]) -> Tally:
     every = list(rows)
-    found = [row.found for row in every]
+    found = [row.outcome for row in every]
     own, part = ([row for row in every if row.right and row.whole is whole] for whole in (True, False))
     return Tally(
         sets=len(every),
-        **{kind.value: found.count(kind) for kind in Found},
+        **{kind.value: found.count(kind) for kind in WindowOutcome},
         own_right=len(own),
         own_right_published=sum(row.published for row in own),
         own_right_part=len(part),
@@ -96,23 +96,23 @@ def tally(rows: Iterable[Row]) -> Tally:
     )
 
 
-def coverage(rows: Iterable[Row]) -> Coverage:
-    """Of the published cameras."""
+def measure_coverage(rows: Iterable[WindowRow]) -> Coverage:
+    """Measures the coverage of the bounds of the published cameras."""
     cameras = [camera for row in rows if row.published for camera in row.cameras]
-    claimed = {kind: [c.claimed()[kind] for c in cameras if kind in c.claimed()] for kind in KINDS}
+    claimed = {kind: [c.pair_with_bounds()[kind] for c in cameras if kind in c.pair_with_bounds()] for kind in KINDS}
     return Coverage(
         cameras=len(cameras),
-        within={kind: within(pairs) for kind, pairs in claimed.items()},
-        ratio={kind: _percentiles(pairs) for kind, pairs in claimed.items()},
+        within={kind: compute_share_within(pairs) for kind, pairs in claimed.items()},
+        ratio={kind: _compute_percentiles(pairs) for kind, pairs in claimed.items()},
     )
 
 
-def within(pairs: Sequence[tuple[float, float]]) -> float | None:
+def compute_share_within(pairs: Sequence[tuple[float, float]]) -> float | None:
     """The share of errors that are at most their bound."""
     return sum(error <= bound for error, bound in pairs) / len(pairs) if pairs else None
 
 
-def _percentiles(pairs: Sequence[tuple[float, float]]) -> dict[str, float] | None:
+def _compute_percentiles(pairs: Sequence[tuple[float, float]]) -> dict[str, float] | None:
     if not pairs:
         return None
     ratios = [error / max(bound, 1e-9) for error, bound in pairs]

@@ -8,25 +8,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.recon.evaluate.stability.places import Place
+from splatnode.recon.evaluate.stability.places import TrialScene
 from splatnode.recon.evaluate.stability.windows.row import Key as RowKey
-from splatnode.recon.evaluate.stability.windows.row import key_of
-from splatnode.recon.evaluate.stability.windows.store import Key, Pieces, among
+from splatnode.recon.evaluate.stability.windows.row import make_key
+from splatnode.recon.evaluate.stability.windows.store import Key, Pieces, select_keys
 from splatnode.recon.evaluate.stability.windows.window import Window
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    place: Place
+    place: TrialScene
     window: Window
     method: str
 
     @property
     def key(self) -> RowKey:
-        return key_of(self.window, self.method)
+        return make_key(self.window, self.method)
 
 
-class Turns:
+class WindowScheduler:
     """Windows of one scene come one after the other, as long as there are other scenes for whoever else is free.
 
     What was found lies in `folder` until the last window of its scene has ended.
@@ -34,11 +34,11 @@ class Turns:
 
     def __init__(self, jobs: Sequence[Job], folder: Path) -> None:
         self._waiting = list(jobs)
-        self._under_way: Counter[Place] = Counter()
+        self._under_way: Counter[TrialScene] = Counter()
         self._folder, self._numbers = folder, itertools.count()
-        self._found: dict[Place, dict[Key, Path]] = {}
+        self._found: dict[TrialScene, dict[Key, Path]] = {}
 
-    def next(self) -> tuple[Job, Pieces] | None:
+    def take_job(self) -> tuple[Job, Pieces] | None:
         """The first window of a scene of which none is under way, else the first; None: all have begun."""
         if not self._waiting:
             return None
@@ -47,10 +47,10 @@ class Turns:
         self._waiting.remove(job)
         self._under_way[job.place] += 1
         found = self._found.get(job.place, {})
-        return job, {key: found[key].read_bytes() for key in among(found.keys(), job.window.names)}
+        return job, {key: found[key].read_bytes() for key in select_keys(found.keys(), job.window.names)}
 
-    def ended(self, job: Job, found: Mapping[Key, bytes]) -> None:
-        """With what a window has found; nothing where it failed."""
+    def finish_job(self, job: Job, found: Mapping[Key, bytes]) -> None:
+        """Stores what a window has found; nothing where it failed."""
         self._under_way[job.place] -= 1
         known = self._found.setdefault(job.place, {})
         if not self._under_way[job.place] and not any(other.place is job.place for other in self._waiting):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.evaluate.stability.places import Place, motion
+from splatnode.recon.evaluate.stability.places import TrialScene, classify_motion
 
 logger = logging.getLogger(__name__)
 
@@ -33,29 +33,31 @@ class Window:
     angle_deg: float  # the largest over the views of the angle to the nearest other one
 
 
-def moving(places: Sequence[Place]) -> list[Place]:
+def select_moving_scenes(places: Sequence[TrialScene]) -> list[TrialScene]:
     """The places whose true cameras move; the others are named in the log: without motion no centre is wrong."""
-    still = [place.name for place in places if motion(place.Ts_world_camera) == "turned"]
+    still = [place.name for place in places if classify_motion(place.Ts_world_camera) == "turned"]
     if still:
         logger.warning("no windows of %s: the true cameras do not move", ", ".join(still))
     return [place for place in places if place.name not in still]
 
 
-def windows_of(place: Place, per_kind: int, seed: int, counts: Sequence[int] = COUNTS) -> list[Window]:
+def draw_windows(place: TrialScene, per_kind: int, seed: int, counts: Sequence[int] = COUNTS) -> list[Window]:
     """At most `per_kind` windows of each count and stride, drawn at random, in which the camera moves."""
     Ts, chosen = place.Ts_world_camera, []
     for count in counts:
         for stride in STRIDES:
             spans = {start: Ts[start : start + stride * count : stride] for start in range(len(Ts))}
-            starts = [start for start, span in spans.items() if len(span) == count and motion(span) != "turned"]
+            starts = [
+                start for start, span in spans.items() if len(span) == count and classify_motion(span) != "turned"
+            ]
             rng = np.random.default_rng([seed, zlib.crc32(f"{place.name} {count} {stride}".encode())])
             for start in sorted(rng.permutation(starts)[:per_kind].tolist()):
                 names = place.names[start : start + stride * count : stride]
-                chosen.append(Window(place.name, count, stride, start, tuple(names), angle_deg(spans[start])))
+                chosen.append(Window(place.name, count, stride, start, tuple(names), compute_angle_deg(spans[start])))
     return chosen
 
 
-def angle_deg(Ts_world_camera: Array) -> float:
+def compute_angle_deg(Ts_world_camera: Array) -> float:
     """The largest over the views (C, 4, 4) of the angle to the nearest other view, seen from the middle of the scene.
 
     The middle is the point with the least squared distance to all optical axes. Where that is behind a camera, or the
@@ -63,7 +65,7 @@ def angle_deg(Ts_world_camera: Array) -> float:
     count, so that the angle is the same for every method.
     """
     rays = Ts_world_camera[:, :3, 2]
-    middle = _nearest_to_axes(Ts_world_camera)
+    middle = _find_nearest_to_axes(Ts_world_camera)
     if middle is not None:
         towards = middle - Ts_world_camera[:, :3, 3]
         if ((towards * rays).sum(1) > 0).all():
@@ -73,7 +75,7 @@ def angle_deg(Ts_world_camera: Array) -> float:
     return float(np.degrees(2.0 * np.arcsin(np.minimum(chords.min(1) / 2.0, 1.0))).max())
 
 
-def _nearest_to_axes(Ts_world_camera: Array) -> Array | None:
+def _find_nearest_to_axes(Ts_world_camera: Array) -> Array | None:
     directions, centres = Ts_world_camera[:, :3, 2], Ts_world_camera[:, :3, 3]
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]  # (C, 3, 3) projects off each axis
     total = across.sum(0)

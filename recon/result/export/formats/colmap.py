@@ -11,10 +11,10 @@ from struct import pack
 
 import numpy as np
 
-from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.export.quaternions import quats_from_matrices
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.export.text import number_row, text_file
+from splatnode.recon.result.export.text import format_number_row, format_text_file
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
@@ -48,45 +48,45 @@ def encode_colmap(
     calibrations = [(c.width, c.height, c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]) for c in cameras]
     camera_ids = {calibration: i + 1 for i, calibration in enumerate(dict.fromkeys(calibrations))}
     images = [
-        _Image(number, _motion(camera), camera_ids[calibration], camera.name)
+        _Image(number, _compute_motion(camera), camera_ids[calibration], camera.name)
         for number, (camera, calibration) in enumerate(zip(cameras, calibrations, strict=True), 1)
     ]
-    colours = base_rgb(gaussians)
+    colours = compute_base_rgb(gaussians)
     points = [
         (i, *mean, *colour)
         for i, (mean, colour) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
     ]
     if any(character.isspace() for camera in cameras for character in camera.name):
-        return _binary(camera_ids, images, points)
-    return _text(camera_ids, images, points, scale)
+        return _encode_binary(camera_ids, images, points)
+    return _encode_text(camera_ids, images, points, scale)
 
 
-def _motion(camera: CameraEstimate) -> tuple[float, ...]:
+def _compute_motion(camera: CameraEstimate) -> tuple[float, ...]:
     T_camera_world = np.linalg.inv(camera.T_world_camera)
     return (*quats_from_matrices(T_camera_world[:3, :3]), *T_camera_world[:3, 3])
 
 
-def _text(
+def _encode_text(
     camera_ids: dict[tuple, int], images: Sequence[_Image], points: Sequence[tuple], scale: Scale
 ) -> dict[str, bytes]:
-    camera_lines = [f"{i} PINHOLE {number_row(calibration)}" for calibration, i in camera_ids.items()]
+    camera_lines = [f"{i} PINHOLE {format_number_row(calibration)}" for calibration, i in camera_ids.items()]
     image_lines = [
         line
         for image in images
-        for line in (f"{image.image_id} {number_row(image.motion)} {image.camera_id} {image.name}", "")
+        for line in (f"{image.image_id} {format_number_row(image.motion)} {image.camera_id} {image.name}", "")
     ]
     point_lines = [f"{i} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0" for i, x, y, z, r, g, b in points]
     return {
-        "cameras.txt": text_file("CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", camera_lines, scale),
-        "images.txt": text_file("IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", image_lines, scale),
-        "points3D.txt": text_file("POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", point_lines, scale),
+        "cameras.txt": format_text_file("CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", camera_lines, scale),
+        "images.txt": format_text_file("IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", image_lines, scale),
+        "points3D.txt": format_text_file("POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", point_lines, scale),
     }
 
 
-def _binary(camera_ids: dict[tuple, int], images: Sequence[_Image], points: Sequence[tuple]) -> dict[str, bytes]:
+def _encode_binary(camera_ids: dict[tuple, int], images: Sequence[_Image], points: Sequence[tuple]) -> dict[str, bytes]:
     return {
-        "cameras.bin": _records([pack("<IiQQ4d", i, _PINHOLE, *lens) for lens, i in camera_ids.items()]),
-        "images.bin": _records(
+        "cameras.bin": _pack_records([pack("<IiQQ4d", i, _PINHOLE, *lens) for lens, i in camera_ids.items()]),
+        "images.bin": _pack_records(
             [
                 pack("<I7dI", image.image_id, *image.motion, image.camera_id)
                 + image.name.encode()
@@ -95,10 +95,10 @@ def _binary(camera_ids: dict[tuple, int], images: Sequence[_Image], points: Sequ
                 for image in images
             ]
         ),
-        "points3D.bin": _records([pack("<Q3d3BdQ", *point, _NO_ERROR, _NO_TRACK) for point in points]),
+        "points3D.bin": _pack_records([pack("<Q3d3BdQ", *point, _NO_ERROR, _NO_TRACK) for point in points]),
     }
 
 
-def _records(records: Sequence[bytes]) -> bytes:
+def _pack_records(records: Sequence[bytes]) -> bytes:
     """As COLMAP's binary files hold them: their number first."""
     return pack("<Q", len(records)) + b"".join(records)

@@ -15,20 +15,20 @@ import numpy.typing as npt
 
 from splatnode.capture.image_file import (
     UnusableImage,
-    decode_photograph,
+    decode_any_image,
     encode_jpeg,
     encode_png,
     find_common_range,
     read_image_file,
 )
-from splatnode.capture.lenses.undistort import without_distortion
+from splatnode.capture.lenses.undistort import undistort_image
 from splatnode.capture.value_range import ValueRange
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate
-from splatnode.recon.result.stored_snapshot import photograph_folders, photograph_path
+from splatnode.recon.result.stored_snapshot import find_image, list_image_folders
 
 DEFAULT_NAME = "dataset"
 
@@ -39,29 +39,29 @@ _ROUNDED = 1.0  # pixels of the modelled photograph's sides, by which rounding c
 
 def export(result: StoredResult) -> dict[str, bytes]:
     """images/, transforms.json and sparse/0/. Raises SceneFileError where a photograph is not to be had any more."""
-    folders = photograph_folders(result.scene.parent)
+    folders = list_image_folders(result.scene.parent)
     files, cameras = {}, []
-    found = [photograph_path(camera, folders) for camera in result.cameras()]
+    found = [find_image(camera, folders) for camera in result.cameras()]
     used = find_common_range([path for path in found if path is not None])
     for camera in result.cameras():
-        image = _photograph(camera, folders, used)
+        image = _load_image(camera, folders, used)
         name = camera.name if camera.name.lower().endswith((".png", *_JPEG)) else f"{camera.name}.png"
-        files[f"images/{name}"] = _encoded(image, name)
-        cameras.append(_of_full_size(replace(camera, name=name), *image.shape[1::-1]))
+        files[f"images/{name}"] = _encode_image(image, name)
+        cameras.append(_resize_camera(replace(camera, name=name), *image.shape[1::-1]))
     scale = result.scale()
     model = encode_colmap(cameras, result.gaussians(), scale)
     files |= {f"sparse/0/{name}": data for name, data in model.items()}
     return files | {"transforms.json": encode_nerfstudio(cameras, scale)}
 
 
-def _photograph(camera: CameraEstimate, folders: Sequence[Path], used: ValueRange | None) -> npt.NDArray[np.uint8]:
+def _load_image(camera: CameraEstimate, folders: Sequence[Path], used: ValueRange | None) -> npt.NDArray[np.uint8]:
     """(H, W, 3) in full size, upright, without the distortion of its lens. Raises SceneFileError."""
-    path = photograph_path(camera, folders)
+    path = find_image(camera, folders)
     if path is None:
         places = " or ".join(str(folder) for folder in folders)
         raise SceneFileError(f"the photograph {camera.name} is not in {places} any more: put it back there")
     try:
-        image = without_distortion(decode_photograph(read_image_file(path), used=used).image, camera.lens)
+        image = undistort_image(decode_any_image(read_image_file(path), used=used).image, camera.lens)
     except (UnusableImage, ValueError) as error:
         raise SceneFileError(f"{path}: {error}") from error
     height, width = image.shape[:2]
@@ -73,11 +73,11 @@ def _photograph(camera: CameraEstimate, folders: Sequence[Path], used: ValueRang
     return image
 
 
-def _of_full_size(camera: CameraEstimate, width: int, height: int) -> CameraEstimate:
+def _resize_camera(camera: CameraEstimate, width: int, height: int) -> CameraEstimate:
     """The camera for its photograph of this many pixels, which has no distortion any more."""
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     return replace(camera, K=K, width=width, height=height, lens=None)
 
 
-def _encoded(image: npt.NDArray[np.uint8], name: str) -> bytes:
+def _encode_image(image: npt.NDArray[np.uint8], name: str) -> bytes:
     return encode_jpeg(image, _JPEG_QUALITY) if name.lower().endswith(_JPEG) else encode_png(image)

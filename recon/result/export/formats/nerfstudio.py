@@ -11,7 +11,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from splatnode.recon.result.export.cameras import BOUNDS_MEANING, STAMP_MEANING, stamp_record
+from splatnode.recon.result.export.cameras import BOUNDS_MEANING, STAMP_MEANING, make_stamp_dict
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.scale import RELATIVE, Scale
@@ -39,7 +39,7 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE
             "w": camera.width,
             "h": camera.height,
             "transform_matrix": (camera.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(),
-            **stamp_record(camera.captured_at),
+            **make_stamp_dict(camera.captured_at),
             "bounds": None if camera.bounds is None else asdict(camera.bounds),
         }
         for camera in cameras

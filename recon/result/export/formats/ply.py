@@ -12,7 +12,7 @@ import numpy as np
 
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import check_count
-from splatnode.recon.result.export.prepare import unknown_source
+from splatnode.recon.result.export.prepare import make_unknown_source
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import GaussianArrays
@@ -55,14 +55,14 @@ def encode_ply(gaussians: GaussianArrays, scale: Scale = RELATIVE) -> bytes:
     return _header(num_gaussians, num_bases, scale) + rows.tobytes()
 
 
-def ply_bytes(num_gaussians: int, num_bases: int, scale: Scale = RELATIVE) -> int:
+def compute_ply_bytes(num_gaussians: int, num_bases: int, scale: Scale = RELATIVE) -> int:
     """The size of `encode_ply`'s result."""
     return len(_header(num_gaussians, num_bases, scale)) + 4 * num_gaussians * len(_property_names(num_bases))
 
 
-def most_in_ply(num_bytes: int, num_bases: int = 1) -> int:
+def compute_max_gaussians(num_bytes: int, num_bases: int = 1) -> int:
     """How many Gaussians a file of at most that size holds; at least 1."""
-    for_one = ply_bytes(1, num_bases)
+    for_one = compute_ply_bytes(1, num_bases)
     further = (num_bytes - for_one - _LONGER_HEADER) // (4 * len(_property_names(num_bases)))
     return max(1, 1 + further)
 
@@ -103,7 +103,7 @@ def decode(data: bytes, name: str = "scene.ply") -> GaussianArrays:
             scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
             opacities=(1.0 / (1.0 + np.exp(-columns("opacity")[:, 0]))).astype(np.float32),
             sh=np.concatenate([columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], 1),
-            source_frame=unknown_source(num_gaussians),
+            source_frame=make_unknown_source(num_gaussians),
         )
 
 

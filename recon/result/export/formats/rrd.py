@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.stored_snapshot import recorded_snapshot
+from splatnode.recon.result.stored_snapshot import load_full_snapshot
 
 DEFAULT_NAME = "scene.rrd"
 
@@ -12,4 +12,4 @@ def export(result: StoredResult) -> bytes:
     """Raises ModuleNotFoundError without rerun."""
     from splatnode.recon.result.export import rerun  # takes a second, and is an extra
 
-    return rerun.recorded(recorded_snapshot(result))
+    return rerun.encode_recording(load_full_snapshot(result))

@@ -10,7 +10,7 @@ import numpy as np
 
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import check_count
-from splatnode.recon.result.export.prepare import SH_C0, base_rgb, take, unknown_source
+from splatnode.recon.result.export.prepare import SH_C0, compute_base_rgb, make_unknown_source, select_gaussians
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
 
@@ -27,10 +27,10 @@ def export(result: StoredResult) -> bytes:
 def encode_splat(gaussians: GaussianArrays) -> bytes:
     """The file's bytes, most visible Gaussian first."""
     visible = gaussians.opacities * gaussians.scales.astype(np.float64).prod(axis=1)
-    ordered = take(gaussians, np.argsort(-visible, kind="stable"))
+    ordered = select_gaussians(gaussians, np.argsort(-visible, kind="stable"))
     rows = np.empty(len(ordered), _ROW)
     rows["mean"], rows["scale"] = ordered.means, ordered.scales
-    rows["rgba"][:, :3] = base_rgb(ordered)
+    rows["rgba"][:, :3] = compute_base_rgb(ordered)
     rows["rgba"][:, 3] = np.rint(ordered.opacities * 255.0)
     rows["quat"] = np.clip(np.rint(ordered.quats * 128.0 + 128.0), 0, 255)
     return rows.tobytes()
@@ -55,5 +55,5 @@ def decode(data: bytes, name: str = "scene.splat") -> GaussianArrays:
         scales=rows["scale"].copy(),
         opacities=rows["rgba"][:, 3].astype(np.float32) / 255.0,
         sh=((rows["rgba"][:, None, :3] / 255.0 - 0.5) / SH_C0).astype(np.float32),
-        source_frame=unknown_source(len(rows)),
+        source_frame=make_unknown_source(len(rows)),
     )

@@ -19,10 +19,10 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.axes import least_turned
+from splatnode.recon.result.export.axes import minimize_rotations
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import check_count
-from splatnode.recon.result.export.prepare import take, unknown_source
+from splatnode.recon.result.export.prepare import make_unknown_source, select_gaussians
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
 
@@ -55,17 +55,17 @@ def encode_spz(gaussians: GaussianArrays) -> bytes:
     """
     num_gaussians, num_bases = gaussians.sh.shape[:2]
     degree = {bases: degree for degree, bases in _NUM_BASES.items()}[num_bases]
-    bits = _fractional_bits(gaussians)
+    bits = _choose_fractional_bits(gaussians)
     fixed = np.rint(gaussians.means.astype(np.float64) * _AXES * 2.0**bits).astype("<i4")
     order = np.lexsort((fixed[:, 1], fixed[:, 2]))
-    fixed, ordered = fixed[order], least_turned(take(gaussians, order))
+    fixed, ordered = fixed[order], minimize_rotations(select_gaussians(gaussians, order))
     parts = [
         _HEADER.pack(_MAGIC, _VERSION, num_gaussians, degree, bits, 0, 0),
         np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes(),
-        _to_bytes(ordered.opacities * 255.0, _OPACITY_STEP),
-        _to_bytes(ordered.sh[:, 0] * (_COLOUR_SCALE * 255.0) + 127.5, _COLOUR_STEP),
-        _to_bytes((np.log(ordered.scales) + 10.0) * 16.0),
-        _to_bytes((ordered.quats[:, 1:] * _AXES + 1.0) * 127.5),  # w is positive
+        _quantize(ordered.opacities * 255.0, _OPACITY_STEP),
+        _quantize(ordered.sh[:, 0] * (_COLOUR_SCALE * 255.0) + 127.5, _COLOUR_STEP),
+        _quantize((np.log(ordered.scales) + 10.0) * 16.0),
+        _quantize((ordered.quats[:, 1:] * _AXES + 1.0) * 127.5),  # w is positive
         _pack_sh(ordered.sh[:, 1:] * _SH_SIGNS[1:num_bases, None]),
     ]
     compressor = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # 16: a gzip wrapper, without a time stamp
@@ -110,7 +110,7 @@ def decode(data: bytes, name: str = "scene.spz") -> GaussianArrays:
             ],
             axis=1,
         ),
-        source_frame=unknown_source(num_gaussians),
+        source_frame=make_unknown_source(num_gaussians),
     )
 
 
@@ -140,12 +140,12 @@ def _inflate(stream, data: bytes, size: int, name: str) -> bytes:
         raise SceneFileError(f"{name} is not a .spz file or is damaged: {error}") from error
 
 
-def _to_bytes(values: npt.NDArray, step: int | npt.NDArray = 1) -> bytes:
+def _quantize(values: npt.NDArray, step: int | npt.NDArray = 1) -> bytes:
     """Rounded to multiples of `step`, as far as these fit."""
     return np.clip(np.rint(values / step) * step, 0, 255).astype(np.uint8).tobytes()
 
 
-def _fractional_bits(gaussians: GaussianArrays) -> int:
+def _choose_fractional_bits(gaussians: GaussianArrays) -> int:
     """As many as the extents call for and let the largest coordinate fit in 24 bits: our scenes' scale is arbitrary."""
     if not len(gaussians):
         return 0
@@ -174,16 +174,16 @@ def _unpack_smallest_three(packed: npt.NDArray[np.uint32]) -> npt.NDArray[np.flo
         xyzw[:, i] = np.where(largest == i, 0.0, value)
         packed = np.where(largest == i, packed, packed >> 10)
     xyzw[np.arange(len(packed)), largest] = np.sqrt(np.maximum(1.0 - (xyzw**2).sum(1), 0.0))
-    return _our_axes(xyzw)
+    return _convert_axes(xyzw)
 
 
 def _unpack_first_three(quat: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     """Version 2: x, y and z in 8 bits; w is what they leave."""
     xyz = quat / 127.5 - 1.0
-    return _our_axes(np.concatenate([xyz, np.sqrt(np.maximum(1.0 - (xyz**2).sum(1, keepdims=True), 0.0))], 1))
+    return _convert_axes(np.concatenate([xyz, np.sqrt(np.maximum(1.0 - (xyz**2).sum(1, keepdims=True), 0.0))], 1))
 
 
-def _our_axes(xyzw: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+def _convert_axes(xyzw: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     wxyz = xyzw[:, [3, 0, 1, 2]] * np.array([1, *_AXES])
     return (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).astype(np.float32)
 
@@ -191,4 +191,4 @@ def _our_axes(xyzw: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
 def _pack_sh(rest: npt.NDArray[np.float32]) -> bytes:
     """Coefficients in [-1, 1], rounded to 5 bits (degree 1) and 4 bits (above) so that 0 stays 0."""
     step = np.where(np.arange(rest.shape[1]) < 3, 8, 16)[:, None]
-    return _to_bytes(rest * 128.0 + 128.0, step)
+    return _quantize(rest * 128.0 + 128.0, step)

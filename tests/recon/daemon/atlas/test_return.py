@@ -15,13 +15,13 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.atlas import atlas as module
-from splatnode.recon.daemon.atlas.atlas import Atlas
-from splatnode.recon.daemon.atlas.recognition import codes_message, codes_of
+from splatnode.recon.daemon.atlas.atlas import LoopDetector
+from splatnode.recon.daemon.atlas.recognition import compute_global_descriptors, make_descriptors_message
 from splatnode.recon.daemon.checkpoint import checkpoint, left
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.left_places import LeftPlaces
-from splatnode.recon.daemon.places import Places
-from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.daemon.left_places import InactiveSubmaps
+from splatnode.recon.daemon.places import SubmapIndex
+from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
@@ -33,12 +33,12 @@ from tests.support.synthetic import SMALL, photographs, places
 __all__ = ["config", "peer"]
 
 THERE = msgspec.structs.replace(SMALL, views=3)  # as tests/support/synthetic.py photographs each of two places
-AGAIN = synthetic.held_out_cameras(msgspec.structs.replace(SMALL, views=4))
+AGAIN = synthetic.evaluation_cameras(msgspec.structs.replace(SMALL, views=4))
 
 
 def walk() -> list[Frame]:
     """Three photographs of one place, three of another, three of the first from elsewhere."""
-    photographs = [synthetic.photograph(SMALL, camera, 20 + index) for index, camera in enumerate(AGAIN)]
+    photographs = [synthetic.render_image(SMALL, camera, 20 + index) for index, camera in enumerate(AGAIN)]
     again = [Frame(6 + index, f"again_{index}.png", 0, image, None) for index, image in enumerate(photographs)]
     return [*places(seeds=(0, 1)), *again]
 
@@ -94,21 +94,21 @@ def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):
     true = [T for T, _ in (*synthetic.scene_cameras(THERE), *AGAIN)]
     K = np.stack([AGAIN[0][1]] * len(true))
     names = [frame.name for frame in (*walk()[:3], *walk()[6:])]
-    errors = camera_errors(np.stack([cameras[name] for name in names]), np.stack(true), K, K)
+    errors = compare_cameras(np.stack([cameras[name] for name in names]), np.stack(true), K, K)
     assert errors.rotation_deg < 1.5 and errors.centre_pct < 8, errors
 
 
 def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_are(kidnapped, peer, monkeypatch):
     with monkeypatch.context() as patch, running(kidnapped):
-        patch.setattr(LeftPlaces, "finish_next", lambda *_: False)
+        patch.setattr(InactiveSubmaps, "finish_next", lambda *_: False)
         offer_walk(peer)
         wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
         wait_for(lambda: heartbeats(kidnapped.network)["recon"]["scenes"] == 3, PATIENCE_S)
     drafts = places_file(kidnapped)
     assert [place["judged"] for place in drafts["places"]] == [True] * 3
-    assert [folder.name for folder in left.folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
+    assert [folder.name for folder in left.list_left_folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
     with running(kidnapped):
-        wait_for(lambda: not left.folders(kidnapped.checkpoint), PATIENCE_S)
+        wait_for(lambda: not left.list_left_folders(kidnapped.checkpoint), PATIENCE_S)
         wait_for(lambda: heartbeats(kidnapped.network)["recon"]["unfinished"] == 0, PATIENCE_S)
     whole = places_file(kidnapped)
     assert not any(place["provisional"] for place in whole["places"])
@@ -123,11 +123,13 @@ def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_
 
 def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kidnapped, peer, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(Atlas, "compare", lambda _, scene, graph, pause: codes_of(graph.keyframes))  # with no other
+        patch.setattr(
+            LoopDetector, "compare", lambda _, scene, graph, pause: compute_global_descriptors(graph.keyframes)
+        )  # with no other
         with walked(kidnapped, peer):
             pass
     assert places_file(kidnapped)["links"] == []
-    assert [folder.name for folder in left.finished(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
+    assert [folder.name for folder in left.list_finished_folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
     with running(kidnapped):
         wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
     (link,) = places_file(kidnapped)["links"]
@@ -143,18 +145,21 @@ def test_a_finished_place_whose_files_are_damaged_is_not_recognised_and_stops_no
         with closing(Store(tmp_path / "checkpoint" / "left" / place)) as store:
             work = IncrementalReconstruction(config)
             for number, frame in enumerate(frames):
-                store.put(ReceivedFrame("0" * 32, number, frame))
-                work.add(prepare(frame, config))
-            work.complete()
+                store.add_frame(ReceivedFrame("0" * 32, number, frame))
+                work.add_keyframe(prepare(frame, config))
+            work.match_pending_pairs()
             checkpoint.save(store, work, final=False)
-            store.save("codes", *codes_message(work.graph.keyframes, codes_of(work.graph.keyframes)))
-            store.finish()
-    damaged = left.finished_folder(tmp_path / "checkpoint", "scene-0001") / file
+            store.save(
+                "codes",
+                *make_descriptors_message(work.graph.keyframes, compute_global_descriptors(work.graph.keyframes)),
+            )
+            store.finalize()
+    damaged = left.make_finished_path(tmp_path / "checkpoint", "scene-0001") / file
     damaged.write_bytes(damaged.read_bytes()[:-100])
-    index = Places(tmp_path, "0" * 32)
-    atlas = Atlas(tmp_path / "checkpoint", config, index)
+    index = SubmapIndex(tmp_path, "0" * 32)
+    atlas = LoopDetector(tmp_path / "checkpoint", config, index)
     seen = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "bridge", lambda one, *_: seen.append(one.scene_id) or "for the test")
-        atlas.compare("scene-0003", work.graph, lambda: None)
+        patch.setattr(module, "verify_loop", lambda one, *_: seen.append(one.scene_id) or "for the test")
+        atlas.detect_loops("scene-0003", work.graph, lambda: None)
     assert seen == ["scene-0002"] and index.links == ()

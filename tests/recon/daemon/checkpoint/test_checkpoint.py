@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
-from splatnode.recon.config import PREVIEW, Config
+from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.daemon.checkpoint import checkpoint, saved_estimate
 from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
 from splatnode.recon.daemon.checkpoint.saved import GraphRecord
@@ -24,7 +24,7 @@ from splatnode.recon.preparation import prepare
 from splatnode.recon.registration.register import RegisteredCamera
 from tests.support.synthetic import photographs
 
-CONFIG = Config(size=160, preview=replace(PREVIEW, iterations=1))
+CONFIG = ReconstructionConfig(size=160, preview=replace(PREVIEW, iterations=1))
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def saved(tmp_path_factory) -> tuple[Path, IncrementalReconstruction]:
     folder = tmp_path_factory.mktemp("checkpoint")
     store, made = Store(folder), IncrementalReconstruction(CONFIG)
     for sequence, frame in enumerate(photographs()[:3]):
-        made.add(prepare(store.put(ReceivedFrame("0" * 32, sequence, frame)).frame, CONFIG))
+        made.add_keyframe(prepare(store.add_frame(ReceivedFrame("0" * 32, sequence, frame)).frame, CONFIG))
     made.update()
     checkpoint.save(store, made, final=True)
     store.close()
@@ -54,7 +54,7 @@ def store(saved, tmp_path):
 
 def test_cameras_of_before_lenses_had_a_second_radial_coefficient_come_back(work):
     known = work.remembered()
-    record, arrays = saved_estimate.estimate_message(known, ())
+    record, arrays = saved_estimate.make_reconstruction_message(known, ())
     of_one = [field.name for field in fields(RegisteredCamera) if field.name not in record.cameras[0]]
     radial = of_one.index("radial")
     cameras = [{**numbers, "radial": -0.1} for numbers in record.cameras]
@@ -62,7 +62,9 @@ def test_cameras_of_before_lenses_had_a_second_radial_coefficient_come_back(work
     kept = [array for index, array in enumerate(arrays[:first]) if index % len(of_one) != radial]
     message = Message(replace(record, cameras=cameras), (*kept, *arrays[first:]))
     for one, other in zip(
-        saved_estimate.estimate_from(message, known.graph).registration.cameras, known.registration.cameras, strict=True
+        saved_estimate.parse_reconstruction(message, known.graph).registration.cameras,
+        known.registration.cameras,
+        strict=True,
     ):
         assert one.radial.tolist() == [-0.1, 0.0] and np.array_equal(one.T_world_camera, other.T_world_camera)
 
@@ -76,21 +78,23 @@ def test_what_was_estimated_and_measured_comes_back_and_is_not_made_anew(store, 
         raise AssertionError("estimated thoroughly again")
 
     monkeypatch.setattr(again, "estimate_thoroughly", refuse)
-    before, after = work.remembered(), again.remembered()
-    assert after.verdict == before.verdict and after.evidence == before.evidence and again.proven == work.proven
+    before, after = work.remembered(), again.find_reconstruction()
+    assert (
+        after.verdict == before.verdict and after.evidence == before.evidence and again.publishable_names == work.proven
+    )
     for one, other in zip(after.registration.cameras, before.registration.cameras, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera) and one.lens == other.lens
     assert after.registration.inlier_ratios == before.registration.inlier_ratios
     assert np.array_equal(after.registration.observed_pixels, before.registration.observed_pixels)
     for name, pointmap in work.known.pointmaps.items():
         known = pointmap.depth > 0
-        assert np.array_equal(again.known.pointmaps[name].depth > 0, known)
-        assert np.abs(again.known.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
-        assert np.array_equal(again.known.pointmaps[name].unchecked, pointmap.unchecked)
-        assert np.abs(again.known.pointmaps[name].confidence - pointmap.confidence).max() < 0.01
-        assert np.abs(again.known.pointmaps[name].normal - pointmap.normal).max() < 0.01
+        assert np.array_equal(again.state.pointmaps[name].depth > 0, known)
+        assert np.abs(again.state.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
+        assert np.array_equal(again.state.pointmaps[name].unchecked, pointmap.unchecked)
+        assert np.abs(again.state.pointmaps[name].confidence - pointmap.confidence).max() < 0.01
+        assert np.abs(again.state.pointmaps[name].normal - pointmap.normal).max() < 0.01
     further = photographs()[3]
-    again.add(prepare(further, CONFIG))
+    again.add_keyframe(prepare(further, CONFIG))
     assert again.grow() and [view.name for view in again.scene.views] == [*work.names, further.name]
 
 
@@ -102,7 +106,7 @@ def test_what_another_version_wrote_is_made_anew(store, caplog):
 
 def test_evidence_of_an_older_version_is_weighed_anew_and_no_frame_is_lost(store, work, caplog):
     """Before, the weakest link was the weakest joint, inlier ratios were agreements."""
-    record, arrays = saved_estimate.estimate_message(work.remembered(), work.proven)
+    record, arrays = saved_estimate.make_reconstruction_message(work.remembered(), work.proven)
     older = msgspec.to_builtins(record)
     evidence = older["evidence"]
     evidence["joint"], evidence["loose"] = evidence.pop("weakest_link"), evidence.pop("disconnected")
@@ -123,6 +127,6 @@ def test_what_is_missing_is_made_anew(store, lost):
     again = found.work
     assert found.keyframes == 3
     for keyframe in found.new:
-        again.add(keyframe)
+        again.add_keyframe(keyframe)
     again.update()
-    assert len(again.scene.views) == 3 and again.remembered().verdict.publishable
+    assert len(again.scene.views) == 3 and again.find_reconstruction().verdict.publishable

@@ -13,13 +13,13 @@ from splatnode.capture.messaging.wire import Message, decode, encode
 from splatnode.recon.daemon.checkpoint.saved import (
     GraphRecord,
     SceneRecord,
-    graph_from,
-    graph_message,
-    scene_from,
-    scene_message,
+    make_graph_message,
+    make_scene_message,
+    parse_graph,
+    parse_scene,
 )
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration.straightened import straight
+from splatnode.recon.registration.straightened import undistort_keyframe
 from splatnode.recon.scene import light
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
@@ -52,7 +52,7 @@ def same(one, other) -> bool:
 
 def test_features_and_pairs_come_back_to_the_bit(graph):
     graph = replace(graph, pending=frozenset({(0, 2)}))
-    found = graph_from(over_the_disk(*graph_message(graph)))
+    found = parse_graph(over_the_disk(*make_graph_message(graph)))
     features, pairs = found.features, found.pairs
     names = [keyframe.name for keyframe in graph.keyframes]
     assert found.pending == [(names[0], names[2])]
@@ -68,7 +68,7 @@ def test_the_scene_comes_back_to_the_bit(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
     first, *others = scene.views
     scene = replace(scene, views=(replace(first, consistent_depth=0.625), *others))  # of the others it is not known
-    found = scene_from(over_the_disk(*scene_message(scene, final=True)), keyframes)
+    found = parse_scene(over_the_disk(*make_scene_message(scene, final=True)), keyframes)
     assert found.iterations == 40
     for field in fields(Gaussians):
         assert torch.equal(getattr(found.gaussians, field.name), getattr(scene.gaussians, field.name))
@@ -83,48 +83,48 @@ def test_the_scene_comes_back_to_the_bit(graph, scene):
 def test_straightened_photographs_are_straightened_again(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
     lens = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0, "estimated", (-0.2, 0.0, 0.0, 0.0))
-    bent = straight(graph.keyframes[1], lens)
+    bent = undistort_keyframe(graph.keyframes[1], lens)
     first, second, third = scene.views
     views = first, replace(second, image=bent.image, lens=lens), third
-    found = scene_from(over_the_disk(*scene_message(replace(scene, views=views), final=False)), keyframes)
+    found = parse_scene(over_the_disk(*make_scene_message(replace(scene, views=views), final=False)), keyframes)
     assert [view.lens for view in found.views] == [None, lens, None]
     for one, other in zip(found.views, views, strict=True):
         assert np.array_equal(one.image, other.image)
-    header, arrays = scene_message(scene, final=False)
+    header, arrays = make_scene_message(scene, final=False)
     earlier = SceneRecord(header.views, header.iterations, header.final)  # of a version that knew no lenses
-    assert all(view.lens is None for view in scene_from(over_the_disk(earlier, arrays), keyframes).views)
+    assert all(view.lens is None for view in parse_scene(over_the_disk(earlier, arrays), keyframes).views)
 
 
 def test_a_scene_of_which_a_frame_is_gone_is_made_anew(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes[1:]}
-    assert scene_from(over_the_disk(*scene_message(scene, final=False)), keyframes) is None
+    assert parse_scene(over_the_disk(*make_scene_message(scene, final=False)), keyframes) is None
 
 
 def test_what_another_version_wrote_is_told(graph, scene):
-    header, arrays = graph_message(graph)
+    header, arrays = make_graph_message(graph)
     strange = GraphRecord(header.names, [{"colour": 1.0}, *header.features[1:]], header.pairs, [])
     with pytest.raises(ValueError, match="Features with colour"):
-        graph_from(Message(strange, tuple(arrays)))
+        parse_graph(Message(strange, tuple(arrays)))
     with pytest.raises(ValueError, match="missing"):
-        graph_from(Message(header, tuple(arrays[:-1])))
-    record, arrays = scene_message(scene, final=False)
+        parse_graph(Message(header, tuple(arrays[:-1])))
+    record, arrays = make_scene_message(scene, final=False)
     with pytest.raises(ValueError, match="arrays"):
-        scene_from(
+        parse_scene(
             Message(SceneRecord(record.views, 1, False), tuple(arrays[1:])), {k.name: k for k in graph.keyframes}
         )
 
 
 def test_the_gains_of_a_scenes_photographs_come_back(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
-    image, exposure = light.relit(graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7)
+    image, exposure = light.compensate_image(graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7)
     first, second, third = scene.views
     lit = replace(scene, views=(first, replace(second, image=image, exposure=exposure), third))
-    header, arrays = scene_message(lit, final=False)
-    found = scene_from(over_the_disk(header, arrays), keyframes)
+    header, arrays = make_scene_message(lit, final=False)
+    found = parse_scene(over_the_disk(header, arrays), keyframes)
     assert [view.exposure and view.exposure.gains for view in found.views] == [None, (2.0, 1.5, 0.5), None]
     assert [view.exposure and view.exposure.falloff for view in found.views] == [None, 0.7, None]
     assert np.array_equal(found.views[1].image, image) and found.headroom == 1.0
-    darker = scene_from(over_the_disk(*scene_message(replace(lit, headroom=1.25), final=False)), keyframes)
+    darker = parse_scene(over_the_disk(*make_scene_message(replace(lit, headroom=1.25), final=False)), keyframes)
     assert darker.headroom == 1.25
     earlier = SceneRecord(header.views, header.iterations, header.final)  # of a version that knew no gains
-    assert all(view.exposure is None for view in scene_from(over_the_disk(earlier, arrays), keyframes).views)
+    assert all(view.exposure is None for view in parse_scene(over_the_disk(earlier, arrays), keyframes).views)

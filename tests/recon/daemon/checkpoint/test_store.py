@@ -317,17 +317,17 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
     store.leave_place(2)
     assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"} and not store.dropped
     assert not (store.directory / "graph").exists()
-    (folder,) = left.folders(store.directory)
+    (folder,) = left.list_left_folders(store.directory)
     kept = Store(folder)
     assert kept.scene_id == "scene-0001" and [each.frame.name for each in kept.frames()] == ["0.png"]
-    assert kept.dropped == [DroppedFrame("1.png", "blurred")] and kept.load("graph", Ledger) is not None
+    assert kept.frames_dropped == [DroppedFrame("1.png", "blurred")] and kept.load("graph", Ledger) is not None
     kept.close()
 
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["2.png", "3.png"]
-    assert (SESSION, 0) in store.seen and left.folders(store.directory) == [folder]
+    assert (SESSION, 0) in store.seen and left.list_left_folders(store.directory) == [folder]
     left.remove(folder)
-    assert left.folders(store.directory) == []
+    assert left.list_left_folders(store.directory) == []
 
 
 def test_a_place_goes_on_from_the_one_that_it_shares_frames_with(open_store):
@@ -335,7 +335,7 @@ def test_a_place_goes_on_from_the_one_that_it_shares_frames_with(open_store):
     for sequence in range(4):
         store.put(received(sequence))
     store.leave_place(2, shared=("2.png", "3.png"))
-    (folder,) = left.folders(store.directory)
+    (folder,) = left.list_left_folders(store.directory)
     kept = Store(folder)
     assert (kept.ledger.follows, kept.ledger.shared) == ("", ()) and kept.names == {f"{i}.png" for i in range(4)}
     kept.close()
@@ -351,13 +351,16 @@ def test_a_finished_place_is_kept_and_taken_back(open_store):
         store.put(received(sequence))
     store.save("scene", Ledger(), [])
     store.leave_place(2)
-    (folder,) = left.folders(store.directory)
+    (folder,) = left.list_left_folders(store.directory)
     kept = Store(folder)
-    kept.remove_shown()
-    kept.finish()
+    kept.remove_scene_files()
+    kept.finalize()
     kept.close()
-    assert left.folders(store.directory) == [] and left.finished(store.directory)[0].name == "scene-0001"
-    assert not (left.finished_folder(store.directory, "scene-0001") / "scene").exists()
+    assert (
+        left.list_left_folders(store.directory) == []
+        and left.list_finished_folders(store.directory)[0].name == "scene-0001"
+    )
+    assert not (left.make_finished_path(store.directory, "scene-0001") / "scene").exists()
 
     store = open_store()
     store.retract_elsewhere("0.png", ["scene-0001"])
@@ -367,7 +370,7 @@ def test_a_finished_place_is_kept_and_taken_back(open_store):
     assert left.reopen(store.directory, "scene-0007") is None
     again = left.reopen(store.directory, "scene-0001")
     assert again == folder and left.reopen(store.directory, "scene-0001") == folder
-    assert left.finished(store.directory) == [] and left.folders(store.directory) == [folder]
+    assert left.list_finished_folders(store.directory) == [] and left.list_left_folders(store.directory) == [folder]
     store.was_retracted("scene-0001", "0.png")
     assert open_store().ledger.retracted == ()
 
@@ -379,10 +382,10 @@ def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypat
     monkeypatch.setattr(Store, "begin_place", lambda *_: (_ for _ in ()).throw(SystemExit))
     with pytest.raises(SystemExit):
         store.leave_place(2)
-    assert left.folders(store.directory) != []
+    assert left.list_left_folders(store.directory) != []
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["0.png", "1.png", "2.png"]
-    assert left.folders(store.directory) == [] and store.scene_id == "scene-0001"
+    assert left.list_left_folders(store.directory) == [] and store.scene_id == "scene-0001"
 
 
 def place_that_was_left(open_store, count: int) -> Path:
@@ -397,11 +400,11 @@ def place_that_was_left(open_store, count: int) -> Path:
 def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_path):
     folder = place_that_was_left(open_store, 4)
     place = Store(folder)
-    assert place.part(["3.png", "2.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
-    assert {each.reason for each in place.dropped} == {"it shows another place: scene-0001-3"}
+    assert place.split_off(["3.png", "2.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
+    assert {each.reason for each in place.frames_dropped} == {"it shows another place: scene-0001-3"}
     place.close()
     open_store()  # whose start removes what was not left yet
-    assert [each.name for each in left.folders(tmp_path / "checkpoint")] == ["scene-0001", "scene-0001-3"]
+    assert [each.name for each in left.list_left_folders(tmp_path / "checkpoint")] == ["scene-0001", "scene-0001-3"]
     part = Store(folder.with_name("scene-0001-3"))
     assert [each.frame.name for each in part.frames()] == ["2.png", "3.png"] and part.scene_id == "scene-0001-3"
     part.close()
@@ -409,7 +412,7 @@ def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_p
 
 def test_a_part_that_begins_with_the_very_first_frame_has_a_name_of_its_own(open_store):
     place = Store(place_that_was_left(open_store, 2))
-    assert place.part(["0.png"]) == "scene-0001-1" and place.names == {"1.png"}
+    assert place.split_off(["0.png"]) == "scene-0001-1" and place.names == {"1.png"}
     place.close()
 
 
@@ -418,10 +421,10 @@ def test_a_part_whose_making_was_interrupted_is_made_once(open_store, tmp_path, 
     place = Store(folder)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Store, "forget", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        place.part(["2.png", "3.png"])
+        place.split_off(["2.png", "3.png"])
     place.close()
     place = Store(folder)
     assert place.names == {"0.png", "1.png", "2.png", "3.png"}
-    assert place.part(["2.png", "3.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
+    assert place.split_off(["2.png", "3.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
     place.close()
-    assert len(left.folders(tmp_path / "checkpoint")) == 2
+    assert len(left.list_left_folders(tmp_path / "checkpoint")) == 2

@@ -14,9 +14,9 @@ from splatnode.recon.evaluate.appearance import FieldSnapshot
 from splatnode.recon.evaluate.rivals import nerfmm, nope_nerf
 from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
 from splatnode.recon.evaluate.rivals.nerf import fit
-from splatnode.recon.evaluate.rivals.nerf.appearance import FieldAppearance, spread_pixels
+from splatnode.recon.evaluate.rivals.nerf.appearance import FieldAppearance, sample_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Cameras, Focal
-from splatnode.recon.evaluate.rivals.nerf.field import Field, encoded
+from splatnode.recon.evaluate.rivals.nerf.field import Field, encode_frequencies
 from splatnode.recon.evaluate.rivals.nerf.volume_rendering import FAR, NEAR, SAMPLES, RenderedRays, render_rays
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from tests.support.synthetic import photographs
@@ -51,7 +51,7 @@ def test_a_fog_of_even_density_weighs_by_its_depth():
 
 
 def test_encoding_by_hand():
-    found = encoded(torch.tensor([[0.5]]), 2)
+    found = encode_frequencies(torch.tensor([[0.5]]), 2)
     quarter = 0.5**0.5
     assert torch.allclose(found, torch.tensor([[0.5, quarter, 1.0, quarter, 0.0]]), atol=1e-6)
 
@@ -80,7 +80,7 @@ def test_gradients_of_pose_and_focal_length():
 
 
 def test_the_lattice_covers_an_image():
-    pixels = spread_pixels(40, 30, 400)
+    pixels = sample_pixels(40, 30, 400)
     assert (pixels % 1 == 0.5).all() and (pixels.amax(0) < torch.tensor([40, 30])).all()
     counts = torch.histogramdd(pixels, [4, 3], range=[0.0, 40.0, 0.0, 30.0]).hist
     assert counts.min() >= 25  # of 33 on average
@@ -120,10 +120,10 @@ def test_colours_that_are_not_used_do_not_count():
     for image in spoilt:
         image[:, 8:] = 1.0
     used = (torch.arange(16) < 8).expand(12, 16)
-    config = fit.Config(iterations=60, checkpoints=(), rays=64)
+    config = fit.FitConfig(iterations=60, checkpoints=(), rays=64)
     looks = []
     for masks in ([used, used], [None, None]):
-        (learnt,) = fit.learn(spoilt, masks, Focal(1.0), config, seed=0)
+        (learnt,) = fit.fit_field(spoilt, masks, Focal(1.0), config, seed=0)
         looks.append(
             FieldAppearance(learnt.field).render(np.eye(4), np.array([[16.0, 0, 8], [0, 16, 6], [0, 0, 1]]), 16, 12)
         )
@@ -134,17 +134,17 @@ def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
     frames = list(photographs()[:3])
     half = np.tile(np.arange(frames[0].width) < frames[0].width // 2, (frames[0].height, 1))
     frames[1], given = replace(frames[1], mask=half), []
-    monkeypatch.setattr(fit, "learn", lambda images, used, *rest, **named: given.extend(used) or iter(()))
+    monkeypatch.setattr(fit, "fit_field", lambda images, used, *rest, **named: given.extend(used) or iter(()))
     with pytest.raises(AssertionError):  # without an end there is no last snapshot
         list(nerfmm.reconstruct(frames, 0))
     assert [used is None for used in given] == [True, False, True] and 0.4 < given[1].float().mean() < 0.6
     depth = np.ones(half.shape, np.float32)
-    view = nope_nerf._view_with_depth(FrameWithDepth("a", 0, frames[1].image, depth, np.eye(3), half))
+    view = nope_nerf._make_view_with_depth(FrameWithDepth("a", 0, frames[1].image, depth, np.eye(3), half))
     assert view.used is not None and view.used.shape == view.depth.shape and 0.4 < view.used.float().mean() < 0.6
 
 
 def test_nerfmm_learns_a_place_and_its_cameras():
-    config = fit.Config(iterations=80, checkpoints=(10,), rays=128)
+    config = fit.FitConfig(iterations=80, checkpoints=(10,), rays=128)
     snapshots = list(nerfmm.reconstruct(list(photographs()[:3]), 0, config))
     assert [snapshot.iterations for snapshot in snapshots] == [10, 80, 80]
     assert [snapshot.final for snapshot in snapshots] == [False, False, True]
@@ -167,8 +167,8 @@ def test_two_photographs_are_refused():
 
 def test_chamfer_by_hand():
     a, b = torch.tensor([[0.0, 0, 0], [1, 0, 0]]), torch.tensor([[0.0, 0, 3]])
-    assert float(nope_nerf.chamfer(a, b)) == pytest.approx((3 + 10**0.5) / 2 + 3)
-    assert float(nope_nerf.chamfer(a, a.flip(0))) == pytest.approx(0, abs=1e-6)
+    assert float(nope_nerf.compute_chamfer_distance(a, b)) == pytest.approx((3 + 10**0.5) / 2 + 3)
+    assert float(nope_nerf.compute_chamfer_distance(a, a.flip(0))) == pytest.approx(0, abs=1e-6)
 
 
 def wall(shift: float) -> nope_nerf.ViewWithDepth:
@@ -181,7 +181,7 @@ def wall(shift: float) -> nope_nerf.ViewWithDepth:
 def test_the_next_view_shows_the_same_colours_from_where_it_stands():
     terms = nope_nerf.ExtraLosses([wall(0.0), wall(0.1)], Focal(40 / 32))
     at = torch.tensor([0.0, 0.05, 0.1], requires_grad=True)
-    losses = [terms.surface(0, terms.cloud(0) - torch.stack([x, *torch.zeros(2)])) for x in at]
+    losses = [terms.compute_surface_loss(0, terms.compute_cloud(0) - torch.stack([x, *torch.zeros(2)])) for x in at]
     assert float(losses[0].detach()) == pytest.approx(0.05, rel=0.05)  # half of the shift
     assert float(losses[2].detach()) < 0.003
     losses[1].backward()
@@ -191,7 +191,7 @@ def test_the_next_view_shows_the_same_colours_from_where_it_stands():
 def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
     terms = nope_nerf.ExtraLosses([wall(0.0), wall(0.1)], Focal(40 / 32))
     seen = RenderedRays(torch.zeros(1, 3), torch.tensor([3.0]))
-    late = fit.Step(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
+    late = fit.FitStep(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
     loss = terms(late)
     assert float(loss.detach()) == pytest.approx(0.04 * 2.0)
     loss.backward()
@@ -199,7 +199,7 @@ def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
 
 
 def test_nope_nerf_learns_a_place_from_its_depths():
-    config = fit.Config(iterations=20, checkpoints=(), rays=64)
+    config = fit.FitConfig(iterations=20, checkpoints=(), rays=64)
     frames = list(photographs()[:3])
     once, final = nope_nerf.reconstruct(frames, 0, config)
     assert not once.final and final.final and final.verdict.publishable

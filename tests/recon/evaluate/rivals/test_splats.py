@@ -16,8 +16,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, known_depth
-from splatnode.recon.evaluate.rivals.colmap import sparse_model
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.evaluate.rivals.colmap import reconstruct_sparse_model
+from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import ControlChoice
@@ -35,12 +35,12 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def model(frames):
-    found = sparse_model(frames, 0)
+    found = reconstruct_sparse_model(frames, 0)
     assert found is not None
     return found
 
 
-def short(config: refinement.Config, iterations: int) -> refinement.Config:
+def short(config: refinement.RefinementConfig, iterations: int) -> refinement.RefinementConfig:
     """Without resets, from which opacities would have no time to come back."""
     adapting = adaptive.Config(every=20, start=0.0, reset_every=adaptive.NEVER)
     adapting = adapting if config.control.kind == "adaptive" else proximity.Config(adapting)
@@ -55,7 +55,7 @@ def training_psnr(snapshot: Snapshot, frames: Sequence[Frame]) -> float:
             [
                 psnr(
                     torch.from_numpy(render_rgb(snapshot.gaussians, c.T_world_camera, c.K, c.width, c.height)),
-                    torch.from_numpy(modelled_image(of[c.name], max(c.width, c.height))).float() / 255,
+                    torch.from_numpy(resize_image(of[c.name], max(c.width, c.height))).float() / 255,
                 )
                 for c in snapshot.cameras
             ]
@@ -80,10 +80,10 @@ def test_a_model_s_world_is_its_first_camera_at_a_depth_of_1(model):
 
 
 def test_3dgs_starts_from_colmap_s_points(model):
-    scene = colmap_3dgs.begin(model, 0)
+    scene = colmap_3dgs.initialize_scene(model, 0)
     assert len(scene.gaussians) == len(model.points)
     assert [view.name for view in scene.views] == [each.frame.name for each in model.registered]
-    rates = colmap_3dgs.in_parts_of_extent(colmap_3dgs.OPTIMIZE, scene).rates
+    rates = colmap_3dgs.scale_rates_to_extent(colmap_3dgs.OPTIMIZE, scene).rates
     centres = np.stack([each.T_world_camera[:3, 3] for each in model.registered])
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
     assert rates.means == pytest.approx(1.6e-4 * 1.1 * spread, rel=1e-5)
@@ -91,9 +91,12 @@ def test_3dgs_starts_from_colmap_s_points(model):
 
 def test_colmap_s_rivals_tell_the_lens_whose_distortion_they_took_out(model):
     for each in model.registered:
-        view = colmap_3dgs.view(each)
+        view = colmap_3dgs.make_training_view(each)
         assert any(each.intrinsics.distortion) and view.lens == each.intrinsics
-        assert colmap_3dgs.view(replace(each, intrinsics=replace(each.intrinsics, distortion=()))).lens is None
+        assert (
+            colmap_3dgs.make_training_view(replace(each, intrinsics=replace(each.intrinsics, distortion=()))).lens
+            is None
+        )
 
 
 def half_of(frame: Frame) -> np.ndarray:
@@ -102,24 +105,24 @@ def half_of(frame: Frame) -> np.ndarray:
 
 def test_what_a_mask_hides_is_not_fitted_by_colmap_s_rivals(model):
     for each in model.registered:
-        assert colmap_3dgs.view(each).mask is None
-        view = colmap_3dgs.view(replace(each, frame=replace(each.frame, mask=half_of(each.frame))))
+        assert colmap_3dgs.make_training_view(each).mask is None
+        view = colmap_3dgs.make_training_view(replace(each, frame=replace(each.frame, mask=half_of(each.frame))))
         assert view.mask is not None and view.mask.shape == view.image.shape[:2] and 0.4 < view.mask.mean() < 0.6
 
 
 def test_what_a_mask_hides_is_neither_a_start_nor_fitted_by_cf_3dgs(frames):
     masked = [replace(frame, mask=half_of(frame)) if i == 1 else frame for i, frame in enumerate(frames)]
-    known = known_depth.frames_with_depth(masked, 0)
+    known = known_depth.estimate_frame_depths(masked, 0)
     assert [each.mask is None for each in known] == [True, False, True]
     frame, T = known[1], np.eye(4)
-    assert cf_3dgs._view(frame, T).mask is frame.mask
+    assert cf_3dgs._make_training_view(frame, T).mask is frame.mask
     config = cf_3dgs.Config()
-    some, all_of_it = (cf_3dgs._from_depth(each, T, config) for each in (frame, replace(frame, mask=None)))
+    some, all_of_it = (cf_3dgs._initialize_from_depth(each, T, config) for each in (frame, replace(frame, mask=None)))
     assert 0.4 < len(some) / len(all_of_it) < 0.6
 
 
 def test_fsgs_knows_the_depth_of_colmap_s_points(model):
-    scene = colmap_fsgs.with_depth(model, 0)
+    scene = colmap_fsgs.initialize_scene_with_depth(model, 0)
     for view, seen in zip(scene.views, model.observed, strict=True):
         T, K = view.T_world_camera.double().numpy(), view.K.double().numpy()
         points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]

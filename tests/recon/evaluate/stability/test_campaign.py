@@ -18,9 +18,9 @@ import pytest
 from splatnode.capture.frame import Frame
 from splatnode.command_line import build_parser
 from splatnode.recon.evaluate.stability.campaign import Plan, run_campaign
-from splatnode.recon.evaluate.stability.case import Case, Demand, Row, accepted
-from splatnode.recon.evaluate.stability.methods import by_name
-from splatnode.recon.evaluate.stability.places import Photo, Places
+from splatnode.recon.evaluate.stability.case import Demand, MatrixRow, TrialCase, make_accept_case
+from splatnode.recon.evaluate.stability.methods import find_method
+from splatnode.recon.evaluate.stability.places import ScenesByMotion, TrialImage
 from splatnode.recon.jobs.calls import engine
 from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.result.verdict import Code
@@ -31,7 +31,7 @@ from tests.support.trials import without_costs
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory) -> Places:
+def places(tmp_path_factory) -> ScenesByMotion:
     return three_places(tmp_path_factory.mktemp("places"))
 
 
@@ -50,12 +50,12 @@ def takes_memory() -> list[Frame]:
     return [] if held else one_frame()
 
 
-def case(source) -> Case:
-    return Case("a note", source, Demand.REFUSE, frozenset({Code.TOO_FEW_VIEWS}))
+def case(source) -> TrialCase:
+    return TrialCase("a note", source, Demand.REFUSE, frozenset({Code.TOO_FEW_VIEWS}))
 
 
-def row(number: int, source) -> Row:
-    return Row(number, "row", lambda sampler: case(source))
+def row(number: int, source) -> MatrixRow:
+    return MatrixRow(number, "row", lambda sampler: case(source))
 
 
 def test_a_trial_ends_whatever_happens_in_it(tmp_path, places):
@@ -84,7 +84,7 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, places):
     assert [(t["row"], t["seed"]) for t in content["trials"]] == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert content["false_accept_rate"] == 0.0 and content["false_refuse_rate"] is None
     assert {path.name for path in tmp_path.iterdir()} == {"stability.json"}
-    elsewhere = Places(places.walked[:1])
+    elsewhere = ScenesByMotion(places.walked[:1])
     with pytest.raises(ValueError, match="is of the scenes east, south, west, now there are east"):
         run_campaign(Plan(rows, (0,), ("splatnode",)), elsewhere, tmp_path, "command", on)
 
@@ -103,15 +103,15 @@ def test_seconds_of_one_core_and_of_several_are_not_mixed(tmp_path, places):
     assert len(run_campaign(plan, places, tmp_path, "command", in_this_process(cores_each=4))) == 1
 
 
-def six_views() -> Case:
-    photos = [Photo(frame.name, frame.image, None) for frame in photographs()]
-    return accepted(photos, "the built-in place")
+def six_views() -> TrialCase:
+    photos = [TrialImage(frame.name, frame.image, None) for frame in photographs()]
+    return make_accept_case(photos, "the built-in place")
 
 
 def test_one_core_and_two_give_the_same(tmp_path, places):
     if len(usable_cores()) < 2:
         pytest.skip("needs two cores")
-    rows = Row(1, "six", lambda sampler: six_views()), row(2, one_frame)
+    rows = MatrixRow(1, "six", lambda sampler: six_views()), row(2, one_frame)
     found = []
     for cores in (1, 2):
         with engine(cores, None) as on:
@@ -147,7 +147,7 @@ def begun(path: Path) -> list[str]:
 
 def noted(out: Path, on) -> list[dict]:
     rows = tuple(row(number, partial(note, out / "begun.txt", number)) for number in range(4))
-    return run_campaign(Plan(rows, (0,), ("splatnode",)), Places(()), out, "command", on)
+    return run_campaign(Plan(rows, (0,), ("splatnode",)), ScenesByMotion(()), out, "command", on)
 
 
 def test_a_driver_that_is_killed_repeats_what_was_running_alone(tmp_path):
@@ -171,4 +171,4 @@ def test_command_line():
     assert args.methods == ("splatnode", "colmap") and args.cores is None and args.ray is None
     assert isinstance(args, argparse.Namespace)
     with pytest.raises(ValueError, match="no method 'magic'; there are: splatnode, colmap, glomap"):
-        by_name("magic")
+        find_method("magic")

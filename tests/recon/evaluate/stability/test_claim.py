@@ -7,13 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.claim import CameraError, Claim, all_right, errors_of
+from splatnode.recon.evaluate.stability.claim import (
+    CameraError,
+    FiniteBounds,
+    has_only_right_cameras,
+    measure_camera_errors,
+)
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.result.bounds import Bounds, ball
+from splatnode.recon.result.bounds import Bounds, make_ball
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
-BOUNDS = Claim(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
+BOUNDS = FiniteBounds(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
 GOOD = CameraError("a", rotation_deg=0.9, centre_pct=1.9, spread_pct=4.0, focal_pct=3.0, bounds=BOUNDS)
 TRUTH = {
     f"{degrees}": TrueCamera(on_arc(degrees, distance=3.0), K, WIDTH, HEIGHT) for degrees in (0, 20, 40, 90, 180, 270)
@@ -29,23 +34,25 @@ def test_a_centre_is_wrong_in_percent_of_the_distance_and_of_the_spread():
     cameras = estimated(0, 90, 180, 270, distance=0.5)  # half as far away as the scene, and their spread is as much
     for number, shift in enumerate((0.01, -0.01, 0.01, -0.01)):  # up and down in turns: no similarity makes up for it
         cameras[number].T_world_camera[1, 3] += shift
-    errors = errors_of(cameras, TRUTH)
+    errors = measure_camera_errors(cameras, TRUTH)
     assert [error.centre_pct for error in errors] == pytest.approx([1.0] * 4, rel=1e-3)
     assert [error.spread_pct for error in errors] == pytest.approx([2.0] * 4, rel=1e-3)
-    assert max(error.rotation_deg for error in errors) < 1e-5 and all_right(errors)
+    assert max(error.rotation_deg for error in errors) < 1e-5 and has_only_right_cameras(errors)
 
 
 def test_two_centres_are_compared_in_the_direction_in_which_the_cameras_look():
     cameras = estimated(0, 20)
-    assert max(error.spread_pct for error in errors_of(cameras, TRUTH)) < 1e-4
+    assert max(error.spread_pct for error in measure_camera_errors(cameras, TRUTH)) < 1e-4
     cameras[1].T_world_camera[1, 3] += 0.1
-    assert not all_right(errors_of(cameras, TRUTH)), "a similarity of the centres alone would hide it"
-    assert errors_of(cameras[:1], TRUTH) == ()
+    assert not has_only_right_cameras(measure_camera_errors(cameras, TRUTH)), (
+        "a similarity of the centres alone would hide it"
+    )
+    assert measure_camera_errors(cameras[:1], TRUTH) == ()
 
 
 def test_focal_lengths_are_compared_at_one_size():
     cameras = [replace(camera, K=0.55 * K, width=WIDTH // 2, height=HEIGHT // 2) for camera in estimated(0, 20, 40)]
-    assert [error.focal_pct for error in errors_of(cameras, TRUTH)] == pytest.approx([10.0] * 3)
+    assert [error.focal_pct for error in measure_camera_errors(cameras, TRUTH)] == pytest.approx([10.0] * 3)
 
 
 @pytest.mark.parametrize(
@@ -66,11 +73,15 @@ def test_focal_lengths_are_compared_at_one_size():
     ],
 )
 def test_wrong_is_beyond_the_claim(changes, rough, wrong):
-    assert replace(GOOD, **changes).wrong(rough) is wrong
+    assert replace(GOOD, **changes).is_wrong(rough) is wrong
 
 
 def test_bounds_that_are_not_finite_claim_nothing():
-    infinite = Bounds(float("inf"), float("nan"), float("nan"), float("inf"), ball(float("nan")))
+    infinite = Bounds(float("inf"), float("nan"), float("nan"), float("inf"), make_ball(float("nan")))
     cameras = [replace(camera, bounds=infinite) for camera in estimated(0, 20, 40)]
-    assert not any(error.wrong(rough=False) for error in errors_of(cameras, TRUTH))
-    assert all(np.isfinite(bound) for error in errors_of(cameras, TRUTH) for _, bound in error.claimed().values())
+    assert not any(error.is_wrong(rough=False) for error in measure_camera_errors(cameras, TRUTH))
+    assert all(
+        np.isfinite(bound)
+        for error in measure_camera_errors(cameras, TRUTH)
+        for _, bound in error.pair_with_bounds().values()
+    )

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from splatnode.recon.evaluate.stability.case import Demand
-from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
-from splatnode.recon.evaluate.stability.summary import rate, report, summarise
+from splatnode.recon.evaluate.stability.outcome import Outcome, classify_outcome, score_cameras
+from splatnode.recon.evaluate.stability.summary import compute_rate, make_report, summarise
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.result.bounds import Bounds, ball
+from splatnode.recon.result.bounds import Bounds, make_ball
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
@@ -32,7 +32,7 @@ def estimated(*degrees: float, turn: float = 0.0) -> list[CameraEstimate]:
 
 
 def test_right_cameras_are_right_in_any_frame_and_scale():
-    score = compare(estimated(0, 10, 20), [world(0, 10, 20)])
+    score = score_cameras(estimated(0, 10, 20), [world(0, 10, 20)])
     assert score.right
     assert score.rotation_error_deg == pytest.approx(0, abs=1e-5)
     assert score.centre_error_pct == pytest.approx(0, abs=1e-5)
@@ -40,47 +40,48 @@ def test_right_cameras_are_right_in_any_frame_and_scale():
 
 def test_a_camera_turned_too_far_is_wrong():
     """By two thirds of the turn: the best common rotation takes the others along."""
-    assert compare(estimated(0, 10, 20, turn=2.9), [world(0, 10, 20)]).exact
-    between = compare(estimated(0, 10, 20, turn=7.0), [world(0, 10, 20)])
+    assert score_cameras(estimated(0, 10, 20, turn=2.9), [world(0, 10, 20)]).exact
+    between = score_cameras(estimated(0, 10, 20, turn=7.0), [world(0, 10, 20)])
     assert between.right and not between.exact
-    wrong = compare(estimated(0, 10, 20, turn=8.0), [world(0, 10, 20)])
+    wrong = score_cameras(estimated(0, 10, 20, turn=8.0), [world(0, 10, 20)])
     assert not wrong.right and wrong.rotation_error_deg == pytest.approx(8.0)
 
 
 def test_a_camera_beyond_its_claim_is_wrong():
     cameras = estimated(0, 10, 20, turn=1.5)
-    claimed = [replace(camera, bounds=Bounds(0.3, 0.01, 1.0, 1.0, ball(0.01))) for camera in cameras]
-    assert compare(cameras, [world(0, 10, 20)]).right and not compare(claimed, [world(0, 10, 20)]).right
+    claimed = [replace(camera, bounds=Bounds(0.3, 0.01, 1.0, 1.0, make_ball(0.01))) for camera in cameras]
+    assert score_cameras(cameras, [world(0, 10, 20)]).right and not score_cameras(claimed, [world(0, 10, 20)]).right
     roughly = [
-        replace(camera, bounds=Bounds(3.0, 0.1, 10.0, 10.0, ball(0.1))) for camera in estimated(0, 10, 20, turn=8.0)
+        replace(camera, bounds=Bounds(3.0, 0.1, 10.0, 10.0, make_ball(0.1)))
+        for camera in estimated(0, 10, 20, turn=8.0)
     ]
-    assert not compare(roughly, [world(0, 10, 20)]).right
-    assert compare(roughly, [world(0, 10, 20)], rough=True).right
+    assert not score_cameras(roughly, [world(0, 10, 20)]).right
+    assert score_cameras(roughly, [world(0, 10, 20)], rough=True).right
 
 
 def test_a_camera_without_a_finite_place_is_wrong():
     cameras = estimated(0, 10, 20)
     cameras[1].T_world_camera[0, 3] = np.nan
-    assert not compare(cameras, [world(0, 10, 20)]).right
+    assert not score_cameras(cameras, [world(0, 10, 20)]).right
 
 
 def test_a_centre_too_far_off_is_wrong():
     cameras = estimated(0, 10, 20, 30)
     cameras[1].T_world_camera[:3, 3] += 0.4  # of a spread of 1.2
-    assert not compare(cameras, [world(0, 10, 20, 30)]).right
+    assert not score_cameras(cameras, [world(0, 10, 20, 30)]).right
 
 
 def test_cameras_of_two_worlds_are_no_scene():
-    assert compare(estimated(0, 10, 20), [world(0, 10, 20), world(30, 40)]).right
-    assert not compare(estimated(0, 10, 20, 30), [world(0, 10, 20), world(30, 40)]).right
-    assert not compare(estimated(0, 10, 20, 99), [world(0, 10, 20)]).right, "a frame of no world is in no scene"
+    assert score_cameras(estimated(0, 10, 20), [world(0, 10, 20), world(30, 40)]).right
+    assert not score_cameras(estimated(0, 10, 20, 30), [world(0, 10, 20), world(30, 40)]).right
+    assert not score_cameras(estimated(0, 10, 20, 99), [world(0, 10, 20)]).right, "a frame of no world is in no scene"
 
 
 def test_what_did_not_move_is_no_scene():
     still = {name: TrueCamera(on_arc(0), K, WIDTH, HEIGHT) for name in ("0", "10", "20")}
-    assert not compare(estimated(0, 10, 20), [still]).right
-    assert not compare(estimated(0, 10, 20), []).right
-    assert not compare([], [still]).right
+    assert not score_cameras(estimated(0, 10, 20), [still]).right
+    assert not score_cameras(estimated(0, 10, 20), []).right
+    assert not score_cameras([], [still]).right
 
 
 @pytest.mark.parametrize(
@@ -98,17 +99,17 @@ def test_what_did_not_move_is_no_scene():
     ],
 )
 def test_outcomes(demand, published, right, fits, expected):
-    assert outcome(demand, published, right, fits) is expected
+    assert classify_outcome(demand, published, right, fits) is expected
 
 
 def test_wilson_s_interval():
-    none = rate(0, 200)
+    none = compute_rate(0, 200)
     assert (none.rate, none.low) == (0.0, 0.0)
     assert none.high == pytest.approx(1.959964**2 / (200 + 1.959964**2))
-    half = rate(5, 10)
+    half = compute_rate(5, 10)
     assert (half.low, half.high) == (pytest.approx(0.2366, abs=1e-4), pytest.approx(0.7634, abs=1e-4))
-    assert rate(7, 7).high == 1.0
-    assert rate(0, 0).rate is None
+    assert compute_rate(7, 7).high == 1.0
+    assert compute_rate(0, 0).rate is None
 
 
 def record(demand: str, found: str, **other) -> dict:
@@ -149,24 +150,24 @@ def test_rates_of_one_method():
 
 
 def test_the_report_s_rates_are_those_of_the_first_method():
-    content = report(TRIALS)
+    content = make_report(TRIALS)
     assert content["false_accept_rate"] == pytest.approx(2 / 9)
     assert content["false_refuse_rate"] == pytest.approx(2 / 5)
     assert [method["method"] for method in content["methods"]] == ["splatnode", "colmap"]
-    assert report([])["false_accept_rate"] is None
+    assert make_report([])["false_accept_rate"] is None
 
 
 def test_the_chart_has_a_cell_for_every_trial(tmp_path):
     pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
-    from splatnode.recon.evaluate.stability.chart import draw, figure_of
+    from splatnode.recon.evaluate.stability.chart import draw, make_figure
 
     trials = [{**trial, "seed": number % 3, "verdict": f"CODE_{number}"} for number, trial in enumerate(TRIALS)]
-    figure = figure_of({"trials": trials, **report(trials)})
+    figure = make_figure({"trials": trials, **make_report(trials)})
     shown = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert {f"CODE_{number}" for number in range(len(trials))} <= {text.rstrip(" *") for text in shown}
     assert "CODE_1 *" in shown, "a limit that was missed is marked"
-    (tmp_path / "stability.json").write_text(json.dumps({"trials": trials, **report(trials)}))
+    (tmp_path / "stability.json").write_text(json.dumps({"trials": trials, **make_report(trials)}))
     assert draw(tmp_path / "stability.json", tmp_path).stat().st_size > 10_000
-    (tmp_path / "stability.json").write_text(json.dumps({"trials": [], **report([])}))
+    (tmp_path / "stability.json").write_text(json.dumps({"trials": [], **make_report([])}))
     with pytest.raises(ValueError, match="must have a trial to draw, it has none"):
         draw(tmp_path / "stability.json", tmp_path)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.control import adaptive, proximity
-from splatnode.recon.optimize.control.control import Step
+from splatnode.recon.optimize.control.control import OptimizerStep
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.optimize.training_image import TrainingImage
 from splatnode.recon.rasterize.cpu import rasterize
@@ -33,14 +33,14 @@ def gaussians(count: int = 4, scale: float = 0.01, opacity: float = 0.5) -> Gaus
     )
 
 
-def step(of: Gaussians, iteration: int = 10, gradient: float = 0.0) -> Step:
+def step(of: Gaussians, iteration: int = 10, gradient: float = 0.0) -> OptimizerStep:
     """Two cameras 1 apart: an extent of 0.55. The gradient is that of the means, along x."""
     apart = torch.eye(4)
     apart[0, 3] = 1.0
     of.means.requires_grad_()
     of.means.grad = torch.zeros_like(of.means)
     of.means.grad[0, 0] = gradient
-    return Step(iteration, 100, iteration / 100, 0, of, (torch.eye(4), apart), (IMAGE, IMAGE), None)
+    return OptimizerStep(iteration, 100, iteration / 100, 0, of, (torch.eye(4), apart), (IMAGE, IMAGE), None)
 
 
 def test_the_extent_is_that_of_the_cameras():
@@ -60,7 +60,7 @@ def test_the_gradient_in_the_image_is_that_of_moving_what_is_seen():
 
     ramp = torch.linspace(0, 1, scene.width)[None, :, None] + torch.linspace(0, 2, scene.height)[:, None, None]
     (image(scene.Ks[0]).rgb * ramp).sum().backward()
-    found = adaptive.image_gradient(Step(1, 10, 0.1, 0, of, (T,), (photograph,), None))
+    found = adaptive.image_gradient(OptimizerStep(1, 10, 0.1, 0, of, (T,), (photograph,), None))
     principal = scene.Ks[0].clone().requires_grad_()  # moving it moves the image of all that is seen
     (image(principal).rgb * ramp).sum().backward()
     halves = torch.tensor([scene.width / 2, scene.height / 2])
@@ -109,10 +109,10 @@ def test_there_is_an_end_to_growing():
 def test_a_gap_is_filled_half_way_to_the_neighbours():
     three_near = gaussians(5)
     three_near.means[4, 0] = 2.0
-    grown = proximity.unpooled(three_near, 1.0, 3)
+    grown = proximity.unpool(three_near, 1.0, 3)
     assert grown.means[:, 0].tolist() == pytest.approx([1.15, 1.1, 1.05])
     assert grown.source_frame.tolist() == [4, 4, 4]
-    assert len(proximity.unpooled(three_near, 5.0, 3)) == 0
+    assert len(proximity.unpool(three_near, 5.0, 3)) == 0
 
 
 def test_unpooling_is_part_of_a_round():

@@ -9,7 +9,7 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize.control.control import Change, Step
+from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.refinement import refine
 from splatnode.recon.scene.scene import Scene
 from tests.recon.optimize.test_refinement import plain, truth  # noqa: F401  a fixture
@@ -17,7 +17,7 @@ from tests.recon.optimize.test_refinement import plain, truth  # noqa: F401  a f
 QUICK = plain(iterations=6, half_resolution_share=0.5)
 
 
-def controlled(scene: Scene, after_step: Callable[[Step], Change | None]) -> Scene:
+def controlled(scene: Scene, after_step: Callable[[OptimizerStep], GaussianChange | None]) -> Scene:
     """`scene` after its refinement under a control that is this function."""
     choice = SimpleNamespace(config=None, module=SimpleNamespace(load=lambda config, seed: control))
     control = SimpleNamespace(after_step=after_step)
@@ -27,7 +27,7 @@ def controlled(scene: Scene, after_step: Callable[[Step], Change | None]) -> Sce
 def test_a_control_sees_every_step_with_its_gradients(truth):  # noqa: F811
     seen = []
 
-    def watch(step: Step) -> None:
+    def watch(step: OptimizerStep) -> None:
         assert step.gaussians.means.grad is not None and step.gaussians.means.grad.abs().max() > 0
         assert len(step.Ts_world_camera) == len(step.images) == 3
         seen.append((step.iteration, step.iterations, step.view, step.images[0].width))
@@ -41,13 +41,13 @@ def test_a_control_sees_every_step_with_its_gradients(truth):  # noqa: F811
 def test_the_optimiser_goes_on_with_what_a_control_gives_back(truth):  # noqa: F811
     counts = []
 
-    def change(step: Step) -> Change | None:
+    def change(step: OptimizerStep) -> GaussianChange | None:
         counts.append(len(step.gaussians))
         if step.iteration != 2:
             return None
         origin = torch.tensor([5, 1, 1])
         kept = step.gaussians.map(lambda tensor: tensor.detach()[origin])
-        return Change(kept, torch.where(torch.arange(3) == 2, -1, origin))
+        return GaussianChange(kept, torch.where(torch.arange(3) == 2, -1, origin))
 
     scene = controlled(truth, change)
     assert counts == [len(truth.gaussians)] * 2 + [3] * 4
@@ -66,4 +66,4 @@ def test_a_control_that_changes_nothing_changes_nothing(truth):  # noqa: F811
 
 def test_a_change_whose_rows_do_not_fit_their_origins_is_an_error(truth):  # noqa: F811
     with pytest.raises(ValueError, match="for these origins"):
-        controlled(truth, lambda step: Change(step.gaussians.map(torch.Tensor.detach), torch.zeros(3).long()))
+        controlled(truth, lambda step: GaussianChange(step.gaussians.map(torch.Tensor.detach), torch.zeros(3).long()))

@@ -9,11 +9,11 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize.control.control import ControlChoice, Step
-from splatnode.recon.optimize.control.prune import Config, changes_without, load, most_worth
-from splatnode.recon.optimize.pseudo_views import between
+from splatnode.recon.optimize.control.control import ControlChoice, OptimizerStep
+from splatnode.recon.optimize.control.prune import Config, estimate_removal_changes, load, select_most_worthwhile
+from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
 from splatnode.recon.optimize.refinement import refine
-from splatnode.recon.optimize.training_image import TrainingImage, training_image
+from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
 from splatnode.recon.rasterize.gaussian_render import Camera
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.contrast_masking import visibility
@@ -23,7 +23,7 @@ from tests.recon.optimize.test_refinement import plain, render, truth  # noqa: F
 
 
 def images_of(scene: Scene, scale: float = 1.0) -> list[TrainingImage]:
-    return [training_image(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
+    return [make_training_image(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
 
 
 def cameras_of(scene: Scene, scale: float = 1.0) -> list[Camera]:
@@ -32,7 +32,7 @@ def cameras_of(scene: Scene, scale: float = 1.0) -> list[Camera]:
 
 
 def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
-    return changes_without(scene.gaussians, cameras_of(scene, scale), probes, torch.Generator().manual_seed(0))
+    return estimate_removal_changes(scene.gaussians, cameras_of(scene, scale), probes, torch.Generator().manual_seed(0))
 
 
 def left_out(gaussians: Gaussians, view: TrainingView, index: int) -> float:
@@ -62,9 +62,9 @@ def test_photographs_of_another_size_are_worth_about_the_same(truth):  # noqa: F
 
 def test_of_too_many_the_best_are_kept_in_their_order():
     values = torch.tensor([0.5, 3.0, 0.1, 2.0, 9.0])
-    assert most_worth(values, 0.4, None).tolist() == [0, 1, 3, 4]
-    assert most_worth(values, 0.4, 2).tolist() == [1, 4]
-    assert most_worth(values, 0.4, 9).tolist() == [0, 1, 3, 4]
+    assert select_most_worthwhile(values, 0.4, None).tolist() == [0, 1, 3, 4]
+    assert select_most_worthwhile(values, 0.4, 2).tolist() == [1, 4]
+    assert select_most_worthwhile(values, 0.4, 9).tolist() == [0, 1, 3, 4]
 
 
 def pruned(scene: Scene, config: Config, limit: int | None = None) -> Scene:
@@ -86,12 +86,12 @@ def test_what_no_photograph_shows_goes_and_the_far_shell_stays(truth):  # noqa: 
 def test_views_between_lie_near_the_path_and_are_no_photographs(truth):  # noqa: F811
     cameras = cameras_of(truth)
     centres = torch.stack([camera.T_world_camera[:3, 3] for camera in cameras])
-    found = between(cameras, 6, off_path=0.0, rng=np.random.default_rng(0))
+    found = sample_pseudo_views(cameras, 6, off_path=0.0, rng=np.random.default_rng(0))
     assert len(found) == 6
     for view in found:
         away = (centres - view.camera.T_world_camera[:3, 3]).norm(dim=1)
         assert 0 < away.min() < 0.6 * torch.pdist(centres).max()
-    assert between(cameras[:1], 3, off_path=0.0, rng=np.random.default_rng(0)) == []
+    assert sample_pseudo_views(cameras[:1], 3, off_path=0.0, rng=np.random.default_rng(0)) == []
 
 
 @pytest.mark.parametrize("limit", [1, 7])
@@ -101,7 +101,7 @@ def test_a_limit_is_kept_to_the_one(truth, limit):  # noqa: F811
 
 def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: F811
     control = load(Config(at=(0.3, 0.6), least_change=0.0), seed=0)
-    step = Step(9, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], images_of(truth), None)
+    step = OptimizerStep(9, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], images_of(truth), None)
     changed = [
         control.after_step(replace(step, progress=progress)) is not None for progress in (0.2, 0.4, 0.5, 0.7, 0.95)
     ]
@@ -113,7 +113,7 @@ def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: 
 def test_in_a_hurry_it_waits_until_the_gaussians_are_fitted_unless_there_are_too_many(truth):  # noqa: F811
     def happens(iteration: int, limit: int | None, progress: float = 0.5) -> bool:
         scene = truth.gaussians, [v.T_world_camera for v in truth.views], images_of(truth), limit
-        return load(Config(), seed=0).after_step(Step(iteration, 500, progress, 0, *scene)) is not None
+        return load(Config(), seed=0).after_step(OptimizerStep(iteration, 500, progress, 0, *scene)) is not None
 
     assert not happens(30, None, 0.3) and happens(31, None, 0.3)
     assert not happens(3, len(truth.gaussians)) and happens(3, len(truth.gaussians) - 1)

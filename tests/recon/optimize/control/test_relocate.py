@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.optimize.control.relocate import Config, relocated, shared_by, with_noise
-from splatnode.recon.optimize.refinement import Config as Optimising
+from splatnode.recon.optimize.control.relocate import Config, add_noise, relocate_dead, split_opacity
+from splatnode.recon.optimize.refinement import RefinementConfig as Optimising
 from splatnode.recon.optimize.refinement import refine
 from splatnode.recon.scene.gaussians import Gaussians
 from tests.recon.optimize.test_refinement import truth  # noqa: F401  a fixture
@@ -29,7 +29,7 @@ def gaussians(opacities: list[float]) -> Gaussians:
 
 @pytest.mark.parametrize(("opacity", "count"), [(0.3, 1), (0.7, 2), (0.9, 5)])
 def test_parts_in_one_place_look_like_the_whole(opacity, count):
-    shared, narrower = shared_by(torch.tensor([count]), torch.tensor([opacity]))
+    shared, narrower = split_opacity(torch.tensor([count]), torch.tensor([opacity]))
     assert 1 - (1 - float(shared)) ** count == pytest.approx(opacity, abs=1e-5)
     x = torch.linspace(-12, 12, 20001).double()
     together = 1 - (1 - shared.double() * torch.exp(-0.5 * (x / narrower.double()) ** 2)) ** count
@@ -38,7 +38,7 @@ def test_parts_in_one_place_look_like_the_whole(opacity, count):
 
 def test_the_dead_move_to_the_living_and_start_anew():
     before = gaussians([0.6, 0.001, 0.004])
-    after, origin = relocated(before, 0.005, torch.Generator().manual_seed(0))
+    after, origin = relocate_dead(before, 0.005, torch.Generator().manual_seed(0))
     assert torch.equal(after.means, before.means[[0, 0, 0]])
     assert torch.equal(after.sh, before.sh[[0, 0, 0]])
     assert origin.tolist() == [-1, -1, -1]  # the living one, too: it is a third of itself now
@@ -48,14 +48,14 @@ def test_the_dead_move_to_the_living_and_start_anew():
 def test_where_none_is_dead_or_none_alive_nothing_moves():
     for opacities in ([0.6, 0.5], [0.001, 0.002]):
         before = gaussians(opacities)
-        after, origin = relocated(before, 0.005, torch.Generator().manual_seed(0))
+        after, origin = relocate_dead(before, 0.005, torch.Generator().manual_seed(0))
         assert after is before and origin.tolist() == [0, 1]
 
 
 def test_the_transparent_move_within_their_extent_and_the_opaque_stay():
     before = gaussians([1e-4] * 500 + [0.5] * 500)
     flat = replace(before, log_scales=torch.tensor([0.0, -1.0, -20.0]).repeat(1000, 1))
-    moves = with_noise(flat, 0.1, torch.Generator().manual_seed(0)).means - flat.means
+    moves = add_noise(flat, 0.1, torch.Generator().manual_seed(0)).means - flat.means
     spread = moves[:500].std(0)
     assert float(spread[0] / spread[1]) == pytest.approx(float(torch.e**2), rel=0.2)  # as the variances
     assert moves[:, 2].abs().max() == 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatnode.recon.result.export.axes import least_turned
+from splatnode.recon.result.export.axes import minimize_rotations
 from splatnode.recon.result.export.quaternions import matrices_from_quats
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians
@@ -17,7 +17,7 @@ def covariances(gaussians: GaussianArrays) -> np.ndarray:
 
 def test_the_same_gaussians_are_turned_little():
     gaussians = make_gaussians(2000)
-    turned = least_turned(gaussians)
+    turned = minimize_rotations(gaussians)
     size = gaussians.scales.max(1)[:, None, None] ** 2
     assert np.allclose(covariances(turned) / size, covariances(gaussians) / size, atol=1e-5)
     assert (np.sort(turned.scales, 1) == np.sort(gaussians.scales, 1)).all()
@@ -29,6 +29,6 @@ def test_the_same_gaussians_are_turned_little():
 def test_a_quarter_turn_is_none():
     quarter = make_gaussians(1)
     quarter.quats[:] = np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)  # about z
-    turned = least_turned(quarter)
+    turned = minimize_rotations(quarter)
     assert np.allclose(turned.quats, [1.0, 0.0, 0.0, 0.0], atol=1e-6)
     assert (turned.scales == quarter.scales[:, [1, 0, 2]]).all()

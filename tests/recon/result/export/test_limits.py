@@ -11,7 +11,7 @@ import pytest
 
 from splatnode.command_line import main
 from splatnode.recon.result.export import SceneFileError, read_cameras, read_gaussians
-from splatnode.recon.result.export.limits import BYTES_A_VALUE, MAX_JSON_BYTES, check_count, values_of_one
+from splatnode.recon.result.export.limits import BYTES_A_VALUE, MAX_JSON_BYTES, check_count, count_values
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.viewer.sources import load_result
 from tests.support.crafted import Crafted, camera_files, scene_files
@@ -44,7 +44,7 @@ def test_every_crafted_scene_is_refused_by_name_or_read_in_bounded_memory():
     for reading in readings("tests.support.crafted:scene_files", f"{__name__}:read_scene"):
         refused = reading.outcome.startswith("SceneFileError: ") and reading.name in reading.outcome
         assert refused or (reading.outcome.endswith("Gaussians") and reading.name in GOOD), reading
-        assert reading.taken <= BYTES_A_VALUE * values_of_one(16) * reading.size // 4 + MARGIN, reading
+        assert reading.taken <= BYTES_A_VALUE * count_values(16) * reading.size // 4 + MARGIN, reading
 
 
 def test_every_crafted_camera_file_is_refused_by_name():

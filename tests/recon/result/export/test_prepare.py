@@ -12,7 +12,7 @@ from splatnode.recon.result.export.formats.splat import decode as decode_splat
 from splatnode.recon.result.export.formats.splat import encode_splat
 from splatnode.recon.result.export.formats.spz import decode as decode_spz
 from splatnode.recon.result.export.formats.spz import encode_spz
-from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.prepare import sanitize_gaussians
 from tests.support.exported import make_gaussians
 
 
@@ -25,7 +25,7 @@ def test_viewer_safe_leaves_out_and_clamps_what_would_break_a_viewer():
     gaussians.opacities[4:6] = [0.0, 1.0]
     gaussians.quats[6] = 0.0
     gaussians.quats[7] *= 20.0
-    safe = viewer_safe(gaussians)
+    safe = sanitize_gaussians(gaussians)
     assert len(safe) == 97
     assert np.array_equal(safe.means, gaussians.means[3:])
     assert safe.scales[0].min() > 0 and safe.scales[0].max() < 100
@@ -38,9 +38,9 @@ def test_viewer_safe_leaves_out_and_clamps_what_would_break_a_viewer():
 
 def test_viewer_safe_keeps_a_sane_scene_as_it_is_and_accepts_none():
     gaussians = make_gaussians()
-    safe = viewer_safe(gaussians)
+    safe = sanitize_gaussians(gaussians)
     assert np.array_equal(safe.means, gaussians.means) and np.array_equal(safe.scales, gaussians.scales)
-    empty = viewer_safe(make_gaussians(0))
+    empty = sanitize_gaussians(make_gaussians(0))
     assert len(empty) == 0
     assert len(decode_ply(encode_ply(empty))) == 0
     assert len(decode_spz(encode_spz(empty))) == 0
@@ -51,6 +51,6 @@ def test_a_quaternion_that_is_too_long_to_measure_is_none_and_nobody_is_warned()
     gaussians.quats[4] = 3e38
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        safe = viewer_safe(gaussians)
+        safe = sanitize_gaussians(gaussians)
     assert np.array_equal(safe.quats[4], [1, 0, 0, 0])
     assert np.allclose(np.linalg.norm(safe.quats, axis=1), 1.0, atol=1e-6)

@@ -24,7 +24,7 @@ from splatnode.recon.result.export import (
 )
 from splatnode.recon.result.export import staged as staged_module
 from splatnode.recon.result.export.formats.ply import encode_ply
-from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.verdict import Code
 from tests.support.exported import make_gaussians, make_snapshot, write
@@ -185,10 +185,10 @@ def test_what_a_killed_process_had_begun_is_finished_or_taken_back(tmp_path):
     digest = hashlib.sha256((tmp_path / "transforms.json").read_bytes()).hexdigest()
     note = {"files": ["scene.ply", "report.json"], "superseded": {"transforms.json": digest}}
     interrupted(tmp_path, {"report.json": b"new"}, json.dumps(note))  # scene.ply has its name already
-    staged_module.completed(tmp_path)
+    staged_module.finish_interrupted_write(tmp_path)
     assert (tmp_path / "report.json").read_bytes() == b"new" and not (tmp_path / "transforms.json").exists()
     interrupted(tmp_path, {"report.json": b"newer"}, None)
-    staged_module.completed(tmp_path)
+    staged_module.finish_interrupted_write(tmp_path)
     assert (tmp_path / "report.json").read_bytes() == b"new" and not list(tmp_path.glob(".*"))
 
 
@@ -207,7 +207,7 @@ def test_a_strangers_note_touches_nothing_outside_its_folder(tmp_path, note):
     (tmp_path / ".outside.0123456789ab.tmp").write_text("theirs")
     (tmp_path / "elsewhere" / ".x.0123456789ab.tmp").write_text("theirs")
     interrupted(folder, {}, note)
-    staged_module.completed(folder)
+    staged_module.finish_interrupted_write(folder)
     assert outside.read_text() == "mine" and not (tmp_path / "elsewhere" / "x").exists()
     assert {path.name for path in folder.iterdir()} == {"link", "own"}
 
@@ -303,7 +303,7 @@ def test_a_run_that_is_killed_between_renames_leaves_no_export_beside_the_new_sc
     with pytest.raises(KeyboardInterrupt):
         write(replace(make_snapshot(), gaussians=make_gaussians(seed=4)), tmp_path)
     monkeypatch.undo()
-    with result_folder(tmp_path):
+    with hold_result_folder(tmp_path):
         assert files_in(tmp_path) - {".splatnode.lock"} == fresh
 
 

@@ -10,22 +10,22 @@ import pytest
 from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians
 from splatnode.recon.result.export.selection import Box, Selection
 from splatnode.recon.result.export.sources import SOURCES
-from splatnode.recon.result.only_seen import only_seen
-from splatnode.recon.result.sources import SHELL, filled
-from splatnode.recon.result.write import finish
+from splatnode.recon.result.only_seen import remove_unconfirmed
+from splatnode.recon.result.sources import SHELL, encode_unconfirmed
+from splatnode.recon.result.write import write_result_folder
 from tests.support.exported import make_gaussians, make_snapshot, write
 
 SEEN = Selection(only_seen=True)
 
 
-ALL_KINDS = (0, filled(0), SHELL, 3, filled(3))
+ALL_KINDS = (0, encode_unconfirmed(0), SHELL, 3, encode_unconfirmed(3))
 
 
 def result(folder, sources=ALL_KINDS):
     gaussians = make_gaussians(50)
     gaussians = replace(gaussians, source_frame=np.resize(np.array(sources, np.int32), 50))
     snapshot = replace(make_snapshot(), gaussians=gaussians)
-    finish(snapshot, folder, seed=0, preset_name="balanced")
+    write_result_folder(snapshot, folder, seed=0, preset_name="balanced")
     return snapshot
 
 
@@ -33,7 +33,7 @@ def result(folder, sources=ALL_KINDS):
 def test_only_what_two_photographs_confirm_is_exported(tmp_path, to):
     snapshot = result(tmp_path)
     back = read_gaussians(export_scene(tmp_path, to, tmp_path / f"seen.{to}", SEEN))
-    expected = only_seen(snapshot).gaussians
+    expected = remove_unconfirmed(snapshot).gaussians
     assert len(back) == 20 == len(expected)
     atol = 1e-3 if to == "spz" else 1e-6
     assert np.allclose(np.sort(back.means[:, 0]), np.sort(expected.means[:, 0]), atol=atol)
@@ -83,7 +83,7 @@ def test_a_box_must_have_an_inside(most):
 
 
 def test_a_result_without_confirmed_gaussians_is_refused(tmp_path):
-    result(tmp_path, sources=(SHELL, filled(0)))
+    result(tmp_path, sources=(SHELL, encode_unconfirmed(0)))
     with pytest.raises(SceneFileError, match="no Gaussian that two photographs confirm"):
         export_scene(tmp_path, "ply", tmp_path / "seen.ply", SEEN)
 

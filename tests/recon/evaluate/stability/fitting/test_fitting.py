@@ -11,13 +11,18 @@ import pytest
 
 from splatnode.recon.evaluate.stability.claim import CameraError
 from splatnode.recon.evaluate.stability.fitting import bounds, odds
-from splatnode.recon.evaluate.stability.fitting.cross_validation import counts, fitted, left_out, without_each_scene
-from splatnode.recon.evaluate.stability.fitting.judge import beyond_claim, published, wrong
-from splatnode.recon.evaluate.stability.fitting.module import source
-from splatnode.recon.evaluate.stability.fitting.samples import Sample, read
+from splatnode.recon.evaluate.stability.fitting.cross_validation import (
+    count_judgements,
+    fit_models,
+    fit_without_each_scene,
+    pair_held_out_models,
+)
+from splatnode.recon.evaluate.stability.fitting.judge import exceeds_bounds, is_published, is_wrong
+from splatnode.recon.evaluate.stability.fitting.module import format_module
+from splatnode.recon.evaluate.stability.fitting.samples import Sample, read_samples
 from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.models import Fitted
+from splatnode.recon.verification.models import VerdictModels
 from tests.support.verdicts import evidence
 
 RANDOM = np.random.default_rng(0)
@@ -47,8 +52,8 @@ def samples() -> list[Sample]:
 
 
 def test_the_bounds_hold_for_as_many_errors_as_they_should(samples):
-    judged = left_out(samples, without_each_scene(samples))
-    found = counts([pair for pair in judged if pair[0].right])
+    judged = pair_held_out_models(samples, fit_without_each_scene(samples))
+    found = count_judgements([pair for pair in judged if pair[0].right])
     assert found.right_published == found.right and found.beyond == 0
     # A bound is never below 2.5 standard errors, within which 98.8 % of these errors are.
     assert found.rotations_within is not None and 0.9 <= found.rotations_within <= 0.995
@@ -57,16 +62,16 @@ def test_the_bounds_hold_for_as_many_errors_as_they_should(samples):
 
 def test_a_bound_grows_with_what_the_sources_say(samples):
     model = bounds.fit(samples).rotation
-    narrow, wide = (model.of(Errors(size, size, 0.0), 3) for size in (0.2, 2.0))
+    narrow, wide = (model.predict_bound(Errors(size, size, 0.0), 3) for size in (0.2, 2.0))
     assert 4.0 * narrow < wide
-    assert model.of(Errors(0.2, 0.2, 50.0), 3) == 100.0  # what the focal length leaves open, twice
+    assert model.predict_bound(Errors(0.2, 0.2, 50.0), 3) == 100.0  # what the focal length leaves open, twice
 
 
 def test_wrong_registrations_are_refused_by_numbers_that_did_not_see_their_scene(samples):
-    numbers = without_each_scene(samples)
+    numbers = fit_without_each_scene(samples)
     bad = [each for each in samples if each.gross]
-    assert len(bad) == 10 and not any(published(each, numbers[each.scene]) for each in bad)
-    assert all(wrong(each, numbers[each.scene]) for each in bad)
+    assert len(bad) == 10 and not any(is_published(each, numbers[each.scene]) for each in bad)
+    assert all(is_wrong(each, numbers[each.scene]) for each in bad)
 
 
 def test_a_measure_never_counts_the_wrong_way(samples):
@@ -108,14 +113,14 @@ def test_more_must_speak_for_poses_with_a_lens_of_its_own_where_such_were_wrong(
 
 def test_cameras_of_two_worlds_are_beyond_every_claim(samples):
     mixed = replace(samples[0], errors=dict(list(samples[0].errors.items())[:2]))
-    assert not mixed.together and beyond_claim(mixed, fitted(samples))
+    assert not mixed.together and exceeds_bounds(mixed, fit_models(samples))
 
 
 def test_the_module_that_is_written_holds_what_was_found(samples):
-    numbers = fitted(samples)
+    numbers = fit_models(samples)
     namespace: dict[str, object] = {}
-    exec(compile(source(Fitted(numbers, numbers)), "fitted.py", "exec"), namespace)
-    assert namespace["FITTED"] == Fitted(numbers, numbers)
+    exec(compile(format_module(VerdictModels(numbers, numbers)), "fitted.py", "exec"), namespace)
+    assert namespace["FITTED"] == VerdictModels(numbers, numbers)
 
 
 def test_no_number_of_the_verdict_was_typed_in():
@@ -127,4 +132,4 @@ def test_no_number_of_the_verdict_was_typed_in():
 def test_other_files_are_refused(tmp_path):
     (tmp_path / "bench.json").write_text('{"runs": []}')
     with pytest.raises(ValueError, match=r"bench\.json must be a windows\.json or a stability\.json"):
-        read([tmp_path / "bench.json"])
+        read_samples([tmp_path / "bench.json"])

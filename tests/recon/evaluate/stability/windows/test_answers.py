@@ -12,14 +12,14 @@ from msgspec.structs import replace
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
 from splatnode.recon import estimation
-from splatnode.recon.config import Config
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate.demo import write_capture
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of
-from splatnode.recon.evaluate.stability.places import Place
+from splatnode.recon.evaluate.stability.own_cameras import list_registered_cameras
+from splatnode.recon.evaluate.stability.places import TrialScene
 from splatnode.recon.evaluate.stability.windows import ours, store
-from splatnode.recon.evaluate.stability.windows.row import Answer, Found, judged
-from splatnode.recon.evaluate.stability.windows.store import Key, among
-from splatnode.recon.evaluate.stability.windows.window import Window, angle_deg
+from splatnode.recon.evaluate.stability.windows.row import WindowAnswer, WindowOutcome, judge_window
+from splatnode.recon.evaluate.stability.windows.store import Key, select_keys
+from splatnode.recon.evaluate.stability.windows.window import Window, compute_angle_deg
 from splatnode.recon.evaluate.timing import Timing
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.jobs.cores import usable_cores
@@ -32,33 +32,35 @@ PLACE = synthetic.Config(views=6, width=320, height=240)
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Place:
+def place(tmp_path_factory) -> TrialScene:
     folder = tmp_path_factory.mktemp("built_in")
     write_capture(folder, PLACE)
-    return Place(load_scene(folder), tuple(synthetic.frame_name(i) for i in range(PLACE.views)))
+    return TrialScene(load_scene(folder), tuple(synthetic.frame_name(i) for i in range(PLACE.views)))
 
 
-def window(place: Place, start: int, stride: int, count: int = 3) -> Window:
+def window(place: TrialScene, start: int, stride: int, count: int = 3) -> Window:
     span = slice(start, start + stride * count, stride)
-    return Window(place.name, count, stride, start, place.names[span], angle_deg(place.Ts_world_camera[span]))
+    return Window(place.name, count, stride, start, place.names[span], compute_angle_deg(place.Ts_world_camera[span]))
 
 
-def answered(place: Place, each: Window, known: dict[Key, bytes], config: Config, **asked) -> Answer:
+def answered(
+    place: TrialScene, each: Window, known: dict[Key, bytes], config: ReconstructionConfig, **asked
+) -> WindowAnswer:
     """What splatnode answers; what it finds is known from then on."""
-    answer, found = ours.answered(place, each, config, asked.get("fresh", False), "nothing", known)
+    answer, found = ours.answer_window(place, each, config, asked.get("fresh", False), "nothing", known)
     known |= found
     return answer
 
 
 def test_what_is_known_of_a_scene_changes_no_answer(place):
-    config = Config()
+    config = ReconstructionConfig()
     windows = [window(place, 0, 2), window(place, 1, 1, 4)]  # which share a pair
     known: dict[Key, bytes] = {}
     found = [answered(place, each, known, config) for each in windows]
     for each, answer in zip(windows, found, strict=True):
-        estimate = ours.from_scratch(ours.frames_of(place, each), config)
+        estimate = ours.estimate_without_store(ours.load_window_frames(place, each), config)
         assert answer.verdict == estimate.verdict
-        cameras = cameras_of(estimate)
+        cameras = list_registered_cameras(estimate)
         assert [camera.name for camera in answer.cameras] == [camera.name for camera in cameras]
         for one, other in zip(answer.cameras, cameras, strict=True):
             np.testing.assert_array_equal(one.T_world_camera, other.T_world_camera)
@@ -73,7 +75,10 @@ def test_masks_hide_what_they_hide_in_windows_too(place, tmp_path):
     hidden[:100] = 0
     (tmp_path / f"{each.names[1]}.png").write_bytes(encode_png(hidden))
     scene = dataclasses.replace(place.scene, masks=tmp_path)
-    plain, frames = ours.frames_of(place, each, True), ours.frames_of(Place(scene, place.names), each, True)
+    plain, frames = (
+        ours.load_window_frames(place, each, True),
+        ours.load_window_frames(TrialScene(scene, place.names), each, True),
+    )
     assert [(frame.frame_id, frame.stamp_ns, frame.intrinsics is None) for frame in frames] == [
         (1, 1, False),
         (3, 3, False),
@@ -92,15 +97,15 @@ def assert_same(one: object, other: object) -> None:
 
 def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkeypatch):
     """Of firm pairs and of weak ones, which tilted features are made for, and which are chosen by window."""
-    config = Config()
+    config = ReconstructionConfig()
     few = replace(config.matching.features, num_features=1000)
     matching = replace(config.matching, features=few, tilting=replace(config.matching.tilting, firm_matches=100))
     config = replace(config, matching=matching)
-    keyframes = [prepare(frame, config) for frame in ours.frames_of(place, window(place, 0, 1, 6))]
+    keyframes = [prepare(frame, config) for frame in ours.load_window_frames(place, window(place, 0, 1, 6))]
     known: dict[Key, bytes] = {}
     for some in (keyframes[:4], keyframes[2:], keyframes[1::2], keyframes):
-        graph, found = store.matched(
-            some, {key: known[key] for key in among(known, [k.name for k in some])}, matching, None
+        graph, found = store.match_keyframes(
+            some, {key: known[key] for key in select_keys(known, [k.name for k in some])}, matching, None
         )
         known |= found
         scratch = match(some, matching)
@@ -112,16 +117,16 @@ def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkey
     assert 0 < len(graph.tilted) < len(graph.plain), "else there was nothing to choose"
     for work in ("match_plain", "match_tilted"):
         monkeypatch.setattr(pair_matching, work, None)
-    assert store.matched(keyframes, known, matching, None)[1] == {}, "nothing is matched twice"
+    assert store.match_keyframes(keyframes, known, matching, None)[1] == {}, "nothing is matched twice"
 
 
 def test_a_refusal_keeps_its_cameras_and_evidence(place, monkeypatch):
     monkeypatch.setattr(estimation, "refuse_before_registration", lambda *_: Verdict(Code.BLUR, "No.", ""))
     each = window(place, 0, 2)
-    answer = answered(place, each, {}, Config(), fresh=True)
+    answer = answered(place, each, {}, ReconstructionConfig(), fresh=True)
     assert answer.fresh_seconds is not None and answer.fresh_seconds > 0
-    row = judged(each, "splatnode", answer, place.scene.cameras)
-    assert row.found is Found.REFUSED and row.cores == len(usable_cores())
+    row = judge_window(each, "splatnode", answer, place.scene.cameras)
+    assert row.outcome is WindowOutcome.REFUSED and row.cores == len(usable_cores())
     assert row.evidence is not None and row.right and len(row.cameras) == 3
     assert all(camera.bounds is not None for camera in row.cameras)
 
@@ -129,11 +134,13 @@ def test_a_refusal_keeps_its_cameras_and_evidence(place, monkeypatch):
 def test_seconds_are_those_of_a_window_that_had_its_cores_alone(place):
     each = window(place, 0, 1)
     alone, beside = Timing(1, "a processor", 0.01), Timing(1, "a processor", 0.3)
-    answer = Answer(Verdict(Code.NO_OVERLAP, "Nothing.", ""), (), 2.0, alone, 5.0, alone)
-    row = judged(each, "splatnode", answer, place.scene.cameras)
+    answer = WindowAnswer(Verdict(Code.NO_OVERLAP, "Nothing.", ""), (), 2.0, alone, 5.0, alone)
+    row = judge_window(each, "splatnode", answer, place.scene.cameras)
     assert (row.seconds, row.fresh_seconds, row.others, row.cores) == (2.0, 5.0, 0.01, 1)
     for one, other in ((alone, beside), (beside, alone)):
-        row = judged(each, "splatnode", dataclasses.replace(answer, timed_on=one, fresh_on=other), place.scene.cameras)
+        row = judge_window(
+            each, "splatnode", dataclasses.replace(answer, timed_on=one, fresh_on=other), place.scene.cameras
+        )
         assert (row.seconds, row.fresh_seconds, row.others) == (None, None, 0.3)
 
 
@@ -144,14 +151,14 @@ def test_rivals_map_what_is_known_of_the_scene(place):
     jobs = [("colmap", window(place, 0, 1, 4)), ("glomap", window(place, 1, 1)), ("colmap", window(place, 2, 1, 4))]
     known: dict[Key, bytes] = {}
     for number, (method, each) in enumerate(jobs):
-        answer, found = rivals.answered(place, each, method, 0, number == 0, known)
+        answer, found = rivals.answer_window(place, each, method, 0, number == 0, known)
         assert len(found) == (10, 0, 7)[number], "what is known is not found again"
         known |= found
-        row = judged(each, method, answer, place.scene.cameras)
-        assert row.found is Found.RIGHT and {camera.name for camera in row.cameras} == set(each.names)
+        row = judge_window(each, method, answer, place.scene.cameras)
+        assert row.outcome is WindowOutcome.RIGHT and {camera.name for camera in row.cameras} == set(each.names)
         assert all(camera.bounds is None for camera in row.cameras)
         assert answer.seconds > 0 and (answer.fresh_seconds is not None) == (number == 0)
-        _, found = rivals.answered(place, each, method, 0, False, {})
+        _, found = rivals.answer_window(place, each, method, 0, False, {})
         for key in (key for key in found if len(key) == 3):
             one, other = (pickle.loads(pieces[key]) for pieces in (known, found))
             np.testing.assert_array_equal(one.matches, other.matches)

@@ -17,13 +17,13 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.command_line import build_parser
 from splatnode.recon.evaluate.demo import write_capture
-from splatnode.recon.evaluate.stability.claim import CameraError, Claim
-from splatnode.recon.evaluate.stability.places import Place
+from splatnode.recon.evaluate.stability.claim import CameraError, FiniteBounds
+from splatnode.recon.evaluate.stability.places import TrialScene
 from splatnode.recon.evaluate.stability.windows import campaign
 from splatnode.recon.evaluate.stability.windows.campaign import Plan, read_rows, run_windows
-from splatnode.recon.evaluate.stability.windows.command import report_lines, tell
-from splatnode.recon.evaluate.stability.windows.row import Answer, Found, Row
-from splatnode.recon.evaluate.stability.windows.summary import coverage, summarise, tally
+from splatnode.recon.evaluate.stability.windows.command import format_report, print_report
+from splatnode.recon.evaluate.stability.windows.row import WindowAnswer, WindowOutcome, WindowRow
+from splatnode.recon.evaluate.stability.windows.summary import measure_coverage, summarise, tally_rows
 from splatnode.recon.evaluate.stability.windows.window import Window
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.jobs.calls import engine
@@ -33,18 +33,18 @@ from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places
 from tests.support.trials import without_costs
 
-BOUNDS = Claim(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
+BOUNDS = FiniteBounds(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
 
 
 def camera(number: int, **changes) -> CameraError:
     return replace(CameraError(f"{number}", 0.5, 1.0, 2.0, 3.0, BOUNDS), **changes)
 
 
-def row(*cameras: CameraError, **changes) -> Row:
+def row(*cameras: CameraError, **changes) -> WindowRow:
     of_window = {"scene": "east", "count": 3, "stride": 1, "start": 0, "names": ("0", "1", "2"), "angle_deg": 6.0}
     said = {"method": "splatnode", "verdict": "OK", "published": True, "message": "", "evidence": None}
     measured = {"seconds": 1.0, "fresh_seconds": None, "rotation_deg": 0.5, "centre_pct": 2.0}
-    return Row(**{**of_window, **said, **measured, "cameras": cameras, **changes})
+    return WindowRow(**{**of_window, **said, **measured, "cameras": cameras, **changes})
 
 
 THREE = (camera(0), camera(1), camera(2))
@@ -59,17 +59,25 @@ ROWS = [
     row(*(camera(i, bounds=None, rotation_deg=4.0) for i in range(3)), method="colmap"),
     row(*(camera(i, bounds=None, rotation_deg=6.0) for i in range(3)), method="colmap", start=1),
 ]
-OUTCOMES = [Found.RIGHT, Found.RIGHT_PART, Found.BETWEEN, Found.WRONG, Found.REFUSED, Found.REFUSED, Found.FAILED]
+OUTCOMES = [
+    WindowOutcome.RIGHT,
+    WindowOutcome.RIGHT_PART,
+    WindowOutcome.BETWEEN,
+    WindowOutcome.WRONG,
+    WindowOutcome.REFUSED,
+    WindowOutcome.REFUSED,
+    WindowOutcome.FAILED,
+]
 
 
 def test_what_became_of_a_window():
-    assert [row.found for row in ROWS] == [*OUTCOMES, Found.BETWEEN, Found.WRONG]
+    assert [row.outcome for row in ROWS] == [*OUTCOMES, WindowOutcome.BETWEEN, WindowOutcome.WRONG]
     rough = row(*THREE[:2], camera(2, rotation_deg=6.0, bounds=replace(BOUNDS, rotation_deg=5.0)))
-    assert rough.found is Found.WRONG and replace(rough, verdict="OK_ROUGH").found is Found.BETWEEN
+    assert rough.outcome is WindowOutcome.WRONG and replace(rough, verdict="OK_ROUGH").outcome is WindowOutcome.BETWEEN
 
 
 def test_tallies():
-    found = tally(ROWS[:7])
+    found = tally_rows(ROWS[:7])
     assert (found.sets, found.right, found.right_part, found.between, found.wrong) == (7, 1, 1, 1, 1)
     assert (found.refused, found.failed) == (2, 1)
     assert (found.own_right, found.own_right_published) == (2, 1)
@@ -78,21 +86,21 @@ def test_tallies():
     assert summary["splatnode"]["by_angle"]["below 8"]["sets"] == 6
     assert summary["splatnode"]["by_angle"]["15 to 25"]["wrong"] == 1
     assert summary["colmap"]["by_count"]["3"]["between"] == 1
-    assert any("colmap" in line and "below 8 degrees" in line for line in report_lines(ROWS))
+    assert any("colmap" in line and "below 8 degrees" in line for line in format_report(ROWS))
 
 
 def test_coverage_is_of_published_cameras():
-    found = coverage(ROWS[:7])
+    found = measure_coverage(ROWS[:7])
     assert found.cameras == 11
     assert found.within == {"rotation": 9 / 11, "centre": 1.0, "focal": 1.0}
     assert found.ratio["centre"]["50"] == pytest.approx(0.5)
-    assert coverage(ROWS[7:]).within == {"rotation": None, "centre": None, "focal": None}
+    assert measure_coverage(ROWS[7:]).within == {"rotation": None, "centre": None, "focal": None}
 
 
 NOTHING = Verdict(Code.NO_OVERLAP, "Nothing.", "")
 
 
-def note(place: Place, window: Window) -> list[str]:
+def note(place: TrialScene, window: Window) -> list[str]:
     """The windows that were asked for so far, by their start and stride, in a file beside the scene."""
     path = place.scene.paths[window.names[0]].parents[1] / "asked.txt"
     with path.open("a") as file:
@@ -103,7 +111,7 @@ def note(place: Place, window: Window) -> list[str]:
 def first_broken(place, window, config, fresh, told, known):
     if len(note(place, window)) == 1:
         raise ValueError("worse luck")
-    return Answer(NOTHING, seconds=1.0, fresh_seconds=1.0 if fresh else None), {}
+    return WindowAnswer(NOTHING, seconds=1.0, fresh_seconds=1.0 if fresh else None), {}
 
 
 def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
@@ -115,8 +123,8 @@ def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
         return len((tmp_path / "asked.txt").read_text().splitlines())
 
     rows = run_windows(plan, places, tmp_path, "command", on)
-    assert asked() == len(rows) == 8 and rows[0].found is Found.FAILED and rows[0].message == "worse luck"
-    assert run_windows(plan, places, tmp_path, "command", on)[0].found is Found.REFUSED
+    assert asked() == len(rows) == 8 and rows[0].outcome is WindowOutcome.FAILED and rows[0].message == "worse luck"
+    assert run_windows(plan, places, tmp_path, "command", on)[0].outcome is WindowOutcome.REFUSED
     assert asked() == 9, "only what had no answer is run again"
     rows = run_windows(replace(plan, fresh=True), places, tmp_path, "command", on)
     assert all(row.fresh_seconds == 1.0 for row in rows)
@@ -162,7 +170,7 @@ def befallen(place, window, config, fresh, told, known):
         os.kill(os.getpid(), signal.SIGKILL)
     if window.stride == 3:
         time.sleep(600)
-    return Answer(NOTHING), {}
+    return WindowAnswer(NOTHING), {}
 
 
 def test_a_window_that_fails_costs_only_itself(tmp_path, monkeypatch, capsys):
@@ -170,11 +178,11 @@ def test_a_window_that_fails_costs_only_itself(tmp_path, monkeypatch, capsys):
     plan = Plan(("splatnode",), per_kind=1, counts=(3,), timeout_s=1.5)
     with engine(1, None) as on:
         rows = run_windows(plan, three_places(tmp_path).walked[:1], tmp_path, "command", on)
-    assert [row.found for row in rows] == [Found.FAILED] * 3 + [Found.REFUSED]
+    assert [row.outcome for row in rows] == [WindowOutcome.FAILED] * 3 + [WindowOutcome.REFUSED]
     raised, died, hung, _ = (row.message for row in rows)
     assert "FloatingPointError: worse luck" in raised and "was killed (SIGKILL)" in died
     assert hung == "took longer than the 1.5 s that --timeout-s allows"
-    tell(rows)
+    print_report(rows)
     assert "no answer: east, 3 at stride 1 from" in capsys.readouterr().out
 
 
@@ -191,10 +199,10 @@ with engine(1, None) as on:
 def slow(place, window, config, fresh, told, known):
     if len(note(place, window)) == 3:
         time.sleep(600)
-    return Answer(NOTHING), {}
+    return WindowAnswer(NOTHING), {}
 
 
-def third_slow_at_first(out: Path, on) -> list[Row]:
+def third_slow_at_first(out: Path, on) -> list[WindowRow]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(campaign.ours, "answered", slow)
         plan = Plan(("splatnode",), per_kind=1, counts=(3,))
@@ -215,16 +223,16 @@ def test_a_driver_that_is_killed_repeats_what_was_running_alone(tmp_path):
     assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {"asked.txt", "windows.json"}
 
 
-def pair_of_scenes(folder: Path) -> list[Place]:
+def pair_of_scenes(folder: Path) -> list[TrialScene]:
     """Two scenes of the built-in place, small ones."""
     config = synthetic.Config(views=4, width=320, height=240)
     names = tuple(synthetic.frame_name(index) for index in range(config.views))
     for name in ("one", "other"):
         write_capture(folder / name, config)
-    return [Place(load_scene(folder / name), names) for name in ("one", "other")]
+    return [TrialScene(load_scene(folder / name), names) for name in ("one", "other")]
 
 
-def answered_by(on, places: Sequence[Place], out: Path) -> list[dict]:
+def answered_by(on, places: Sequence[TrialScene], out: Path) -> list[dict]:
     """The rows as they lie on the disk, without costs."""
     run_windows(Plan(("splatnode",), counts=(3,)), places, out, "command", on)
     return without_costs(json.loads((out / "windows.json").read_text())["rows"])
@@ -247,9 +255,11 @@ def test_charts(tmp_path):
     assert charts.draw(ROWS, tmp_path) == ["windows.png", "calibration.png"]
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("windows.png", "calibration.png"))
     assert charts.draw(ROWS[7:], tmp_path) == ["windows.png"], "who claims nothing has no calibration"
-    titles = [axes.get_title(loc="left") for axes in charts.figure_of_shares(ROWS).axes]
+    titles = [axes.get_title(loc="left") for axes in charts.make_shares_figure(ROWS).axes]
     assert titles == ["splatnode: 2 of 7 right, 1 wrong", "COLMAP: 0 of 2 right, 1 wrong"]
-    labels = [text.get_text() for axes in charts.figure_of_claims(ROWS).axes for text in axes.get_legend().get_texts()]
+    labels = [
+        text.get_text() for axes in charts.make_bounds_figure(ROWS).axes for text in axes.get_legend().get_texts()
+    ]
     assert labels == ["3 views: 82% of 11 cameras within", "3 views: 100% of 11 cameras within"]
 
 

@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-from splatnode.recon.evaluate.stability.places import Place
-from splatnode.recon.evaluate.stability.windows.turns import Job, Turns
+from splatnode.recon.evaluate.stability.places import TrialScene
+from splatnode.recon.evaluate.stability.windows.turns import Job, WindowScheduler
 from splatnode.recon.evaluate.stability.windows.window import Window
 from splatnode.recon.evaluate.truth import EvaluationScene
 
-EAST, WEST = (Place(EvaluationScene("pole", {}, {}), ("a", "b", "c", "d")) for _ in range(2))  # of one name, even
+EAST, WEST = (TrialScene(EvaluationScene("pole", {}, {}), ("a", "b", "c", "d")) for _ in range(2))  # of one name, even
 
 
-def job(place: Place, start: int) -> Job:
+def job(place: TrialScene, start: int) -> Job:
     return Job(place, Window(place.name, 2, 1, start, place.names[start : start + 2], 5.0), "splatnode")
 
 
 def test_each_window_gets_what_was_found_of_its_photographs(tmp_path):
     first, second, third = (job(EAST, start) for start in range(3))
-    turns = Turns([first, second, third], tmp_path)
-    assert turns.next() == (first, {})
-    turns.ended(first, {("plain", "a"): b"1", ("plain", "b"): b"2", ("plain", "a", "b"): b"3"})
-    assert turns.next() == (second, {("plain", "b"): b"2"})
-    turns.ended(second, {})  # it failed
-    assert turns.next() == (third, {})
-    assert turns.next() is None and len(list(tmp_path.iterdir())) == 3
-    turns.ended(third, {("plain", "d"): b"4"})
+    turns = WindowScheduler([first, second, third], tmp_path)
+    assert turns.take_job() == (first, {})
+    turns.finish_job(first, {("plain", "a"): b"1", ("plain", "b"): b"2", ("plain", "a", "b"): b"3"})
+    assert turns.take_job() == (second, {("plain", "b"): b"2"})
+    turns.finish_job(second, {})  # it failed
+    assert turns.take_job() == (third, {})
+    assert turns.take_job() is None and len(list(tmp_path.iterdir())) == 3
+    turns.finish_job(third, {("plain", "d"): b"4"})
     assert list(tmp_path.iterdir()) == [], "nobody needs it any more"
 
 
 def test_whoever_is_free_turns_to_another_scene_and_nobody_waits(tmp_path):
     east, west = [job(EAST, start) for start in range(3)], [job(WEST, 0)]
-    turns = Turns([*east, *west], tmp_path)
-    begun = [turns.next() for _ in range(3)]
+    turns = WindowScheduler([*east, *west], tmp_path)
+    begun = [turns.take_job() for _ in range(3)]
     assert [each and each[0] for each in begun] == [east[0], west[0], east[1]]
-    turns.ended(west[0], {("plain", "a"): b"1"})
-    turns.ended(east[1], {("plain", "c"): b"1"})
-    assert turns.next() == (east[2], {("plain", "c"): b"1"}), "and not what was found in the other scene"
+    turns.finish_job(west[0], {("plain", "a"): b"1"})
+    turns.finish_job(east[1], {("plain", "c"): b"1"})
+    assert turns.take_job() == (east[2], {("plain", "c"): b"1"}), "and not what was found in the other scene"

@@ -14,7 +14,7 @@ from splatnode import command_line
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.capture.lenses.lens import project
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistort_frame
 from tests.support.exported import make_snapshot, write
 
 WIDTH, HEIGHT = 1024, 768
@@ -43,7 +43,7 @@ def result(folder: Path, names: tuple[str, str]) -> Path:
     for name, camera, lens in zip(names, make_snapshot().cameras, (LENS, straight), strict=True):
         (folder / "images").mkdir(exist_ok=True, parents=True)
         (folder / "images" / name).write_bytes(encode_png(photograph(lens)))
-        pinhole = undistorted(Frame(0, name, 0, photograph(lens), lens)).intrinsics
+        pinhole = undistort_frame(Frame(0, name, 0, photograph(lens), lens)).intrinsics
         assert pinhole is not None
         K = pinhole.resized(camera.width, camera.height).K
         cameras.append(replace(camera, name=name, K=K, lens=lens if lens is LENS else None))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError
+from splatnode.recon.result.export.formats.ply import compute_max_gaussians, compute_ply_bytes, encode_ply
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
-from splatnode.recon.result.export.formats.ply import encode_ply, most_in_ply, ply_bytes
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians
 
@@ -16,7 +16,7 @@ from tests.support.exported import make_gaussians
 def test_ply_round_trip(num_bases):
     gaussians = make_gaussians(num_bases=num_bases)
     data = encode_ply(gaussians)
-    assert len(data) == ply_bytes(len(gaussians), num_bases)
+    assert len(data) == compute_ply_bytes(len(gaussians), num_bases)
     back = decode_ply(data)
     assert np.array_equal(back.means, gaussians.means)
     assert np.array_equal(back.quats, gaussians.quats)
@@ -50,10 +50,10 @@ def test_ply_layout_is_the_published_one():
 
 @pytest.mark.parametrize("count", [1, 9, 10, 12_345, 99_999, 100_000])
 def test_as_many_fit_into_a_ply_of_a_size_as_its_size_says(count):
-    exactly = ply_bytes(count, 1)
-    assert count - 1 <= most_in_ply(exactly) <= count
-    assert ply_bytes(most_in_ply(exactly), 1) <= exactly
-    assert most_in_ply(10) == 1
+    exactly = compute_ply_bytes(count, 1)
+    assert count - 1 <= compute_max_gaussians(exactly) <= count
+    assert compute_ply_bytes(compute_max_gaussians(exactly), 1) <= exactly
+    assert compute_max_gaussians(10) == 1
 
 
 def test_ply_of_another_program_may_have_another_order_and_more_properties():

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.export.axes import least_turned
+from splatnode.recon.result.export.axes import minimize_rotations
 from splatnode.recon.result.export.formats.spz import decode as decode_spz
 from splatnode.recon.result.export.formats.spz import encode_spz
-from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians, same_rotations
@@ -23,7 +23,7 @@ def in_the_files_order(gaussians: GaussianArrays) -> GaussianArrays:
     """By z, then by y, each rounded to the file's digits, with axes named as the file has them."""
     bits = gzip.decompress(encode_spz(gaussians))[13]
     x_y_z = np.rint(gaussians.means.astype(np.float64) * 2.0**bits)
-    return least_turned(take(gaussians, np.lexsort((-x_y_z[:, 1], -x_y_z[:, 2]))))
+    return minimize_rotations(select_gaussians(gaussians, np.lexsort((-x_y_z[:, 1], -x_y_z[:, 2]))))
 
 
 @pytest.mark.parametrize("num_bases", [1, 4, 9, 16])
@@ -42,7 +42,7 @@ def test_spz_round_trip_within_its_rounding(num_bases):
 
 def test_the_picture_does_not_depend_on_the_order_and_hardly_on_the_rounding():
     gaussians = make_gaussians(300, 1)
-    shuffled = take(gaussians, np.random.default_rng(1).permutation(300))
+    shuffled = select_gaussians(gaussians, np.random.default_rng(1).permutation(300))
     K, T_world_camera = np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.eye(4)
     T_world_camera[2, 3] = -8.0
     written, other, exact = (
