@@ -82,7 +82,7 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a stream, within bounds that hold for all that is made of it: `framed` where they may not hold."""
+    """One image of a stream, within bounds that hold for all that is made of it: `make_frame` where they may not hold."""
 
     frame_id: int  # position in its stream, from 0
     name: str  # printable, unique in its stream; for a file, its name as `printable_name` writes it

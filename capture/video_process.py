@@ -104,7 +104,7 @@ def _check_complete(num_lost: int, is_cut: bool) -> None:
 
 
 def main() -> None:
-    """The decoder's process: FILE EVERY MAX_PIXELS FROM_NS TO_NS; writes what `_received` reads."""
+    """The decoder's process: FILE EVERY MAX_PIXELS FROM_NS TO_NS; writes what `_receive_frames` reads."""
     from splatnode.capture.av import NoPictures, NotReadable, TooLarge, Video
 
     file, every, max_pixels, from_ns, to_ns = sys.argv[1], *map(int, sys.argv[2:])

@@ -194,7 +194,7 @@ class IncrementalReconstruction:
         self._remove_from_scene(names)
 
     def defer_keyframes(self, names: Collection[str]) -> None:
-        """Takes keyframes out of the scene as `retract` does, and remembers them and what their pairs say."""
+        """Takes keyframes out of the scene as `remove_keyframes` does, and remembers them and what their pairs say."""
         self._known = replace(self._known, beside=self.graph.merge(self._known.beside))
         self._remove_from_scene(names)
 

@@ -135,7 +135,7 @@ def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
 def select_frames(
     frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = ignore_progress
 ) -> Source:
-    """Photographs that lie in no folder, or what is used of them: as of a folder's. Raises ValueError as `source`."""
+    """Photographs that lie in no folder, or what is used of them: as of a folder's. Raises ValueError as `load_source`."""
     if views:
         return Source(tuple(frames[i] for i in _select_evenly(views, len(frames))), None, None)
     if every_frame or len(frames) <= ALL:
@@ -146,7 +146,7 @@ def select_frames(
 
 
 def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayRecording:
-    """As `source`, without a limit to the number of keyframes."""
+    """As `load_source`, without a limit to the number of keyframes."""
     _check_there(request.source)
     images: set[tuple[str, str, int, int]] = set()
     looked_through = _record_sizes(_stream_candidates(request, tell), images)

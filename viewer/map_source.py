@@ -104,7 +104,7 @@ def map_moment(maps: Maps, which: int = 0) -> Moment:
 
 
 def _read_maps(maps: Maps) -> MapSet:
-    """Raises SceneFileError where nothing has come yet, besides what `read_whole` raises."""
+    """Raises SceneFileError where nothing has come yet, besides what `read_map_set` raises."""
     whole = read_map_set(maps.folder)
     if not _list_shown_maps(whole):
         raise SceneFileError(f"{maps.folder} holds no scene yet: its places.json lists none with a result")
@@ -120,7 +120,7 @@ class MapSource:
     """A thread that loads what is near the eye; it keeps one moment, the newest."""
 
     age_s = None
-    tracked = None
+    live_camera = None
 
     def __init__(self, maps: Maps) -> None:
         """Raises SceneFileError, FileNotFoundError, OSError where the folder cannot be read."""

@@ -58,7 +58,7 @@ class FixedSource:
     """One moment that is there from the start."""
 
     age_s = None
-    tracked = None
+    live_camera = None
 
     def __init__(self, moment: Moment) -> None:
         self._moment: Moment | None = moment

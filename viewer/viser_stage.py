@@ -1,6 +1,6 @@
 """What visitors of a viser page see: Gaussians, cameras with their photographs, the live camera, and the verdict.
 
-viser itself is imported in `viser.py` alone; here its server is used. Everything but `_going_to` runs on one thread.
+viser itself is imported in `viser.py` alone; here its server is used. Everything but `_make_click_handler` runs on one thread.
 """
 
 from __future__ import annotations

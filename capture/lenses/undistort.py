@@ -43,7 +43,7 @@ def undistort_frame(frame: Frame) -> Frame:
 
 
 def _undistort_single(frame: Frame) -> Frame:
-    """As `undistorted`, of a frame without a right image."""
+    """As `undistort_frame`, of a frame without a right image."""
     given = frame.intrinsics
     if given is None:
         return frame
@@ -78,7 +78,7 @@ def _undistort_single(frame: Frame) -> Frame:
 
 
 def undistort_image(image: npt.NDArray[np.uint8], lens: Intrinsics | None) -> npt.NDArray[np.uint8]:
-    """A photograph (H, W, 3), at any size, as `undistorted` shows it; itself without a lens. Raises likewise."""
+    """A photograph (H, W, 3), at any size, as `undistort_frame` shows it; itself without a lens. Raises likewise."""
     return image if lens is None else undistort_frame(Frame(0, "photograph", 0, image, lens)).image
 
 

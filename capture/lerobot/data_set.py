@@ -104,7 +104,7 @@ def episode_name(number: int) -> str:
 
 
 def film(folder: Path, part: str) -> Film:
-    """The episode and camera that `parts` names so; "3/KEY" is the episode 3, too, and one camera need not be named.
+    """The episode and camera that `list_parts` names so; "3/KEY" is the episode 3, too, and one camera need not be named.
 
     Raises UnusableDataSet where there is none, or where it has no images; OSError, ModuleNotFoundError.
     """

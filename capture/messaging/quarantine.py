@@ -65,7 +65,7 @@ class Quarantine:
 
     @property
     def unseen(self) -> int:
-        """How many of those that are here came after `seen` was last called."""
+        """How many of those that are here came after `mark_seen` was last called."""
         return sum(number > self._last_seen for number in self._records)
 
     def newest(self, count: int) -> tuple[QuarantinedKeyframe, ...]:

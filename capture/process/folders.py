@@ -26,7 +26,7 @@ def make_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def claim_folder(folder: Path) -> Iterator[None]:
-    """Makes `folder` as `made` does and holds its lock, whose file is removed at the end. Raises Held, OSError."""
+    """Makes `folder` as `make_folder` does and holds its lock, whose file is removed at the end. Raises Held, OSError."""
     with make_folder(folder), exclusive(folder / LOCK):
         try:
             yield

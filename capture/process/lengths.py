@@ -26,7 +26,7 @@ def parse_measurement(text: str) -> tuple[float, float | None]:
 
 
 def measurement_argument(text: str) -> str:
-    """The text, for an argument of the command line that `measured` reads."""
+    """The text, for an argument of the command line that `parse_measurement` reads."""
     try:
         parse_measurement(text)
     except ValueError as error:

@@ -22,7 +22,7 @@ def sanitize_text(text: object, longest: int = LONGEST_TEXT) -> str:
 
 
 def is_printable(text: str, longest: int = LONGEST_TEXT) -> bool:
-    """Whether `printable` gives `text` back as it is."""
+    """Whether `sanitize_text` gives `text` back as it is."""
     return len(text) <= longest and text.isprintable()
 
 
@@ -37,7 +37,7 @@ def sanitize_lines(text: object) -> str:
 
 
 def sanitize_name(raw: str, longest: int = LONGEST_NAME) -> str:
-    """The name `raw` of a file as `printable` shows it; two names that differ stay two.
+    """The name `raw` of a file as `sanitize_text` shows it; two names that differ stay two.
 
     So a backslash is escaped, too, and of a name that is too long the end is replaced by a digest of the whole.
     """
@@ -46,7 +46,7 @@ def sanitize_name(raw: str, longest: int = LONGEST_NAME) -> str:
 
 
 def digest_name(raw: str, longest: int = LONGEST_NAME) -> str:
-    """The beginning of `raw` as `printable` shows it, and a digest of the whole: no other name becomes this one."""
+    """The beginning of `raw` as `sanitize_text` shows it, and a digest of the whole: no other name becomes this one."""
     digest = hashlib.blake2b(raw.encode(errors="surrogatepass"), digest_size=8).hexdigest()
     return f"{escape_text(raw)[: longest - len(digest) - 1]}~{digest}"
 

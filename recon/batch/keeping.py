@@ -26,7 +26,7 @@ def partial_log(out: Path, name: str) -> Path:
 
 
 def finalize_result(recording: BatchRecording, out: Path, made_as: str, end: End) -> Outcome:
-    """Gives the result that was made as `hidden(out, made_as)` its name; of a failure what was said is kept."""
+    """Gives the result that was made as `partial_folder(out, made_as)` its name; of a failure what was said is kept."""
     partial, log = partial_folder(out, made_as), partial_log(out, made_as)
     found, final, failed_log = (
         read_outcome(recording, partial, end),

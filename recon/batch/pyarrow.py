@@ -77,7 +77,7 @@ def _raise_as_unusable_data_set(said: str) -> Iterator[None]:
 
 
 def _read_rows(file: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a table that `write_seen` wrote, some at a time. Raises UnusableDataSet where it is none, OSError."""
+    """The rows of a table that `write_cameras` wrote, some at a time. Raises UnusableDataSet where it is none, OSError."""
     shown = sanitize_text(str(file))
     must = f"{shown!r} must be a table of cameras that splatnode wrote, for others to be added"
     said = f"{must}; move it away, or mend it"

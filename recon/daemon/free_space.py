@@ -43,7 +43,7 @@ class OccupancyResult:
 
 
 class OccupancyMapper:
-    """Maps the present scene. `make` is for the thread that works; any thread may ask for `current`."""
+    """Maps the present scene. `map_scene` is for the thread that works; any thread may ask for `find_current_map`."""
 
     def __init__(self, config: OccupancyConfig) -> None:
         self._config = config

@@ -77,7 +77,7 @@ class InactiveSubmaps:
     def finalize_next(self, pause: Pause) -> bool:
         """Makes the scene of the oldest place that is judged, as good as it gets, and writes its result.
 
-        False where there is none to be made now; `pause` as for `judge_next`.
+        False where there is none to be made now; `pause` as for `verify_next`.
         """
         return self._process_first(
             [each for each in self._pending_folders if self._atlas.has_scene(each.name)], self._finalize, pause

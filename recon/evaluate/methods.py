@@ -161,7 +161,7 @@ def select_start_config(name: str) -> ReconstructionConfig | None:
 def run_method(
     frames: Sequence[Frame], name: str, seed: int, start: Start | None = None, device: Device = "cpu"
 ) -> Iterator[Snapshot]:
-    """Runs the method called `name`, from where `start` stands if it is given one that `start_of` asks for.
+    """Runs the method called `name`, from where `start` stands if it is given one that `select_start_config` asks for.
 
     `device` is for methods that are configurations; rivals are measured on the processor. At module level, so that a
     fresh process can be told to run it.

@@ -87,7 +87,7 @@ def compute_visibility_by_split(scene: EvaluationScene, splits: Sequence[Split],
 
 
 def run_and_score(job: Job, start: bytes | None, shown: bytes | None) -> RunResult:
-    """Runs `job`, from the pickled `timed_start`, if there is one, and scores it; `shown` is the pickled `seen`."""
+    """Runs `job`, from the pickled `time_start`, if there is one, and scores it; `shown` is the pickled `seen`."""
     begun: TimedStart | None = pickle.loads(start) if start else None
     counts: Mapping[str, Counts] = pickle.loads(shown)[len(job.split.train)] if shown else {}
     frames = job.scene.frames(job.split.train)

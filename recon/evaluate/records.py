@@ -30,7 +30,7 @@ class Bench(msgspec.Struct, frozen=True):
     by_region: bool | None = None
     checkpoints: tuple[int, ...] | None = None
     device: str | None = None
-    splits: dict[str, Split] = {}  # by `set_name`
+    splits: dict[str, Split] = {}  # by `format_set_name`
 
     def final_runs(self) -> set[tuple[str, int, str, int]]:
         """The runs (scene, views, method, seed) that have come to their end, or failed."""

@@ -102,7 +102,7 @@ def count_visibility(view: Surface, training: Sequence[Surface]) -> Counts:
 def count_visibility_by_name(
     names: Iterable[str], views: Mapping[str, Surface], training: Sequence[Surface]
 ) -> dict[str, Counts]:
-    """`shown_counts` of those photographs whose surface is known, by name."""
+    """`count_visibility` of those photographs whose surface is known, by name."""
     return {name: count_visibility(views[name], training) for name in names if name in views}
 
 

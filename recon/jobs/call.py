@@ -42,7 +42,7 @@ def pack_call(work: Work) -> bytes:
 
 
 def write_call(call: bytes, folder: Path) -> Path:
-    """Makes the folder of a `packed` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
+    """Makes the folder of a `pack_call` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
     make_owner_only_folder(folder, "--out or $TMPDIR", ours=True)
     (folder / CALL).write_bytes(call)
     return folder

@@ -16,7 +16,7 @@ from splatnode.recon.jobs.child import Child, make_launch_command
 
 
 class Copies:
-    """Begins processes that make calls; `copying` makes one."""
+    """Begins processes that make calls; `open_copies` makes one."""
 
     def __init__(self, cores: Sequence[int]) -> None:
         self._cores = cores

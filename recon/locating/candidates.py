@@ -120,7 +120,7 @@ def make_lens_grid(side: int, assumed: Sequence[LensAssumption]) -> list[Lens]:
 
 
 def make_non_square_lenses(side: int) -> list[Lens]:
-    """As `any_lens`, of images whose pixels are not square."""
+    """As `make_lens_grid`, of images whose pixels are not square."""
     return [replace(lens, log_aspect=log_aspect) for log_aspect in _LOG_ASPECTS for lens in make_lens_grid(side, ())]
 
 

@@ -67,7 +67,7 @@ def search_cameras(
 
 
 def search_cameras_longer(judged: QueryContext, lenses: Sequence[Lens]) -> list[CameraModel]:
-    """As `search`, with each of the `lenses` by all correspondences, which finds more where inliers are few."""
+    """As `search_cameras`, with each of the `lenses` by all correspondences, which finds more where inliers are few."""
     most = min(judged.settings.iterations, _LONGER_ITERATIONS)
     found = [posing.search_pose(judged.known, lens, judged.scale, judged.settings, most) for lens in lenses]
     return _best_first(judged, found)

@@ -96,7 +96,7 @@ def prepare_query_image(
 def localize_query(
     landmarks: Landmarks, photograph: QueryImage, config: LocalizationConfig = LocalizationConfig()
 ) -> Located | NotLocated:  # noqa: B008
-    """As `locate`."""
+    """As `localize_image`."""
     found = localize_with_inliers(landmarks, photograph, config)
     return found.located if isinstance(found, Localization) else found
 
@@ -104,7 +104,7 @@ def localize_query(
 def localize_with_inliers(
     landmarks: Landmarks, photograph: QueryImage, config: LocalizationConfig = LocalizationConfig()
 ) -> Localization | NotLocated:  # noqa: B008
-    """As `locate`, with the landmarks that the photograph shows."""
+    """As `localize_image`, with the landmarks that the photograph shows."""
     frame = photograph.frame
     known = match_landmarks(photograph.features, principal_point(frame), landmarks, config.neighbours)
     judged = QueryContext(known, frame.width, frame.height, landmarks.noise_px, landmarks.unit, config.posing)

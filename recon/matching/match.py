@@ -50,7 +50,7 @@ def match(
     until: float = math.inf,
     tell: Tell = ignore_progress,
 ) -> ViewGraph:
-    """The complete view graph of the keyframes. `until` as for `completed`; `tell` hears how far it is."""
+    """The complete view graph of the keyframes. `until` as for `match_pending`; `tell` hears how far it is."""
     graph = ViewGraph(config)
     for keyframe in keyframes:
         graph = graph.add_keyframe(keyframe)
@@ -60,7 +60,7 @@ def match(
 
 
 def _report_progress(graphs: Iterable[ViewGraph], tell: Tell) -> Iterator[ViewGraph]:
-    """The graphs of `completed`, each of which is told. What is still to match is asked once a round: it takes long."""
+    """The graphs of `match_pending`, each of which is told. What is still to match is asked once a round: it takes long."""
     what, plain, of, weak = "photograph pair", -1, 0, 0
     for graph in graphs:
         if len(graph.plain) > plain:
@@ -172,7 +172,7 @@ def match_weak_pair(graph: ViewGraph, pair: Pair, tilts: Sequence[float], matche
 def _match_weak_pairs(
     graph: ViewGraph, pairs: Sequence[Pair], tilts: Sequence[float], matcher: Matcher | None
 ) -> Steps:
-    """After each step of `matched_further` for all `pairs`."""
+    """After each step of `match_weak_pair` for all `pairs`."""
     config = graph.config
     for index in sorted({index for pair in pairs for index in pair}):
         keyframes = list(graph.keyframes)

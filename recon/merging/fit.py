@@ -51,7 +51,7 @@ def fit_gaussians(
 ) -> FitResult:
     """The `gaussians` of the `submaps`, whose median depth must be about 1, at most `most` of them.
 
-    Their source frames are as `Fitted` has them.
+    Their source frames are as `FitResult` has them.
     """
     views = [_view(each.gaussians, camera) for each in submaps for camera in each.cameras]
     begun = _tensors(gaussians)

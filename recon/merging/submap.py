@@ -82,7 +82,7 @@ def _explain_exclusion(place: SubmapEntry) -> str:
 
 
 def _load(place: SubmapEntry, placement: Placement) -> Submap:
-    assert place.folder is not None  # `_why_not` has seen to it
+    assert place.folder is not None  # `_explain_exclusion` has seen to it
     result = StoredResult.create_from_path(place.folder)
     try:
         sure = place.verdict in {code.value for code in SURE}

@@ -101,7 +101,7 @@ def _point_render(
 def _points(view: TrainingView) -> tuple[Array, Array, Array]:
     """Points (M, 3), colours (M, 3) in [0, 1] and normals (M, 3) in the world, of every other row and column."""
     pointmap = view.pointmap
-    assert pointmap is not None  # `expected` looks at no others
+    assert pointmap is not None  # `make_expectations` looks at no others
     depth, confidence = pointmap.depth[::_STEP, ::_STEP], pointmap.confidence[::_STEP, ::_STEP]
     kept = (confidence >= _MIN_CONFIDENCE) & (depth > 0)
     T_world_camera, K = view.T_world_camera.double().numpy(), view.K.double().numpy()

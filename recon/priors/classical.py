@@ -43,7 +43,7 @@ class DepthEstimator(Protocol):
 
 
 class ClassicalPrior(Prior):
-    """Depth by `recon.priors.stereo`, or by `depth_maps` in its place; matches by `matcher`, if there is one."""
+    """Depth by `recon.priors.stereo`, or by `estimate_depth_maps` in its place; matches by `matcher`, if there is one."""
 
     def __init__(
         self, config: Config, depth_maps: DepthEstimator = stereo.estimate_depth_maps, matcher: Matcher | None = None

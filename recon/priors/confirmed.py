@@ -36,7 +36,7 @@ def find_consistent_pixels(pointmaps: Sequence[Pointmap]) -> list[Mask]:
 
 
 def compute_consistent_shares(masks: Sequence[Mask], used: Sequence[Mask]) -> list[float]:
-    """The share of each view's used pixels (h, w) whose depth is multi-view consistent, by the masks of `confirmed`.
+    """The share of each view's used pixels (h, w) whose depth is multi-view consistent, by the masks of `find_consistent_pixels`.
 
     It is 0 for a view of which nothing is used.
     """

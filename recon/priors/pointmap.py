@@ -37,7 +37,7 @@ class Pointmap:
         return replace(self, depth=self.depth * keep, confidence=self.confidence * keep)
 
     def apply_image_mask(self, mask: npt.NDArray[np.bool_] | None) -> Pointmap:
-        """As `masked` by the mask (h, w) of the photograph, whose pixels confirm and deny nothing either."""
+        """As `apply_mask` by the mask (h, w) of the photograph, whose pixels confirm and deny nothing either."""
         if mask is None:
             return self
         unchecked = None if self.unchecked is None else self.unchecked * mask

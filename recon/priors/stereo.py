@@ -1,7 +1,7 @@
 """PatchMatch multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
 
-`depth_maps` does it for a set of views, `further_depth_map` for one more beside those that have a map: there
-`rank_partners` tells which views to compare it with, and `estimate` matches it alone.
+`estimate_depth_maps` does it for a set of views, `estimate_further_depth_map` for one more beside those that have a map: there
+`rank_partners` tells which views to compare it with, and `estimate_planes` matches it alone.
 """
 
 from __future__ import annotations
@@ -264,7 +264,7 @@ def _make_level(view: StereoView, level: int) -> PyramidLevel:
 
 
 def _initialize_or_unknown(view: StereoView, level: PyramidLevel, sparse: SparsePoints | None) -> Planes:
-    """As `_start`; all unknown, which the log tells, where a library fails on this view's points."""
+    """As `_initialize_planes`; all unknown, which the log tells, where a library fails on this view's points."""
     try:
         return _initialize_planes(view, level, sparse)
     except LIBRARY_ERRORS as error:

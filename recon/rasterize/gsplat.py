@@ -122,7 +122,7 @@ class _Splats:
 def _warp_gaussians(
     means: Tensor, quats: Tensor, scales: Tensor, T_world_camera: Tensor, K: Tensor
 ) -> tuple[Tensor, Tensor, None, None, Tensor]:
-    """The Gaussians in the camera frame, warped, as `_projected` takes them: some times as many launches."""
+    """The Gaussians in the camera frame, warped, as `_project_gaussians` takes them: some times as many launches."""
     R_world_camera, warp = T_world_camera[:3, :3], compute_intrinsics_warp(K)
     means_camera = (means - T_world_camera[:3, 3]) @ R_world_camera
     scaled_axes = warp @ R_world_camera.T @ (matrices_from_quats(quats) * scales[:, None])

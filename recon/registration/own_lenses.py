@@ -4,7 +4,7 @@ A zoom, an autofocus that breathes, a second camera of the same resolution or a 
 Nothing tells that beforehand. So each lens parameter of an image is a common value plus a deviation, under a prior
 whose width is estimated from the deviation itself (automatic relevance determination: MacKay, "Bayesian interpolation",
 1992). A deviation stays where the observations tell it well enough; any other falls to where `Config` holds it. Images
-with a deviation that stays get a lens of their own. What cannot be decided widens the covariance (`uncertain`).
+with a deviation that stays get a lens of their own. What cannot be decided widens the covariance (`widen_lens_priors`).
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class PatchImage:
         return (pixels + self.principal) * self.scale
 
     def map_from_grey(self, pixels: Array) -> Array:
-        """(M, 2) the inverse of `to_grey`."""
+        """(M, 2) the inverse of `map_to_grey`."""
         return pixels / self.scale - self.principal
 
     def rescale(self, scale: float) -> PatchImage:

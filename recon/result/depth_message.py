@@ -32,7 +32,7 @@ class DepthHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
 def make_depth_header(
     snapshot: Snapshot, scene_id: str, scene_sequence: int, numbering: Mapping[str, object]
 ) -> DepthHeader:
-    """The message on a snapshot that is shown by message `scene_sequence`; `numbering` as for `to_message`."""
+    """The message on a snapshot that is shown by message `scene_sequence`; `numbering` as for `encode_snapshot`."""
     shares = ((camera.name, camera.consistent_depth) for camera in snapshot.cameras)
     return DepthHeader(
         **numbering,  # pyright: ignore[reportArgumentType]

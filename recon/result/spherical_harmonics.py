@@ -43,7 +43,7 @@ def compute_sh_terms(x: Any, y: Any, z: Any, bases: int) -> list[Any]:
 
 
 def compute_sh_basis(directions: Array, bases: int) -> Array:
-    """(M, B) `terms` of unit vectors (M, 3)."""
+    """(M, B) `compute_sh_terms` of unit vectors (M, 3)."""
     x, y, z = directions.T
     return np.stack(compute_sh_terms(x, y, z, bases), 1)
 

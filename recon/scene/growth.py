@@ -32,7 +32,7 @@ def grow(
 
     `registration` and `pointmaps`, of which each of its cameras has one by name, are in the scene's world. A further
     view seeds Gaussians where none of its neighbours sees a surface better, as when a scene begins, and is brought to
-    the scene's light first. The far shell stays. `config.max_gaussians` does not count here; see `limited`.
+    the scene's light first. The far shell stays. `config.max_gaussians` does not count here; see `limit_gaussians`.
     """
     known = {view.name for view in scene.views}
     registered = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}

@@ -59,7 +59,7 @@ def estimate_exposures(
 ) -> dict[str, Exposure]:
     """The exposures of `images` (h, w, 3), by name; none where they do not differ by more than `config` says.
 
-    `told` has the logarithms of what cameras say of them, as `told_logs` gives them, by name.
+    `told` has the logarithms of what cameras say of them, as `compute_exposure_priors` gives them, by name.
     """
     if not config.enabled or len(pointmaps) < 2:
         return {}
@@ -93,7 +93,7 @@ def estimate_further_exposures(
 
     `further` has the falloff of each one's lens, by name, and `known` what was taken out of the others: if that of any
     was changed, each further one's light is. Otherwise it is where it differs by `config.least` from theirs. `told` is
-    as for `differing`, of the photographs as they were taken.
+    as for `estimate_exposures`, of the photographs as they were taken.
     """
     if not config.enabled:
         return {}
@@ -179,7 +179,7 @@ def _nearest(logs: Array, centres: Array) -> Array:
 def estimate_log_gains(
     pointmaps: Sequence[Pointmap], pictures: Sequence[Image], told: Mapping[str, float] = _NOTHING
 ) -> Array:
-    """(V, 3) logarithms of the photographs' gains; the median of each channel is 0. `told` is as for `differing`."""
+    """(V, 3) logarithms of the photographs' gains; the median of each channel is 0. `told` is as for `estimate_exposures`."""
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
     return _subtract_median(
         _solve_log_gains(find_shared_pixels(pointmaps, pictures), priors, _select_metadata_logs(pointmaps, told))

@@ -102,7 +102,7 @@ def _accept_partial(case: VerificationCase, left_out: tuple[str, ...]) -> Verdic
 
 def _accept_all(case: VerificationCase) -> Verdict:
     exposure_ratio, cameras = case.config.exposure_ratio, case.evidence.cameras
-    gains = {camera.name: camera.gain for camera in cameras}  # finite, for `undetermined` let them pass
+    gains = {camera.name: camera.gain for camera in cameras}  # finite, for `check_finite` let them pass
     ratio = max(gains.values()) / min(gains.values())
     if ratio <= exposure_ratio:
         return Verdict(Code.OK, f"{_summarize_placement(case)}.", "", (), publishable=True)

@@ -1,7 +1,7 @@
 """The verdict on registered poses, before anything is published.
 
 `refuse_before_registration` needs no registration; `decide` asks the checks one after the other, and the first that
-refuses gives the reason. A further check is a file with a function of a `Case`, and its line in CHECKS.
+refuses gives the reason. A further check is a file with a function of a `VerificationCase`, and its line in CHECKS.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class Term:
 @dataclass(frozen=True)
 class OddsModel:
     prior: float  # nats: where all measures are typical
-    terms: Mapping[str, Term]  # by what `measures` calls them
+    terms: Mapping[str, Term]  # by what `compute_measures` calls them
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from splatnode.recon.replay_source import Request, Source, apply_lenses, load_so
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
 _EXIF = b"Exif\0\0"  # before the TIFF structure
 
-# Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `pixels`.
+# Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `make_rgb_image`.
 Picture: TypeAlias = Any
 Images: TypeAlias = "str | PathLike[str] | Picture | Sequence[str | PathLike[str]] | Sequence[Picture]"
 Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
@@ -76,7 +76,7 @@ def make_frame(
 ) -> Frame:
     """A picture as a frame, with what its EXIF tells of lens, time and exposure, without what its alpha hides.
 
-    `used` as for `pixels`. Raises TypeError, ValueError.
+    `used` as for `make_rgb_image`. Raises TypeError, ValueError.
     """
     try:
         image, tiff = make_rgb_image(picture, used), _exif_bytes(picture)

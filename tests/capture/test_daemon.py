@@ -325,7 +325,7 @@ def test_what_the_camera_could_not_give_takes_no_room_of_keyframes(live, waiting
     session = SimpleNamespace(
         dropped=0,
         config=SimpleNamespace(camera=SimpleNamespace(module=SimpleNamespace(LIVE=live)), spool=SpoolConfig()),
-        _server=SimpleNamespace(queued=waiting),
+        _server=SimpleNamespace(num_queued=waiting),
         _deliver=offered.append,
     )
     damaged = DroppedFrame("3.jpg", "the driver says that it is damaged")

@@ -76,7 +76,7 @@ def test_a_decoder_that_ends_early_is_told_after_the_frames_before(tmp_path, mon
         yield from itertools.islice(frames, 2)
         raise VideoError("its decoder ended (-11)")
 
-    monkeypatch.setattr("splatnode.capture.cameras.video.decoded", failing)
+    monkeypatch.setattr("splatnode.capture.cameras.video.decode_video", failing)
     items = list(stream(Config(tmp_path / "a.avi")))
     assert [item.name for item in items] == ["a_000000.png", "a_000001.png", "a_rest"]
     assert items[2] == DroppedFrame("a_rest", "its decoder ended (-11)")

@@ -18,17 +18,17 @@ class Node:
     def __init__(self) -> None:
         first = make_snapshot()
         self._moments = [Moment(first, 0.0), Moment(replace(first, cameras=first.cameras[:1]), 1.0)]
-        self.tracked = None
+        self.live_camera = None
 
     def take(self):
         if self._moments:
             return self._moments.pop(0)
-        self.tracked = make_camera(7)
+        self.live_camera = make_camera(7)
         return None
 
     @property
     def age_s(self):
-        return None if self.tracked is not None else 0.0
+        return None if self.live_camera is not None else 0.0
 
     def close(self) -> None: ...
 

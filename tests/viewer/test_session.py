@@ -89,7 +89,7 @@ class Feed:
     """A source that the test fills."""
 
     age_s = 0.5
-    tracked: CameraEstimate | None = None
+    live_camera: CameraEstimate | None = None
 
     def __init__(self) -> None:
         self.waiting: list[Moment] = []
@@ -189,12 +189,12 @@ def test_the_live_camera_moves_between_moments():
     feed.waiting.append(moments(1)[0])
     session.receive()
     lines = len(session.shapes().lines)
-    feed.tracked = camera(0.4, frame_id=9)
+    feed.live_camera = camera(0.4, frame_id=9)
     assert session.receive() and not session.receive()
     assert len(session.shapes().lines) == lines + 1 and len(session.history) == 1
     session.press("f")
-    assert np.array_equal(session.viewpoint().T_world_camera, feed.tracked.T_world_camera)
-    feed.tracked = None
+    assert np.array_equal(session.viewpoint().T_world_camera, feed.live_camera.T_world_camera)
+    feed.live_camera = None
     assert session.receive() and session.camera().name == "2.png"  # lost: the newest photograph's camera
     session.close()
 
@@ -218,10 +218,10 @@ def test_gaussians_are_painted_again_only_where_they_look_different():
     feed.waiting.append(moments(1)[0])
     session.receive()
     without = session.paint(60, 40)
-    feed.tracked = camera(0.4, frame_id=9)
+    feed.live_camera = camera(0.4, frame_id=9)
     session.receive()
     assert not np.array_equal(session.paint(60, 40), without) and session.paintings == 1
-    feed.tracked = None
+    feed.live_camera = None
     session.receive()
     assert np.array_equal(session.paint(60, 40), without) and session.paintings == 1  # nothing was left behind
     session.press("g")

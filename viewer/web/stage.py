@@ -35,7 +35,7 @@ class ListenAddress:
 
 
 def resolve_address(listen: str | None, port: int, key_file: Path | None) -> ListenAddress:
-    """On the loopback address, or with a key at the address to `listen` on. Raises what `kept_key` raises."""
+    """On the loopback address, or with a key at the address to `listen` on. Raises what `load_or_create_key` raises."""
     key = load_or_create_key(key_file) if key_file is not None else new_key() if listen is not None else None
     return ListenAddress(listen or LOOPBACK, port, key, key_file)
 

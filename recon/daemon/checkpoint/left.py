@@ -29,7 +29,7 @@ def link_left_checkpoint(directory: Path, ledger: Ledger, files: Iterable[str], 
 
 
 def link_split_checkpoint(folder: Path, ledger: Ledger, files: Iterable[str], instead: str, present: bool) -> None:
-    """Links `files` of a place, in `folder`, into a folder of their own among those that were left, as `keep` does.
+    """Links `files` of a place, in `folder`, into a folder of their own among those that were left, as `link_left_checkpoint` does.
 
     `present`: the place is where the camera is, else one that was left. A part that is there already, from a process
     that did not get any further, stays as it is.
@@ -73,7 +73,7 @@ def list_finished_folders(directory: Path) -> list[Path]:
 def move_to_finished(folder: Path, instead: str) -> None:
     """Takes the checkpoint of a place that was left among the finished ones.
 
-    Raises OSError, and NotPrivate as `keep`.
+    Raises OSError, and NotPrivate as `link_left_checkpoint`.
     """
     target = make_finished_path(folder.parent.parent, folder.name)
     make_owner_only_folder(target.parent, instead, ours=True)

@@ -94,7 +94,7 @@ def make_scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt
 
 
 def parse_scene(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
-    """The scene that was saved; None where a frame of it is gone. Raises ValueError as `graph_from`."""
+    """The scene that was saved; None where a frame of it is gone. Raises ValueError as `parse_graph`."""
     header = message.header
     if any(name not in keyframes for name in header.views):
         return None
@@ -141,7 +141,7 @@ def _convert_number(number: Any) -> bool | int | float | None:
 
 
 def unflatten_dataclass(kind: type[T], numbers: Numbers, arrays: Any) -> T:
-    """Inverse of `taken_apart`; takes from `arrays` as many as it needs. Raises ValueError where they do not fit."""
+    """Inverse of `flatten_dataclass`; takes from `arrays` as many as it needs. Raises ValueError where they do not fit."""
     names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
     if not set(numbers) <= set(names):
         raise ValueError(f"a {kind.__name__} with {', '.join(sorted(numbers))} is of another version")

@@ -107,7 +107,7 @@ def make_pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[Pointmaps
 
 
 def parse_pointmaps(message: Message[PointmapsRecord], keyframes: Mapping[str, Keyframe]) -> dict[str, Pointmap]:
-    """The point maps of those keyframes that there are. Raises ValueError as `estimate_from`."""
+    """The point maps of those keyframes that there are. Raises ValueError as `parse_reconstruction`."""
     names, arrays = message.header.names, message.arrays
     if len(arrays) != len(OF_POINTMAP) * len(names):
         raise ValueError(f"{len(names)} point maps with {len(arrays)} arrays are of another version")

@@ -177,7 +177,7 @@ class Store:
             self._write(msgspec.structs.replace(self.ledger, retracted=retracted))
 
     def leave_submap(self, first: int, shared: Collection[str] = ()) -> None:
-        """Begins another place as `begin_place` does, and keeps what there is of the present one. Raises OSError.
+        """Begins another place as `begin_submap` does, and keeps what there is of the present one. Raises OSError.
 
         `shared` are frames from `first` on that belong to both. A death in between leaves the place as it was.
         """

@@ -53,7 +53,7 @@ class TrialCase:
     one world and agree with it. Frames in no world may be in no scene.
     """
 
-    note: str  # made by `described`
+    note: str  # made by `describe_case`
     source: Source
     demand: Demand
     codes: frozenset[Code]  # verdicts that describe these frames

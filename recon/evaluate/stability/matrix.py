@@ -1,4 +1,4 @@
-"""All rows, by number: every `Row` of the modules in `_FAMILIES`.
+"""All rows, by number: every `MatrixRow` of the modules in `_FAMILIES`.
 
 A new row is one function in one of these files; a new file of rows is that file and its name in `_FAMILIES`. Those of
 `lens_assumptions` are made from its kinds.

@@ -119,7 +119,7 @@ class Sampler:
     def load_images(
         self, count: int, apart_from: Sequence[TrialImage] = (), step_deg: float = USUAL_STEP_DEG
     ) -> list[TrialImage]:
-        """The photographs of `window`."""
+        """The photographs of `choose_window`."""
         place, indices = self.choose_window(count, apart_from, step_deg)
         return place.load_images(indices)
 
@@ -226,7 +226,7 @@ def load_trial_scenes(scenes: Sequence[Path], out: Path) -> list[TrialScene]:
 
 
 def classify_motion(Ts_world_camera: Poses) -> str:
-    """How cameras (M, 4, 4) in the order of capture moved: the name of a field of `Places`."""
+    """How cameras (M, 4, 4) in the order of capture moved: the name of a field of `ScenesByMotion`."""
     centres = Ts_world_camera[:, :3, 3]
     steps = np.diff(centres, axis=0)
     lengths = np.linalg.norm(steps, axis=1)

@@ -72,7 +72,7 @@ class TrialResult:
 
 
 def judge_trial(case: TrialCase, row: int, name: str, seed: int, method: str, answer: call.Answer) -> Trial:
-    """The trial of a case that `reconstructed` was called for; its photographs are not looked at."""
+    """The trial of a case that `run_trial` was called for; its photographs are not looked at."""
     head = {
         "row": row,
         "name": name,

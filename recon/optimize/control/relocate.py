@@ -53,7 +53,7 @@ class Relocation:
 
 
 def relocate_dead(gaussians: Gaussians, dead: float, generator: torch.Generator) -> tuple[Gaussians, Tensor]:
-    """The Gaussians with each dead one moved to a live one, and (N,) `Change.origin`.
+    """The Gaussians with each dead one moved to a live one, and (N,) `GaussianChange.origin`.
 
     Those that now share a place look together as the live one did.
     """

@@ -69,7 +69,7 @@ class Aliked(nn.Module):
         return F.normalize(together, dim=1)[0], scores[0, 0]
 
     def forward(self, image: Tensor, count: int) -> Keypoints:
-        """At most `count` keypoints of an image as `maps` takes it."""
+        """At most `count` keypoints of an image as `compute_maps` takes it."""
         features, scores = self.compute_maps(image)
         positions = detect_keypoints(scores, count)
         return Keypoints(positions + 0.5, self.desc_head(features, positions))

@@ -253,7 +253,7 @@ def _compute_jacobian(points: Array, similarity: Similarity) -> Array:
 
 
 def _apply_step(similarity: Similarity, step: npt.NDArray[np.floating]) -> Similarity:
-    """The similarity after a `step` (7,) of the joint fit, in the order of `_motion`."""
+    """The similarity after a `step` (7,) of the joint fit, in the order of `_compute_jacobian`."""
     rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ similarity.rotation
     growth = float(np.exp(np.clip(step[6], -_MAX_LOG_SCALE_STEP, _MAX_LOG_SCALE_STEP)))
     return Similarity(similarity.scale * growth, rotation, similarity.translation + step[3:6])

@@ -27,7 +27,7 @@ class Network(Protocol):
     """The interface of the prior's network; `Mast3r` implements it."""
 
     def encode(self, image: Tensor) -> EncodedImage:
-        """An image as `prepared` gives it, after the encoder."""
+        """An image as `prepare_image` gives it, after the encoder."""
         ...
 
     def decode(self, first: EncodedImage, second: EncodedImage) -> tuple[Prediction, Prediction]:

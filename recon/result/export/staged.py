@@ -1,7 +1,7 @@
 """Files that appear together or not at all: written under temporary names, then renamed.
 
 What several files take to become one result is written down before the first is renamed: a process that is killed
-between two renames, or whose disk fails there, leaves a note beside them, from which `completed` finishes the work.
+between two renames, or whose disk fails there, leaves a note beside them, from which `finish_interrupted_write` finishes the work.
 """
 
 from __future__ import annotations

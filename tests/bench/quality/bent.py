@@ -85,7 +85,7 @@ class Bent(EvaluationScene):
     def image(self, name: str) -> npt.NDArray[np.uint8]:
         return self.photos[name].image
 
-    def masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
+    def load_masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
         """All of it counts; or, with `seen_by`, what the straight photograph shows."""
         image = self.image(name)
         if self.seen_by is None:

@@ -115,7 +115,7 @@ def test_a_whole_episode_is_numbered_without_gaps_where_the_rates_differ(tmp_pat
     places = [1 + round(index / beside * 10) for index in range(2000)]
     image = levels(0)[0]
     decoded = [VideoFrame(place, place * 10**8, image) for place in places]
-    monkeypatch.setattr("splatnode.capture.cameras.video.decoded", lambda *_: iter(decoded))
+    monkeypatch.setattr("splatnode.capture.cameras.video.decode_video", lambda *_: iter(decoded))
     assert [number for number, _ in numbered(frames(folder, f"1/{TOP}"))] == list(range(2000))
 
 

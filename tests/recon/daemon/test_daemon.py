@@ -199,7 +199,7 @@ def test_a_result_that_could_not_be_written_is_written_by_the_next_process(confi
     for frame in photographs()[:3]:
         peer.server.offer(frame)
     with monkeypatch.context() as patch, end, running(config):
-        patch.setattr("splatnode.recon.daemon.output.finish", fail)
+        patch.setattr("splatnode.recon.daemon.output.write_result_folder", fail)
         wait_for(lambda: peer.server.serve(0.02) or failed.is_set(), PATIENCE_S)
     with running(config):
         wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)

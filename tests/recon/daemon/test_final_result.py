@@ -73,7 +73,7 @@ def working(tmp_path, monkeypatch):
             raise place.failures.pop()
         place.owed, place.settled = [], True
 
-    place.take_in = take_in
+    place.add_keyframes = take_in
     monkeypatch.setattr(worker, "ActiveSubmap", lambda *_: place)
     node = worker.Worker(
         DaemonConfig(out=tmp_path / "out"), Store(tmp_path / "store"), Inbox(), lambda _: None, threading.Event()
@@ -92,9 +92,9 @@ def working(tmp_path, monkeypatch):
 def test_a_step_that_memory_or_disk_did_not_suffice_for_is_tried_again(working, error, again, said):
     node, place = working
     place.failures = [error]
-    node._guarded(lambda: place.take_in(["a keyframe"]))
+    node._run_step(lambda: place.add_keyframes(["a keyframe"]))
     assert place.settled is not again and node.problem.endswith(said)
-    node._guarded(lambda: place.take_in([]))
+    node._run_step(lambda: place.add_keyframes([]))
     assert bool(node.problem) is not again
 
 
@@ -103,7 +103,7 @@ def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
     for index in range(CAPACITY):
         inbox.enqueue(RemovedFrame(str(index)), threading.Event())
     daemon = SimpleNamespace(
-        _worker=SimpleNamespace(scenes_left_with=lambda _: []),
+        _worker=SimpleNamespace(find_inactive_scenes=lambda _: []),
         _store=SimpleNamespace(names={"a.png"}, forget=lambda *what: forgotten.append(what)),
         _inbox=inbox,
         _stopping=threading.Event(),

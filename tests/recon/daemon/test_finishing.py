@@ -21,7 +21,7 @@ from tests.support.synthetic import photographs
 class Work:
     """What finishing needs of an IncrementalReconstruction."""
 
-    begun: str = "begun"
+    begun: str = "initial_scene"
     asked: list[refinement.RefinementConfig] = field(default_factory=list)
 
     def rebuild(self, pause: Callable[[], None]) -> None:

@@ -29,7 +29,7 @@ class FakeReconstruction:
         self._all = [keyframe(name) for name in names]
         self.names = list(names)
         self.scene = object() if names else None
-        self.proven = frozenset(names)
+        self.publishable_names = frozenset(names)
         self.refusals: list[frozenset[str]] = []
 
     @property
@@ -38,23 +38,23 @@ class FakeReconstruction:
         return SimpleNamespace(keyframes=keyframes, components=self._components)
 
     @property
-    def aside(self) -> list[SimpleNamespace]:
+    def keyframes_deferred(self) -> list[SimpleNamespace]:
         return [each for each in self._all if each.name not in self.names]
 
-    def complete(self, pause: Callable[[], None]) -> None:
+    def match_pending_pairs(self, pause: Callable[[], None]) -> None:
         pause()
 
-    def add(self, added: SimpleNamespace, pause: Callable[[], None]) -> None:
+    def add_keyframe(self, added: SimpleNamespace, pause: Callable[[], None]) -> None:
         self._all.append(added)
         self.names.append(added.name)
 
-    def set_aside(self, names: Collection[str]) -> None:
+    def defer_keyframes(self, names: Collection[str]) -> None:
         self.names = [name for name in self.names if name not in names]
 
-    def bring_back(self, names: Collection[str]) -> None:
+    def restore_keyframes(self, names: Collection[str]) -> None:
         self.names = [each.name for each in self._all if each.name in {*self.names, *names}]
 
-    def was_refused(self, names: Collection[str]) -> bool:
+    def is_rejected(self, names: Collection[str]) -> bool:
         return frozenset(names) in self.refusals
 
     def estimate_soon(self, pause: Callable[[], None]) -> Any:
@@ -64,7 +64,7 @@ class FakeReconstruction:
         if self.proven == frozenset(self.names):
             return self._estimated(("late", "far", "other") if self._called("late") < 2 else ("far", "other"))
         estimated = self._estimated(("late", "far", "other"))
-        all_placed = len(estimated.placed) == len(self.names)
+        all_placed = len(estimated.publishable_camera_names) == len(self.names)
         return estimated if estimated.verdict.publishable and all_placed else None
 
     def estimate_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Any:

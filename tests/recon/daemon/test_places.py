@@ -145,8 +145,8 @@ def replace_image(frame, index):
 def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, monkeypatch):
     frames = places(seeds=(0, 1))
     with monkeypatch.context() as patch, running(replace(moving, lost_after=3)):
-        patch.setattr(InactiveSubmaps, "judge_next", never)
-        patch.setattr(InactiveSubmaps, "finish_next", never)
+        patch.setattr(InactiveSubmaps, "verify_next", never)
+        patch.setattr(InactiveSubmaps, "finalize_next", never)
         offer_when_three_are_shown(peer, frames)
         peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
         peer.wait_for_acknowledgements()

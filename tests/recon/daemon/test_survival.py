@@ -111,7 +111,7 @@ def impatient(monkeypatch):
 def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plain, impatient):
     with taking(ipc(tmp_path), tmp_path) as node:
         put, failures = node.store.add_frame, [OSError(28, "No space left"), OSError(5, "Input/output error")]
-        monkeypatch.setattr(node.store, "put", lambda one: _raise(failures.pop()) if failures else put(one))
+        monkeypatch.setattr(node.store, "add_frame", lambda one: _raise(failures.pop()) if failures else put(one))
         node.server.offer(frame(0))
         node.until(lambda: node.server.acknowledged == 1)
         assert node.store.names == {"0.png"} and not failures and node.intake.full == ""
@@ -121,7 +121,9 @@ def test_what_cannot_be_stored_is_refused_and_told_until_seen(tmp_path, monkeypa
     with taking(ipc(tmp_path), tmp_path) as node:
         put = node.store.add_frame
         monkeypatch.setattr(
-            node.store, "put", lambda one: _raise(ArithmeticError("odd")) if one.frame.name == "0.png" else put(one)
+            node.store,
+            "add_frame",
+            lambda one: _raise(ArithmeticError("odd")) if one.frame.name == "0.png" else put(one),
         )
         node.server.offer(frame(0))
         node.server.offer(frame(1))
@@ -219,7 +221,7 @@ def test_a_preview_that_makes_tracking_fail_is_one_preview(tmp_path, monkeypatch
             raise ArithmeticError("for the test")
 
     monkeypatch.setattr(
-        watcher, "compute_landmarks", lambda *_: _raise(IndexError("none")) if where == "landmarks" else None
+        watcher, "compute_landmarks", lambda *_: _raise(IndexError("none")) if where == "compute_landmarks" else None
     )
     monkeypatch.setattr(watcher, "Tracker", Failing)
     camera = SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)

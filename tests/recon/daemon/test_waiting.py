@@ -38,7 +38,7 @@ __all__ = ["config"]
 
 def store_all(store, frames) -> list:
     """The frames in the checkpoint, as an earlier process took them, of which it worked in none."""
-    return [store.put(ReceivedFrame("0" * 32, number, frame)) for number, frame in enumerate(frames)]
+    return [store.add_frame(ReceivedFrame("0" * 32, number, frame)) for number, frame in enumerate(frames)]
 
 
 def at_rest(config) -> bool:
@@ -124,7 +124,7 @@ def rounds(monkeypatch) -> list[list[str]]:
     """The keyframes of each round of fallbacks, which all gain nothing."""
     found: list[list[str]] = []
 
-    def climbed(estimate, rejected, config, pause):
+    def run_fallbacks(estimate, rejected, config, pause):
         found.append(sorted(estimate.graph.names))
         message = f"{estimate.verdict.message} Also tried: nothing."
         return replace(estimate, verdict=replace(estimate.verdict, message=message))
@@ -212,12 +212,12 @@ def test_a_pause_does_not_count_as_fallback_time(monkeypatch):
         work.add_keyframe(prepare(frame, work.config))
     done = []
 
-    def climbed(estimate, rejected, recipe, pause):
+    def run_fallbacks(estimate, rejected, recipe, pause):
         pause()
         done.append(True)
         return estimate
 
-    monkeypatch.setattr(incremental, "run_fallbacks", climbed)
+    monkeypatch.setattr(incremental, "run_fallbacks", run_fallbacks)
     with work.fallback_budget(0.2):
         work.estimate_thoroughly(lambda: time.sleep(0.25))
     assert done
@@ -233,7 +233,7 @@ def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_a
         node._backlog = keyframes[:5]
         inbox.enqueue(keyframes[5], threading.Event())
         taken = []
-        monkeypatch.setattr(node.place, "take_in", taken.append)
+        monkeypatch.setattr(node.place, "add_keyframes", taken.append)
         assert node.delay[0] > 0
         for _ in range(3):
             node._process_events(0.0)

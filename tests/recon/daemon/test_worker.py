@@ -31,7 +31,7 @@ def test_more_matches_are_looked_for_within_seconds_since_keyframes_wait(asked, 
 @pytest.mark.parametrize("again", [False, True], ids=["retracted", "retracted, and another of its name came"])
 def test_what_was_retracted_before_it_was_prepared_is_not_taken_in(again, tmp_path, monkeypatch):
     taken: list[list[ArrivedKeyframe]] = []
-    place = SimpleNamespace(settled=True, owed=[], take_in=taken.append, leave_out=lambda names: None)
+    place = SimpleNamespace(settled=True, owed=[], add_keyframes=taken.append, remove_frames=lambda names: None)
     monkeypatch.setattr(worker, "ActiveSubmap", lambda *_: place)
     store, inbox = Store(tmp_path / "checkpoint"), Inbox()
     node = worker.Worker(DaemonConfig(out=tmp_path / "out"), store, inbox, lambda found: None, threading.Event())

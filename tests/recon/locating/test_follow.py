@@ -8,7 +8,7 @@ import numpy as np
 
 from splatnode.recon.locating import follow as following
 from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.locate import localize_image
+from splatnode.recon.locating.localize_image import localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from tests.support.located import errors, known_place, photograph
 

@@ -85,6 +85,6 @@ def test_what_ends_the_worker_ends_the_run(node, monkeypatch):
     def fail(*_: object) -> None:
         raise MemoryError("for the test")
 
-    monkeypatch.setattr(scenes.Worker, "_turn", fail)
+    monkeypatch.setattr(scenes.Worker, "_process_events", fail)
     with pytest.raises(MemoryError, match="for the test"):
         make_scenes(photographs(), IDENTITY, node, ignored)

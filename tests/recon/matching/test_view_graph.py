@@ -29,7 +29,7 @@ class Verified:
     matches: range
     names: tuple[str, str]
 
-    def swapped(self) -> Verified:
+    def swap(self) -> Verified:
         return replace(self, names=self.names[::-1])
 
 
@@ -50,7 +50,7 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
         firm = Verified(range(200), (first.name, second.name)) if first.name[0] == second.name[0] else None
         return MatchedPair(NO_MATCHES, firm, hint)
 
-    def match_tilted(first, second, plain, tilts, config):
+    def match_affine(first, second, plain, tilts, config):
         calls.append((first.name, second.name, "tilted"))
         weak = Verified(range(30), (first.name, second.name)) if plain.log10_nfa < 0.0 else None
         return MatchedPair(NO_MATCHES, weak, -20.0 if weak else 0.0)
@@ -73,7 +73,7 @@ def complete(graph: Any) -> Any:
 
 def soon(graph: Any, name: str) -> Any:
     """With a further keyframe that is compared with a few others."""
-    *_, later = match_newest(graph.with_keyframe(keyframe(name)), None)
+    *_, later = match_newest(graph.add_keyframe(keyframe(name)), None)
     return later
 
 
@@ -139,7 +139,7 @@ def test_components_are_the_largest_first(compared):
 def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
     graph = graph_of("a1", "a2", "b1", "A1", "a3")
     made = len(compared)
-    rest = graph.without({"a1", "b1"})
+    rest = graph.remove_keyframes({"a1", "b1"})
     assert rest.names == ["a2", "A1", "a3"] and len(compared) == made  # it is asked by what follows, which can pause
     # a2 and a3 had two firm partners before; now they have one, and tilted features are worth their time.
     rest = complete(rest)

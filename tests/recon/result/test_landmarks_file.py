@@ -49,7 +49,7 @@ def test_a_file_from_before_focal_lengths_had_bounds_is_read(landmarks):
 
 def test_it_moves_into_another_world(landmarks):
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    moved = landmarks.moved(2.0, turn, np.array([1.0, 2.0, 3.0]))
+    moved = landmarks.transform(2.0, turn, np.array([1.0, 2.0, 3.0]))
     assert np.allclose(moved.points, 2.0 * landmarks.points @ turn.T + [1, 2, 3])
     assert np.allclose(moved.covariances[0], 4.0 * turn @ landmarks.covariances[0] @ turn.T)
     assert np.allclose(moved.Ts_world_camera[0, :3, :3], turn) and np.allclose(

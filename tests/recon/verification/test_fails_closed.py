@@ -163,7 +163,7 @@ def test_a_mirrored_answer_that_could_not_be_computed_is_not_the_lack_of_a_rival
     broken = replace(fit, problem=replace(fit.problem, points=np.full_like(fit.problem.points, np.nan)))
     assert math.isnan(replace(fit, problem=replace(fit.problem, translations=np.full((4, 3), np.nan))).cost)
     adjusted = iter([fit, replace(broken, problem=replace(fit.problem, translations=np.full((4, 3), np.nan)))])
-    monkeypatch.setattr(refit, "adjust", lambda start: next(adjusted))
+    monkeypatch.setattr(refit, "adjust", lambda start: next(adjust))
     assert math.isnan(reversal.compute_reversal_cost_ratio(fit))
 
 

@@ -48,7 +48,7 @@ class SurfaceLiar:
 
     flat: bool = False
 
-    def with_points(self, keyframe: Keyframe) -> Keyframe:
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
         known = keyframe.features
         if len(known.points) >= len(GRID) and (known.points[-len(GRID) :] == self._seen(keyframe)).all():
             return keyframe
@@ -66,7 +66,7 @@ class SurfaceLiar:
 class SnappingLiar:
     """Detected features that happen to lie where the invented surface would be seen: nothing is made up but pairs."""
 
-    def with_points(self, keyframe: Keyframe) -> Keyframe:
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
         return keyframe
 
     def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> np.ndarray:

@@ -21,7 +21,7 @@ from splatnode.recon.verification.models import VerdictModels, VerdictModel
 
 def format_module(numbers: VerdictModels) -> str:
     return HEAD + "\n".join(
-        ["FITTED = Fitted(", *_format_model("many", numbers.many), *_format_model("pair", numbers.pair), ")", ""]
+        ["FITTED = VerdictModels(", *_format_model("many", numbers.many), *_format_model("pair", numbers.pair), ")", ""]
     )
 
 
@@ -29,8 +29,8 @@ def _format_model(name: str, numbers: VerdictModel) -> list[str]:
     bounds = [f"            {f.name}={_format_call(getattr(numbers.claims, f.name))}," for f in fields(numbers.claims)]
     terms = [f'                "{name}": {_format_call(term)},' for name, term in numbers.odds.terms.items()]
     return [
-        f"    {name}=Numbers(",
-        "        claims=ClaimModel(",
+        f"    {name}=VerdictModel(",
+        "        claims=ErrorModel(",
         *bounds,
         "        ),",
         "        odds=OddsModel(",

@@ -35,7 +35,7 @@ def answer_window(
 ) -> tuple[WindowAnswer, dict[Key, bytes]]:
     """The answer, and what was found for it that is not `known` of the scene. It is called in a process of its own.
 
-    `told`: what comes with the photographs, see `frames_of`; `fresh`: measures the seconds from photographs on, too.
+    `told`: what comes with the photographs, see `load_window_frames`; `fresh`: measures the seconds from photographs on, too.
     """
     matcher, frames = load_prior(config).matcher, load_window_frames(place, window, told)
     kept, _, rejected = screen_all(frames, config.screening)

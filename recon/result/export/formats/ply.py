@@ -40,7 +40,7 @@ def export(result: StoredResult) -> bytes:
 
 
 def encode_ply(gaussians: GaussianArrays, scale: Scale = RELATIVE) -> bytes:
-    """The file's bytes. Scales and opacities must be positive and finite (see `viewer_safe`)."""
+    """The file's bytes. Scales and opacities must be positive and finite (see `sanitize_gaussians`)."""
     num_gaussians, num_bases = gaussians.sh.shape[:2]
     names = _property_names(num_bases)
     rows = np.zeros((num_gaussians, len(names)), "<f4")

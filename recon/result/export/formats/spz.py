@@ -51,7 +51,7 @@ def encode_spz(gaussians: GaussianArrays) -> bytes:
     """The file's bytes, Gaussians by height in slices of depth. Scales and opacities must be positive and finite.
 
     Rounding errors: log scales 1/32, opacities 2/255, f_dc 1/38, rotations 1 degree, and centres 1/25 of a typical
-    Gaussian's extent, or 2^-23 of the largest coordinate where that is more. See `viewer_safe`.
+    Gaussian's extent, or 2^-23 of the largest coordinate where that is more. See `sanitize_gaussians`.
     """
     num_gaussians, num_bases = gaussians.sh.shape[:2]
     degree = {bases: degree for degree, bases in _NUM_BASES.items()}[num_bases]

@@ -100,7 +100,7 @@ def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):
 
 def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_are(kidnapped, peer, monkeypatch):
     with monkeypatch.context() as patch, running(kidnapped):
-        patch.setattr(InactiveSubmaps, "finish_next", lambda *_: False)
+        patch.setattr(InactiveSubmaps, "finalize_next", lambda *_: False)
         offer_walk(peer)
         wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
         wait_for(lambda: heartbeats(kidnapped.network)["recon"]["scenes"] == 3, PATIENCE_S)
@@ -124,7 +124,7 @@ def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_
 def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kidnapped, peer, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(
-            LoopDetector, "compare", lambda _, scene, graph, pause: compute_global_descriptors(graph.keyframes)
+            LoopDetector, "detect_loops", lambda _, scene, graph, pause: compute_global_descriptors(graph.keyframes)
         )  # with no other
         with walked(kidnapped, peer):
             pass

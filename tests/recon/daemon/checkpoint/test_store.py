@@ -57,7 +57,7 @@ def open_store(tmp_path):
 
 
 def test_a_frame_survives_the_process_with_all_that_it_had(open_store):
-    put = open_store().put(received(5))
+    put = open_store().add_frame(received(5))
     (stored,) = open_store().frames()
     assert (stored.number, stored.key, stored.frame.name) == (put.number, (SESSION, 5), "5.png")
     assert stored.frame.intrinsics == LENS and stored.frame.stamp_ns == 50
@@ -69,7 +69,7 @@ def test_a_mask_is_kept(open_store):
     store = open_store()
     mask = np.random.default_rng(0).random(image(1).shape[:2]) < 0.5
     received = ReceivedFrame(SESSION, 1, Frame(1, "1.png", 10, image(1), LENS, mask=mask))
-    assert store.put(received) is not None
+    assert store.add_frame(received) is not None
     (stored,) = open_store().frames()
     assert np.array_equal(stored.frame.mask, mask)
 
@@ -93,15 +93,15 @@ def test_numbers_go_on_and_frames_keep_their_order(open_store):
     for run in range(3):
         store = open_store()
         assert [stored.number for stored in store.frames()] == list(range(2 * run))
-        assert [store.put(received(2 * run + i)).number for i in (0, 1)] == [2 * run, 2 * run + 1]
+        assert [store.add_frame(received(2 * run + i)).number for i in (0, 1)] == [2 * run, 2 * run + 1]
 
 
 def test_what_comes_while_the_frames_are_read_takes_no_number_and_no_name_of_theirs(open_store):
     for i in range(3):
-        open_store().put(received(i))
+        open_store().add_frame(received(i))
     again = open_store()
-    assert sorted(again.seen) == [(SESSION, i) for i in range(3)] and again.names == {"0.png", "1.png", "2.png"}
-    new = again.put(received(3, "1.png"))
+    assert sorted(again.frame_keys) == [(SESSION, i) for i in range(3)] and again.names == {"0.png", "1.png", "2.png"}
+    new = again.add_frame(received(3, "1.png"))
     assert new.number == 3 and new.frame.name != "1.png"
     assert [stored.key[1] for stored in again.frames()] == [0, 1, 2]
     assert [stored.key[1] for stored in open_store().frames()] == [0, 1, 2, 3]
@@ -109,7 +109,7 @@ def test_what_comes_while_the_frames_are_read_takes_no_number_and_no_name_of_the
 
 def test_frames_of_the_same_name_are_told_apart(open_store):
     store = open_store()
-    names = [store.put(received(i, "same.png")).frame.name for i in range(3)]
+    names = [store.add_frame(received(i, "same.png")).frame.name for i in range(3)]
     assert len(set(names)) == 3 and names[0] == "same.png"
     assert [stored.frame.name for stored in open_store().frames()] == names
 
@@ -140,57 +140,60 @@ def test_names_are_told_while_another_thread_stores_frames(open_store):
 
 def test_what_was_taken_is_known_whatever_became_of_it(open_store):
     store = open_store()
-    store.put(received(0))
-    store.put(received(1))
-    store.put(ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred")))
+    store.add_frame(received(0))
+    store.add_frame(received(1))
+    store.add_frame(ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred")))
     store.forget("0.png", "retracted")
     again = open_store()
     assert [stored.frame.name for stored in again.frames()] == ["1.png"]
-    assert sorted(again.seen) == [(SESSION, 0), (SESSION, 1), (SESSION, 2)]
-    assert again.dropped == [DroppedFrame("2.png", "blurred"), DroppedFrame("0.png", "retracted")]
+    assert sorted(again.frame_keys) == [(SESSION, 0), (SESSION, 1), (SESSION, 2)]
+    assert again.frames_dropped == [DroppedFrame("2.png", "blurred"), DroppedFrame("0.png", "retracted")]
     again.forget("nobody.png", "retracted")
-    assert again.put(received(3)).number == 2
+    assert again.add_frame(received(3)).number == 2
 
 
 def test_what_was_left_out_is_bounded(open_store):
     store = open_store()
     for i in range(REMEMBERED_DROPPED + 5):
-        store.put(ReceivedFrame(SESSION, i, DroppedFrame(f"{i}.png", "blurred")))
-    assert len(store.dropped) == REMEMBERED_DROPPED and store.dropped[-1].name == f"{REMEMBERED_DROPPED + 4}.png"
+        store.add_frame(ReceivedFrame(SESSION, i, DroppedFrame(f"{i}.png", "blurred")))
+    assert (
+        len(store.frames_dropped) == REMEMBERED_DROPPED
+        and store.frames_dropped[-1].name == f"{REMEMBERED_DROPPED + 4}.png"
+    )
 
 
 def test_another_place_keeps_its_own_frames_only(open_store):
     store = open_store()
     for i in range(4):
-        store.put(received(i))
+        store.add_frame(received(i))
     store.save("scene", Ledger(), [])
-    store.begin_place(first=2)
+    store.begin_submap(first=2)
     assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"}
     again = open_store()
     assert [stored.number for stored in again.frames()] == [2, 3]
     assert again.scene_id == "scene-0002" and again.load("scene", Ledger) is None
-    assert sorted(again.seen) == [(SESSION, i) for i in range(4)]
+    assert sorted(again.frame_keys) == [(SESSION, i) for i in range(4)]
 
 
 def test_frames_of_a_place_that_was_left_as_the_process_died_are_removed(open_store, monkeypatch):
     store = open_store()
     for i in range(3):
-        store.put(received(i))
+        store.add_frame(received(i))
     monkeypatch.setattr(store, "_unlink", lambda frames: None)
-    store.begin_place(first=2)
+    store.begin_submap(first=2)
     assert [stored.number for stored in open_store().frames()] == [2]
     assert len(list((store.directory / "frames").glob("*.frame"))) == 1
 
 
 def test_a_damaged_frame_is_put_aside_and_the_others_are_there(open_store, caplog):
     store = open_store()
-    paths = [store.directory / "frames" / f"{store.put(received(i)).number:012d}.frame" for i in range(3)]
+    paths = [store.directory / "frames" / f"{store.add_frame(received(i)).number:012d}.frame" for i in range(3)]
     paths[1].write_bytes(paths[1].read_bytes()[:-9])
     (store.directory / "frames" / "stranger.frame").write_bytes(b"?")
     again = open_store()
     assert [stored.number for stored in again.frames()] == [0, 2]
     assert "put aside" in caplog.text and paths[1].with_suffix(".damaged").exists()
-    assert again.put(received(9)).number == 3
+    assert again.add_frame(received(9)).number == 3
 
 
 def test_half_written_files_are_removed(open_store):
@@ -202,7 +205,7 @@ def test_half_written_files_are_removed(open_store):
 
 def test_a_full_disk_is_told_and_nothing_has_changed(open_store, monkeypatch):
     store = open_store()
-    store.put(received(0))
+    store.add_frame(received(0))
 
     def full(path, parts):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -212,11 +215,11 @@ def test_a_full_disk_is_told_and_nothing_has_changed(open_store, monkeypatch):
             patched.setattr(module, "write_message", full)
         for frame in (received(1), ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred"))):
             with pytest.raises(OSError, match="No space"):
-                store.put(frame)
+                store.add_frame(frame)
         with pytest.raises(OSError, match="No space"):
             store.forget("0.png", "retracted")
-    assert store.seen == [(SESSION, 0)] and store.names == {"0.png"}
-    assert store.put(received(1)).number == 1
+    assert store.frame_keys == [(SESSION, 0)] and store.names == {"0.png"}
+    assert store.add_frame(received(1)).number == 1
 
 
 def test_two_processes_do_not_share_a_checkpoint(open_store):
@@ -253,13 +256,13 @@ def test_what_can_be_made_anew_is_missing_rather_than_wrong(open_store, caplog):
 )
 def test_what_is_no_file_of_the_checkpoint_is_left_alone(open_store, make, name, stray):
     store = open_store()
-    store.put(received(0))
+    store.add_frame(received(0))
     path = store.directory / name.format(stray)
     make(path)
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["0.png"] and os.path.lexists(path)
     for sequence in range(1, 5):
-        store.put(received(sequence))
+        store.add_frame(received(sequence))
     assert len(list(open_store().frames())) == 5
 
 
@@ -282,21 +285,21 @@ def test_what_lies_where_the_ledger_belongs_is_told(open_store, make):
 
 def test_a_copy_of_a_keyframe_is_left_alone(open_store, caplog):
     store = open_store()
-    store.put(received(0))
+    store.add_frame(received(0))
     copy = store.directory / "frames" / "000000000007.frame"
     copy.write_bytes((store.directory / "frames" / "000000000000.frame").read_bytes())
     store = open_store()
     assert [stored.number for stored in store.frames()] == [0] and copy.exists() and "a copy of" in caplog.text
-    assert store.put(received(1)).number == 8
+    assert store.add_frame(received(1)).number == 8
 
 
 def test_a_checkpoint_is_private_whatever_the_umask_and_one_that_was_open_is_closed(open_store):
     before = os.umask(0)
     try:
         store = open_store()
-        store.put(received(0))
-        store.begin_place(1)
-        store.put(received(1))
+        store.add_frame(received(0))
+        store.begin_submap(1)
+        store.add_frame(received(1))
     finally:
         os.umask(before)
     everything = [store.directory, *store.directory.rglob("*")]
@@ -310,12 +313,12 @@ def test_a_checkpoint_is_private_whatever_the_umask_and_one_that_was_open_is_clo
 def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
     store = open_store()
     for sequence in range(4):
-        store.put(received(sequence))
+        store.add_frame(received(sequence))
     store.forget("1.png", "blurred")
     assert store.names_before(2) == {"0.png"} and store.names_before(3) == {"0.png", "2.png"}
     store.save("graph", Ledger(), [])
-    store.leave_place(2)
-    assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"} and not store.dropped
+    store.leave_submap(2)
+    assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"} and not store.frames_dropped
     assert not (store.directory / "graph").exists()
     (folder,) = left.list_left_folders(store.directory)
     kept = Store(folder)
@@ -325,7 +328,7 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
 
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["2.png", "3.png"]
-    assert (SESSION, 0) in store.seen and left.list_left_folders(store.directory) == [folder]
+    assert (SESSION, 0) in store.frame_keys and left.list_left_folders(store.directory) == [folder]
     left.remove(folder)
     assert left.list_left_folders(store.directory) == []
 
@@ -333,24 +336,24 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
 def test_a_place_goes_on_from_the_one_that_it_shares_frames_with(open_store):
     store = open_store()
     for sequence in range(4):
-        store.put(received(sequence))
-    store.leave_place(2, shared=("2.png", "3.png"))
+        store.add_frame(received(sequence))
+    store.leave_submap(2, shared=("2.png", "3.png"))
     (folder,) = left.list_left_folders(store.directory)
     kept = Store(folder)
     assert (kept.ledger.follows, kept.ledger.shared) == ("", ()) and kept.names == {f"{i}.png" for i in range(4)}
     kept.close()
     store = open_store()
     assert (store.ledger.follows, store.ledger.shared) == ("scene-0001", ("2.png", "3.png"))
-    store.leave_place(4)
+    store.leave_submap(4)
     assert (store.ledger.follows, store.ledger.shared) == ("", ())
 
 
 def test_a_finished_place_is_kept_and_taken_back(open_store):
     store = open_store()
     for sequence in range(3):
-        store.put(received(sequence))
+        store.add_frame(received(sequence))
     store.save("scene", Ledger(), [])
-    store.leave_place(2)
+    store.leave_submap(2)
     (folder,) = left.list_left_folders(store.directory)
     kept = Store(folder)
     kept.remove_scene_files()
@@ -363,25 +366,25 @@ def test_a_finished_place_is_kept_and_taken_back(open_store):
     assert not (left.make_finished_path(store.directory, "scene-0001") / "scene").exists()
 
     store = open_store()
-    store.retract_elsewhere("0.png", ["scene-0001"])
-    store.retract_elsewhere("0.png", ["scene-0001"])
+    store.request_removal("0.png", ["scene-0001"])
+    store.request_removal("0.png", ["scene-0001"])
     store = open_store()
     assert store.ledger.retracted == (("scene-0001", "0.png"),)
     assert left.reopen(store.directory, "scene-0007") is None
     again = left.reopen(store.directory, "scene-0001")
     assert again == folder and left.reopen(store.directory, "scene-0001") == folder
     assert left.list_finished_folders(store.directory) == [] and left.list_left_folders(store.directory) == [folder]
-    store.was_retracted("scene-0001", "0.png")
+    store.confirm_removal("scene-0001", "0.png")
     assert open_store().ledger.retracted == ()
 
 
 def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypatch):
     store = open_store()
     for sequence in range(3):
-        store.put(received(sequence))
-    monkeypatch.setattr(Store, "begin_place", lambda *_: (_ for _ in ()).throw(SystemExit))
+        store.add_frame(received(sequence))
+    monkeypatch.setattr(Store, "begin_submap", lambda *_: (_ for _ in ()).throw(SystemExit))
     with pytest.raises(SystemExit):
-        store.leave_place(2)
+        store.leave_submap(2)
     assert left.list_left_folders(store.directory) != []
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["0.png", "1.png", "2.png"]
@@ -392,8 +395,8 @@ def place_that_was_left(open_store, count: int) -> Path:
     """Its checkpoint, with so many frames."""
     store = open_store()
     for sequence in range(count):
-        store.put(received(sequence))
-    store.leave_place(count)
+        store.add_frame(received(sequence))
+    store.leave_submap(count)
     return store.directory / "left" / "scene-0001"
 
 

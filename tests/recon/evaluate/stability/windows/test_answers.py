@@ -115,7 +115,7 @@ def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkey
         for one, other in zip(graph.keyframes, scratch.keyframes, strict=True):
             assert_same(one.features, other.features)
     assert 0 < len(graph.tilted) < len(graph.plain), "else there was nothing to choose"
-    for work in ("match_plain", "match_tilted"):
+    for work in ("match_plain", "match_affine"):
         monkeypatch.setattr(pair_matching, work, None)
     assert store.match_keyframes(keyframes, known, matching, None)[1] == {}, "nothing is matched twice"
 

@@ -116,7 +116,7 @@ def first_broken(place, window, config, fresh, told, known):
 
 def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
     places, on = three_places(tmp_path).walked[:1], in_this_process()
-    monkeypatch.setattr(campaign.ours, "answered", first_broken)
+    monkeypatch.setattr(campaign.ours, "answer_window", first_broken)
     plan = Plan(("splatnode",), counts=(3,))
 
     def asked() -> int:
@@ -142,7 +142,7 @@ def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
 
 def test_windows_with_a_given_lens_and_without_are_not_mixed(tmp_path, monkeypatch):
     places, on = three_places(tmp_path).walked[:1], in_this_process()
-    monkeypatch.setattr(campaign.ours, "answered", first_broken)
+    monkeypatch.setattr(campaign.ours, "answer_window", first_broken)
     plan, as_it_works = Plan(("splatnode",), per_kind=1, counts=(3,)), []
 
     def noted(take, limits, folder):
@@ -174,7 +174,7 @@ def befallen(place, window, config, fresh, told, known):
 
 
 def test_a_window_that_fails_costs_only_itself(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(campaign.ours, "answered", befallen)
+    monkeypatch.setattr(campaign.ours, "answer_window", befallen)
     plan = Plan(("splatnode",), per_kind=1, counts=(3,), timeout_s=1.5)
     with engine(1, None) as on:
         rows = run_windows(plan, three_places(tmp_path).walked[:1], tmp_path, "command", on)
@@ -204,7 +204,7 @@ def slow(place, window, config, fresh, told, known):
 
 def third_slow_at_first(out: Path, on) -> list[WindowRow]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(campaign.ours, "answered", slow)
+        patch.setattr(campaign.ours, "answer_window", slow)
         plan = Plan(("splatnode",), per_kind=1, counts=(3,))
         return run_windows(plan, three_places(out).walked[:1], out, "command", on)
 
