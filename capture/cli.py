@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import errno
 import json
 import logging
 import math
+import os
 import pkgutil
+import shutil
+import uuid
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib import import_module
+from importlib import import_module, resources
+from pathlib import Path
 
 from splatnode.capture import cameras, daemon
 from splatnode.capture.config import CaptureConfig, camera_opener, is_live
+from splatnode.capture.daemon import last_run
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.last_run import last_run
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config, read_yaml
+from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.logs import use_structured_lines
-from splatnode.capture.process.progress import report_items, show_progress, show_waiting
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.terminal import report_items, say, show_progress, show_waiting
+from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
-from splatnode.capture.status import heartbeats, mark_problems_seen
-from splatnode.capture.status_words import describe_heartbeat
+from splatnode.capture.status import describe_heartbeat, heartbeats, mark_problems_seen
 
 log = logging.getLogger(__name__)
 
@@ -136,3 +142,66 @@ def status(args: argparse.Namespace) -> int:
             say(f"{room}: {answer}")
     heard = {room: bool(fields) for room, fields in found.items()} | ({"capture": True} if ended else {})
     return EXIT_GOOD if all(heard.values()) else EXIT_SILENT
+
+
+# The configurations that come with the package, with systemd's units and udev's rule: listed, or written to a folder.
+#
+# In a checkout they lie in configs/. The first line of each is a comment that says what it is for.
+
+_PATTERNS = ("*.yaml", "systemd/*.service", "udev/*.rules")
+_IS_THERE = {errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR, errno.EBUSY, errno.EINVAL}
+
+
+def config(args: argparse.Namespace) -> int:
+    """Lists the configurations, or with `--write` writes them into a new folder."""
+    contents = examples()
+    if args.write is None:
+        longest = max(map(len, contents))
+        for name, content in contents.items():
+            say(f"{name:{longest}}  {content.decode().splitlines()[0].lstrip('# ')}")
+        say("Write them into a new folder: splatnode config --write configs")
+        return 0
+    write(args.write, contents)
+    for name in contents:
+        say(str(args.write / name))
+    return 0
+
+
+def examples() -> dict[str, bytes]:
+    """The content of each file, by its name in the folder."""
+    with resources.as_file(resources.files("splatnode") / "configs") as folder:
+        paths = [path for pattern in _PATTERNS for path in sorted(folder.glob(pattern))]
+        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def write(folder: Path, contents: dict[str, bytes]) -> None:
+    """Makes `folder` with all files in it, or leaves nothing.
+
+    Raises ValueError where there is something already, which stays as it is, and OSError. A process that is killed may
+    leave its unfinished folder, `.NAME.*.tmp`, beside it.
+    """
+    staged = folder.with_name(f".{folder.name}.{uuid.uuid4().hex[:8]}.tmp") if folder.name else folder
+    try:
+        with make_folder(folder.parent), contextlib.ExitStack() as failing:
+            staged.mkdir()
+            failing.callback(shutil.rmtree, staged, ignore_errors=True)
+            for name, content in contents.items():
+                _write(staged / name, content)
+            os.rename(staged, folder)  # takes the place of an empty folder, and of nothing else
+            failing.pop_all()
+            sync_folder(folder.parent)
+    except OSError as error:
+        if error.errno in _IS_THERE and os.path.lexists(folder):
+            raise ValueError(
+                f"{sanitize_text(folder)} is there already, and nothing was written. Name a folder that is new or empty"
+            ) from error
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+
+
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    with path.open("xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    sync_folder(path.parent)

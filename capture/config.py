@@ -5,17 +5,67 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
-from splatnode.capture import preview, reader, selection
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture import keyframe_selection, reader
+from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image
 from splatnode.capture.masks import mask_frames, open_single_mask
 from splatnode.capture.messaging import spool
+from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.nothing_new import KeepAlive
+from splatnode.capture.messaging.wire import Header, Message, Name, Numbering, Sequential, Text, WireError
 from splatnode.capture.process.config import Plugin
+from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.quality import Limits
+
+# Previews: small JPEG images of what the camera sees now. Some may be lost on the way.
+
+_LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gigabytes
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
+    # At least so many, pixels; less than twice as many, since images are reduced by whole factors
+    longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75  # of the JPEG: 100 is best and largest
+
+
+class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The only array is a JPEG file."""
+
+    name: Name
+    stamp_ns: Sequential
+    state: Name  # of the camera: reader.State
+    taken: bool  # it became a keyframe
+    reason: Text  # why, or why not
+    captured_at: Stamp | None = None
+
+
+def encode_preview(
+    frame: Frame, numbering: Numbering, config: Config, *, state: str, taken: bool, reason: str
+) -> tuple[PreviewHeader, list[npt.NDArray[np.uint8]]]:
+    jpeg = make_jpeg_array(reduce_image(frame.image, config.longer_side), config.jpeg_quality)
+    header = PreviewHeader(
+        **numbering.next(),
+        name=frame.name,
+        stamp_ns=frame.stamp_ns,
+        state=state,
+        taken=taken,
+        reason=sanitize_text(reason),
+        captured_at=frame.captured_at,
+    )
+    return header, [jpeg]
+
+
+def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) RGB. Raises WireError where the message holds no JPEG."""
+    if len(message.arrays) != 1:
+        raise WireError(f"a preview has one JPEG, got {len(message.arrays)} arrays")
+    return decode_jpeg(message.arrays[0], _LARGEST_SIDE)
 
 
 class Camera(Plugin):
@@ -27,10 +77,10 @@ class Camera(Plugin):
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: Camera  # where frames come from: the kinds have options of their own, below
     quality: Limits = Limits()  # which frames are usable, and no copies
-    selection: selection.Config = selection.Config()
+    selection: keyframe_selection.Config = keyframe_selection.Config()
     reader: reader.Config = reader.Config()
-    preview: preview.Config = preview.Config()
-    spool: spool.Config = spool.Config()
+    preview: Config = Config()
+    spool: spool.SpoolConfig = spool.SpoolConfig()
     network: Network = Network()  # how the processes reach each other
     # An image of the camera's size: black is never used, as where the camera sees the robot itself; white is used
     body_mask: Path | None = None

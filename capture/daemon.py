@@ -2,38 +2,99 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
 
 import cv2
+import msgspec
 
-from splatnode.capture.config import CaptureConfig, camera_opener, is_live
+from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.last_run import begin_run, end_run
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.commands import Answer, CommandServer, MarkProblemsSeen
-from splatnode.capture.messaging.keyframes import KeyframeServer
-from splatnode.capture.messaging.network import files_for_strangers
-from splatnode.capture.messaging.services import CAPTURE_CONTROL, CAPTURE_PREVIEW, CAPTURE_STATUS
+from splatnode.capture.keyframe_selection import Decision, Selector
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.network import (
+    CAPTURE_CONTROL,
+    CAPTURE_PREVIEW,
+    CAPTURE_STATUS,
+    Network,
+    files_for_strangers,
+    runtime_directory,
+)
+from splatnode.capture.messaging.pubsub import Answer, CommandServer, MarkProblemsSeen, Publisher
 from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
-from splatnode.capture.preview import encode_preview
-from splatnode.capture.process.after_ready import wrap_late_errors
-from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
-from splatnode.capture.process.logs import event
-from splatnode.capture.process.memory import keep_freed, resident_mb
-from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage, raise_shortage
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.capture.process.problems import Problems, is_logged
-from splatnode.capture.process.service_manager import ServiceManager
+from splatnode.capture.process.files import StrayFile, create_own, read_own
+from splatnode.capture.process.logs import Problems, event, is_logged
+from splatnode.capture.process.records import record_in
+from splatnode.capture.process.system import (
+    SHORT_OF_MEMORY,
+    ServiceManager,
+    is_shortage,
+    keep_freed,
+    make_sure_of_room,
+    raise_file_limit,
+    raise_shortage,
+    resident_mb,
+    wrap_late_errors,
+)
+from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.process.unfailing import Unfailing
 from splatnode.capture.reader import Reader, ReaderState
-from splatnode.capture.selection import Decision, Selector
 from splatnode.capture.status import HEARTBEAT_S, NAMED, CaptureStatus
+
+# How capture ended: kept where its sockets were, so that `splatnode status` tells an end from a silence.
+
+Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
+
+_FILE = "capture.finished"
+_MOST_BYTES = 1000
+
+
+class LastRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A recording that capture read to its end, and whose keyframes recon has answered."""
+
+    frames: Number
+    keyframes: Number
+    at_s: Annotated[float, msgspec.Meta(ge=0, le=1e11)]  # of time.time()
+
+    def __str__(self) -> str:
+        """`finished at 16:35:44: recon has answered all of its 25 keyframes (of 40 frames)`."""
+        clock = time.strftime("%H:%M:%S", time.localtime(self.at_s))
+        return (
+            f"finished at {clock}: recon has answered all of its {self.keyframes} keyframes (of {self.frames} frames)"
+        )
+
+
+def begin_run(network: Network) -> None:
+    """Forgets the last run: another one has begun. Raises NetworkError, OSError."""
+    _path(network).unlink(missing_ok=True)
+
+
+def end_run(network: Network, frames: int, keyframes: int) -> None:
+    """Keeps that the recording has ended now. Raises NetworkError, OSError."""
+    path = _path(network)
+    path.unlink(missing_ok=True)
+    with open(create_own(path), "wb") as file:
+        file.write(msgspec.json.encode(LastRun(frames, keyframes, time.time())))
+
+
+def last_run(network: Network) -> LastRun | None:
+    """How capture ended on this machine; None where that is not known, or it was stopped. Raises NetworkError."""
+    with contextlib.suppress(OSError, StrayFile, msgspec.MsgspecError):
+        return record_in(read_own(_path(network), _MOST_BYTES), LastRun)
+    return None
+
+
+def _path(network: Network) -> Path:
+    return runtime_directory(network) / _FILE
+
 
 log = logging.getLogger(__name__)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator, Mapping
+from datetime import datetime, timedelta, timezone
+from pathlib import PurePath
 
-from splatnode.capture.exposure_settings import ExposureSettings, parse_exposure
-from splatnode.capture.frame import Intrinsics
+from splatnode.capture.frame import Clock, ExposureSettings, Intrinsics, Stamp, parse_exposure
 
 IMAGE_WIDTH, IMAGE_LENGTH = 0x0100, 0x0101
 EXIF_IFD = 0x8769
@@ -160,3 +162,99 @@ def first(tags: Tags, tag: int) -> float | None:
     """The tag's first value; None where it is absent or says "unknown" (zero, negative, 0/0)."""
     value = tags.get(tag, (0.0,))[0]
     return float(value) if value > 0 and math.isfinite(value) else None
+
+
+# When a photograph was taken, as its EXIF tells (EXIF 2.32, 4.6.5).
+
+DATE_TIME_ORIGINAL, SUB_SECONDS_ORIGINAL, OFFSET_ORIGINAL = 0x9003, 0x9291, 0x9011
+
+_DATE_TIME = re.compile(r"([0-9]{4})[:-]([0-9]{2})[:-]([0-9]{2})[ T]([0-9]{2}):([0-9]{2}):([0-9]{2})")
+_DIGITS = re.compile(r"[0-9]+")
+_OFFSET = re.compile(r"([+-])([0-9]{2}):?([0-5][0-9])")
+_WIDEST_OFFSET = timedelta(hours=15)  # between UTC and a time zone; the farthest is 14
+_1970 = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+
+def exif_time(tiff: bytes) -> Stamp | None:
+    """The time of exposure, from bytes that begin with a TIFF header; None where they do not tell it.
+
+    It is in UTC where the camera states its time zone. Of the sub-seconds, nine digits count.
+    """
+    texts = read_texts(tiff)
+    shown = _DATE_TIME.fullmatch(texts.get(DATE_TIME_ORIGINAL, "").strip())
+    if shown is None:
+        return None
+    offset = _offset(texts.get(OFFSET_ORIGINAL, "").strip())
+    try:
+        since = datetime(*map(int, shown.groups()), tzinfo=timezone.utc) - _1970 - (offset or timedelta())
+    except ValueError:  # a day or an hour that is none: a camera whose clock was never set writes zeros
+        return None
+    ns = since // timedelta(seconds=1) * 10**9 + _sub_seconds_ns(texts.get(SUB_SECONDS_ORIGINAL, "").strip())
+    return Stamp(ns, Clock.LOCAL if offset is None else Clock.UTC) if ns >= 0 else None
+
+
+def _sub_seconds_ns(text: str) -> int:
+    """The decimal digits after the full second, as nanoseconds; 0 where they are none."""
+    return int(text[:9].ljust(9, "0")) if _DIGITS.fullmatch(text) else 0
+
+
+def _offset(text: str) -> timedelta | None:
+    """Parses the offset of the camera's time zone from UTC; None where the camera does not state it."""
+    found = _OFFSET.fullmatch(text)
+    if found is None:
+        return None
+    sign, hours, minutes = found.groups()
+    offset = timedelta(hours=int(hours), minutes=int(minutes))
+    if offset > _WIDEST_OFFSET:
+        return None
+    return -offset if sign == "-" else offset
+
+
+# When a photograph was taken, as its file's name tells: `1341847980.722988.png`, `IMG_20240131_154501.jpg`.
+#
+# Robots name images by seconds, milli-, micro- or nanoseconds since 1970, telephones by date and time.
+
+_NS = 10**9
+# Seconds since 1970 with a fraction; without a point the number of digits tells the unit. From 2001 to 2033 they begin
+# with 1, dates of this century with 2: no number can be read as both.
+_SECONDS = re.compile(r"(?<![0-9])(1[0-9]{9})(?:\.([0-9]{1,9})|([0-9]{3}|[0-9]{6}|[0-9]{9}))(?![0-9])")
+# A fraction of the second has three, six or nine digits.
+_NAME_TIME_DATE_TIME = re.compile(
+    r"(?<![0-9])(20[0-9]{2})([-_.:]?)([0-9]{2})\2([0-9]{2})(?:[-_.T ]| at )?([0-9]{2})([-_.:]?)([0-9]{2})\6([0-9]{2})"
+    r"(?:[.,]?([0-9]{3}|[0-9]{6}|[0-9]{9}))?(?![0-9])(Z?)(?!\s?[ap]\.?m)",
+    re.IGNORECASE,
+)
+_DIGIT = re.compile("[0-9]")
+
+
+def name_time(name: str) -> Stamp | None:
+    """The time in a file's name; None where it has none, or where the name can be read in two ways.
+
+    It is in UTC where it is counted from 1970, or ends with Z; a date and a time without a zone are of a clock whose
+    zone is not known. A name has one time, and no number behind it: then the time may be that of a whole sequence.
+    """
+    stem = PurePath(name).stem
+    found = [*_SECONDS.finditer(stem), *_NAME_TIME_DATE_TIME.finditer(stem)]
+    if len(found) != 1 or _DIGIT.search(stem, found[0].end()):
+        return None
+    return _parse_unix_time(found[0]) if found[0].re is _SECONDS else _parse_date(found[0])
+
+
+def _parse_unix_time(found: re.Match[str]) -> Stamp:
+    seconds, fraction, digits = found.groups()
+    return Stamp(int(seconds) * _NS + _fraction_ns(fraction or digits), Clock.UTC)
+
+
+def _parse_date(found: re.Match[str]) -> Stamp | None:
+    year, _, month, day, hour, _, minute, second, fraction, zone = found.groups()
+    try:
+        shown = datetime(*map(int, (year, month, day, hour, minute, second)), tzinfo=timezone.utc)
+    except ValueError:  # a day or an hour that is none: the number is something else
+        return None
+    ns = (shown - _1970) // timedelta(seconds=1) * _NS + _fraction_ns(fraction or "")
+    return Stamp(ns, Clock.UTC if zone else Clock.LOCAL)
+
+
+def _fraction_ns(digits: str) -> int:
+    """Decimal digits of a second, at most nine, as nanoseconds."""
+    return int(digits.ljust(9, "0"))

@@ -17,7 +17,7 @@ from urllib.parse import quote, unquote
 from splatnode.capture.cameras import lerobot, mcap, video
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lerobot.data_set import is_data_set
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.text import sanitize_text
 
 MCAP = ".mcap"
 _MODULES = {"mcap": mcap, "lerobot": lerobot, "video": video}
@@ -84,7 +84,8 @@ def _parse_seconds(file: Path, part: str) -> dict[str, float]:
     span = {name: float(text) for name, text in told.items() if text}
     if not span or span.get("from_s", 0.0) >= span.get("to_s", math.inf):
         raise ValueError(
-            f"{sanitize_text(str(file))!r}: behind the # must be seconds of the video, the first before the last, such as "
+            f"{sanitize_text(str(file))!r}: behind the # must be seconds of the video, the first before the last, "
+            "such as "
             f"#t=10,20.5, #t=10 or #t=,20.5; got {sanitize_text(part, 100)!r}. Of an MCAP file it is a topic"
         )
     return span

@@ -3,19 +3,184 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Annotated, TypeVar
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import UNSET, UnsetType
 
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.gravity import Gravity
-from splatnode.capture.motion import Motion
-from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, sanitize_text
-from splatnode.capture.right_image import RightImage
-from splatnode.capture.stamp import Stamp
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
+
+# What a stereo camera's right half saw at the moment of a frame: the source of metres that a robot carries with it.
+
+LONGEST_M = 100.0  # between two cameras that see one thing
+SIGMA_M = 0.0003  # standard deviation of a baseline where nobody tells any
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """How far apart the two cameras of a stereo camera are. Raises ValueError for what no stereo camera has."""
+
+    metres: float
+    sigma_m: float = SIGMA_M  # standard deviation, metres
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.metres) and 0 < self.metres <= LONGEST_M):
+            raise ValueError(f"a baseline must be above 0, up to {LONGEST_M:g} m, got {self.metres:g}")
+        if not (math.isfinite(self.sigma_m) and 0 <= self.sigma_m < 0.5 * self.metres):
+            raise ValueError(
+                f"the sigma of a baseline must be at least 0 and less than half of it, got {self.sigma_m:g} m "
+                f"for {self.metres:g} m"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class RightImage:
+    """The right picture of a rectified pair: its camera has the left one's axes and lens, and stands right of it."""
+
+    image: npt.NDArray[np.uint8]  # (H, W) grey, of the frame's size
+    baseline: Baseline
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 2 or self.image.dtype != np.uint8:
+            raise ValueError(f"a right image must be (H, W) uint8, got {self.image.shape} {self.image.dtype}")
+
+
+def partners(lefts: Sequence[str], rights: Sequence[str]) -> dict[str, str]:
+    """The name of the right photograph of each left one that has one: both have one name, whatever their suffixes.
+
+    Raises ValueError where none has a partner.
+    """
+    right_of = {_stem(name): name for name in rights}
+    found = {name: right_of[_stem(name)] for name in lefts if _stem(name) in right_of}
+    if not found:
+        first = sanitize_text(lefts[0] if lefts else "none", 100)
+        raise ValueError(f"no right photograph has the name of a left one, such as {first}; name both of a pair alike")
+    return found
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0] or name
+
+
+def grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """(H, W) of an image (H, W, 3) RGB or (H, W), as a RightImage has it."""
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+
+
+# How a camera says that it exposed a frame: for how long, at which sensitivity, through which aperture.
+
+_TIMES_S = (1e-7, 1e5)  # from the fastest flash to a night's stars
+_ISOS = (1.0, 1e7)
+_F_NUMBERS = (0.1, 1000.0)  # up to a pinhole's
+
+
+@dataclass(frozen=True)
+class ExposureSettings:
+    """A camera's settings of one exposure. Raises ValueError where no camera could have them."""
+
+    time_s: float  # seconds for which light was gathered
+    iso: float  # sensitivity, as an ISO speed: 200 is twice as sensitive as 100
+    f_number: float | None = None  # focal length over aperture; None: nobody knows, as of a lens without an iris
+
+    def __post_init__(self) -> None:
+        for what, number, (least, most), unit in (
+            ("time", self.time_s, _TIMES_S, " seconds"),
+            ("sensitivity", self.iso, _ISOS, " ISO"),
+            ("f-number", self.f_number, _F_NUMBERS, ""),
+        ):
+            if number is not None and not least <= number <= most:
+                raise ValueError(f"the {what} of an exposure must be {least:g} to {most:g}{unit}, got {number:g}")
+
+    @property
+    def log_exposure(self) -> float:
+        """Natural logarithm of how bright a surface was recorded, against other frames of the same camera."""
+        aperture = 1.0 if self.f_number is None else self.f_number
+        return math.log(self.time_s * self.iso / 100.0 / aperture**2)
+
+
+def parse_exposure(time_s: float | None, iso: float | None, f_number: float | None = None) -> ExposureSettings | None:
+    """The settings that a camera or a file tells; None where it tells too little, or what cannot be, as 0 often is.
+
+    An f-number that cannot be is left out alone.
+    """
+    if time_s is None or iso is None:
+        return None
+    if f_number is not None and not _F_NUMBERS[0] <= f_number <= _F_NUMBERS[1]:
+        f_number = None
+    try:
+        return ExposureSettings(float(time_s), float(iso), f_number)
+    except ValueError:  # it is a hint, which a frame may lack
+        return None
+
+
+# When an image was captured: a time, and the clock that it was read from.
+
+LARGEST_NS = 2**62  # 146 years
+_NS = 10**9
+_READINGS = 5  # of both clocks, of which the one that was disturbed least counts
+
+
+class Clock(Enum):
+    """The clock that a time is read from. Times of two clocks cannot be compared."""
+
+    UTC = "utc"
+    LOCAL = "local"
+    FILE = "file"
+    RECORDING = "recording"
+
+    @property
+    def meaning(self) -> str:
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Clock.UTC: "since 1970, UTC",
+    Clock.LOCAL: "since 1970 by the camera's date and time, whose time zone is not known",
+    Clock.FILE: "since 1970, UTC, when the file was last written",
+    Clock.RECORDING: "since the recording, or its simulation, began",
+}
+
+
+@dataclass(frozen=True)
+class Stamp:
+    """A time of capture. Raises ValueError where it is before its clock's zero, or beyond LARGEST_NS."""
+
+    ns: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NS)]  # nanoseconds
+    clock: Clock  # what they are counted from: UTC, LOCAL, FILE or RECORDING
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ns <= LARGEST_NS:
+            raise ValueError(f"a time stamp must be 0 to 2**62 ns, got {self.ns}")
+
+    @property
+    def seconds(self) -> str:
+        """In decimal digits, none of which is lost."""
+        return f"{self.ns // _NS}.{self.ns % _NS:09d}"
+
+
+def nearest_stamp(ns: int, clock: Clock) -> Stamp:
+    """The stamp of `ns`, which may be anything: a clock may be set to any year, and a file's time, too."""
+    return Stamp(min(max(0, ns), LARGEST_NS), clock)
+
+
+def wall_clock(mono_ns: int) -> Stamp:
+    """Converts a time of this machine's monotonic clock to the wall clock, if nobody has set it since."""
+    return nearest_stamp(mono_ns + min(_reading() for _ in range(_READINGS))[1], Clock.UTC)
+
+
+def _reading() -> tuple[int, int]:
+    """How long it took to read both clocks, and how far the wall clock is ahead of the monotonic one, nanoseconds."""
+    before, wall, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+    return after - before, wall - (before + after) // 2
+
 
 LARGEST_NUMBER = 2**62  # of ids and stamps
 LARGEST_SIDE = 65_535  # pixels, as of a JPEG
@@ -82,7 +247,9 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a stream, within bounds that hold for all that is made of it: `make_frame` where they may not hold."""
+    """One image of a stream, within bounds that hold for all that is made of it: `make_frame` where they may not
+    hold.
+    """
 
     frame_id: int  # position in its stream, from 0
     name: str  # printable, unique in its stream; for a file, its name as `printable_name` writes it
@@ -183,3 +350,35 @@ def rename_frame(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame
     known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
     came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure, frame.camera
     return make_frame(frame_id, name, stamp_ns, *known, *came)
+
+
+# Fields of records that are left out where there is nothing: a reader that does not know them reads the rest.
+
+T = TypeVar("T")
+
+
+def make_optional_field(value: T | None) -> T | UnsetType:
+    """The value as a field; left out where it is None."""
+    return UNSET if value is None else value
+
+
+def read_optional_field(field: T | UnsetType) -> T | None:
+    """The value of a field; None where it was left out."""
+    return None if isinstance(field, UnsetType) else field
+
+
+# What a camera that may have no frame for long gives in place of one: it is there, and has nothing new.
+
+
+@dataclass(frozen=True)
+class KeepAlive:
+    """A loss is over with it as with a frame. Nobody but the reader gets it (capture/reader.py)."""
+
+
+# The error that every camera raises when it cannot be used.
+
+
+class CameraUnavailable(RuntimeError):
+    """No camera, or no longer: what was expected, what was found, what to do."""
+
+    exit_code = 69

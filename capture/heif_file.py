@@ -17,7 +17,7 @@ import numpy.typing as npt
 from splatnode.capture.image_header import MAX_SIDE, UnusableImage
 from splatnode.capture.pi_heif import HEADER
 from splatnode.capture.process import python
-from splatnode.capture.process.packages import remedy
+from splatnode.capture.process.system import remedy
 
 SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
 _BRANDS = {b"heic", b"heix", b"heim", b"heis", b"mif1", b"mif2", b"miaf", b"avif"}  # of still images

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -18,22 +19,110 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import exif, heif_file, jpeg2000
-from splatnode.capture.exif_time import exif_time
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import Intrinsics
+from splatnode.capture import exif, heif_file, image_header
+from splatnode.capture.exif import exif_time
+from splatnode.capture.frame import ExposureSettings, Intrinsics, Stamp
 from splatnode.capture.image_header import ImageHeader, UnusableImage, read_header
-from splatnode.capture.orientation import ON_ITS_SIDE, ORIENTATION, upright
-from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.stamp import Stamp
-from splatnode.capture.value_range import Extent, ValueRange, convert_to_eight_bits, find_range, measure_extent
+from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.system import outlast
+from splatnode.capture.process.text import guard_untrusted
+
+# How a photograph was turned when it was taken, as EXIF tells, undone.
+
+ORIENTATION = 0x0112  # of EXIF
+# By what EXIF says, quarters of a turn to the left, and whether it is mirrored then.
+_TURNS = {
+    1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (3, True), 6: (3, False), 7: (1, True), 8: (1, False),
+}  # fmt: skip
+ON_ITS_SIDE = tuple(orientation for orientation, (quarters, _) in _TURNS.items() if quarters % 2)
+
+
+def upright(image: npt.NDArray, orientation: int) -> npt.NDArray:
+    """The image (H, W) or (H, W, C) turned as EXIF says; `orientation` is 1 to 8."""
+    quarters, mirrored = _TURNS.get(orientation, _TURNS[1])
+    turned = np.rot90(image, quarters)
+    return turned[:, ::-1] if mirrored else turned
+
+
+# Images of 16 bits a channel: which of their values are used, and how these become 8 bits, alike for all of a set.
+#
+# A sensor of 10, 12 or 14 bits fills the lower bits of 16, a thermal camera a narrow band of them. The upper 8 bits of
+# such images are nearly black, so the used range is stretched. It is one range for all images of a set: their
+# brightness stays comparable.
+
+Deep = npt.NDArray[np.uint16]
+
+FULL = 65_535
+MAX_STRETCHED_BITS = 14  # with 15 or 16 used bits, the upper 8 serve
+MAX_BAND = 1 << MAX_STRETCHED_BITS  # width of a band of values that is stretched
+MIN_BAND_RATIO = 0.25  # darkest over brightest value, from which on the values lie in a band; else they begin at 0
+BAND_MARGIN = 0.05  # of a band's width, on both sides
+_OUTLIERS_PERCENT = 0.01  # of the values at both ends: dead and hot pixels
+_MAX_SAMPLES = 1_000_000  # values of an image that are looked at
+
+
+@dataclass(frozen=True)
+class Extent:
+    """The darkest and the brightest value of images, without outliers."""
+
+    low: int
+    high: int
+
+
+@dataclass(frozen=True)
+class ValueRange:
+    """The values that become 0 and 255."""
+
+    low: int
+    high: int
+
+    def __str__(self) -> str:
+        if self.low == 0:
+            return f"{self.high.bit_length()} of 16 bits"
+        return f"the values {self.low} to {self.high} of 16 bits"
+
+
+def measure_extent(values: Deep) -> Extent:
+    """Measures the extent of the values of an image (H, W) or (H, W, C)."""
+    step = max(1, round((values.size / _MAX_SAMPLES) ** 0.5))
+    some = values[::step, ::step]
+    low, high = np.percentile(some, [_OUTLIERS_PERCENT, 100 - _OUTLIERS_PERCENT], method="nearest")
+    return Extent(int(low), int(high))
+
+
+def find_range(extents: Iterable[Extent]) -> ValueRange | None:
+    """Finds the range that images of these extents share; None without images, or where the upper 8 bits show it."""
+    known = list(extents)
+    if not known:
+        return None
+    low, high = min(extent.low for extent in known), max(extent.high for extent in known)
+    if low >= MIN_BAND_RATIO * high and 0 < high - low < MAX_BAND:
+        margin = round(BAND_MARGIN * (high - low)) + 1
+        return ValueRange(max(0, low - margin), min(FULL, high + margin))
+    bits = max(8, high.bit_length())
+    return ValueRange(0, (1 << bits) - 1) if bits <= MAX_STRETCHED_BITS else None
+
+
+def convert_to_eight_bits(values: Deep, used: ValueRange | None) -> npt.NDArray[np.uint8]:
+    """The image with `used` stretched to 0 to 255; None: the upper 8 bits."""
+    if used is None:
+        return (values >> 8).astype(np.uint8)
+    level = np.clip((np.arange(FULL + 1) - used.low) / (used.high - used.low), 0.0, 1.0)
+    return np.floor(255.999 * level).astype(np.uint8)[values]
+
 
 # Of what can be decoded, HEIC and AVIF with the extra heic.
 _JPEG_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".mpo"}
 _MAYBE_DEEP_SUFFIXES = {".png", ".tif", ".tiff", ".ppm", ".pgm", ".pnm"}  # which may have 16 bits a channel
-SUFFIXES = {*_JPEG_SUFFIXES, *_MAYBE_DEEP_SUFFIXES, ".bmp", ".dib", ".webp", *jpeg2000.SUFFIXES, *heif_file.SUFFIXES}
+SUFFIXES = {
+    *_JPEG_SUFFIXES,
+    *_MAYBE_DEEP_SUFFIXES,
+    ".bmp",
+    ".dib",
+    ".webp",
+    *image_header.SUFFIXES,
+    *heif_file.SUFFIXES,
+}
 _MAX_MEASURED = 30  # files of a set whose values are looked at before the first is decoded
 MAX_PIXELS = 100_000_000  # of an image, unless another limit is given
 MaxPixels = Annotated[int, msgspec.Meta(ge=1, le=1 << 30)]  # of a configuration; OpenCV decodes no more
@@ -68,8 +157,8 @@ def decode_any_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange
     """
     if heif_file.is_heif(data):
         return _attach_exif(*heif_file.decode(data, max_pixels))
-    if jpeg2000.is_jpeg2000(data):
-        return _attach_exif(jpeg2000.decode(data, max_pixels), b"")
+    if image_header.is_jpeg2000(data):
+        return _attach_exif(image_header.decode(data, max_pixels), b"")
     return decode_image(data, max_pixels, used)
 
 
@@ -77,15 +166,15 @@ def check_whole(data: bytes) -> None:
     """Raises UnusableImage where an image file is not complete, or is none."""
     if heif_file.is_heif(data):
         heif_file.check_whole(data)
-    elif jpeg2000.is_jpeg2000(data):
-        jpeg2000.check_whole(data)
+    elif image_header.is_jpeg2000(data):
+        image_header.check_whole(data)
     else:
         read_header(data)
 
 
 def upright_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that an image file is decoded to; None where only decoding it tells. Raises UnusableImage."""
-    if heif_file.is_heif(data) or jpeg2000.is_jpeg2000(data):
+    if heif_file.is_heif(data) or image_header.is_jpeg2000(data):
         return None
     header = read_header(data)
     turned = (exif.first(exif.read_tags(header.exif), ORIENTATION) or 1) in ON_ITS_SIDE

@@ -6,20 +6,116 @@ Sources of the formats: COLMAP's page on its output (text), Kalibr's wiki on its
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
 
-from splatnode.capture.colmap_images import binary_images, text_images
-from splatnode.capture.frame import Intrinsics
-from splatnode.capture.given_lens import ALL, Lenses
-from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.pose_files import binary_images, text_images
+from splatnode.capture.process.config import MAX_BYTES, ConfigError, parse_yaml
+from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_of
+from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
+
+# Lenses that are given: of which images each of them can be, and what is said where it is of none.
+
+ALL = "*"  # the key of a lens that is of all images
+_AFTER_CAMERA = "/_-. "  # what may follow the name of a camera in the name of an image
+
+
+@dataclass(frozen=True)
+class Lenses:
+    """Lenses by the images that they took.
+
+    A key is the name of an image, with or without its suffix; the name of a camera, as `Frame.camera` has it or with
+    which the names of its images begin (`left` for left/0001.png and left_0001.png); or a pattern, such as `left*.png`.
+    The first kind of key that an image matches counts, in this order.
+    """
+
+    by_key: Mapping[str, Intrinsics]
+
+    def find_key(self, name: str, camera: str = "") -> str | None:
+        """Returns the key of the lens of an image; None where no lens is of it."""
+        return find_key(self.by_key, name, camera)
+
+    def apply(self, each: Any) -> Any:
+        """Returns the frame with its lens; as it is where no lens is of it, or one of another aspect ratio.
+
+        Where lenses differ, the key becomes the frame's camera: images of different cameras share no lens.
+        """
+        if not isinstance(each, Frame) or (key := self.find_key(each.name, each.camera)) is None:
+            return each
+        lens = self.by_key[key]
+        seen = assign_lens(each, lens)
+        if seen is each or len(set(self.by_key.values())) == 1:
+            return seen
+        first = next(other for other, known in self.by_key.items() if known == lens)
+        return replace(seen, camera=sanitize_text(first, LONGEST_NAME))
+
+    def check(self, images: Iterable[tuple[str, str, int, int]]) -> None:
+        """Raises ValueError where a lens is of no image, or of none of its aspect ratio.
+
+        `images` are names, cameras, widths and heights of all that there are.
+        """
+        sizes: dict[str, set[tuple[int, int]]] = {key: set() for key in self.by_key}
+        names = []
+        for name, camera, width, height in images:
+            names.append(name)
+            if (key := self.find_key(name, camera)) is not None:
+                sizes[key].add((width, height))
+        for key, found in sizes.items():
+            if found:
+                check_fits(self.by_key[key], found)
+            elif names:
+                raise ValueError(
+                    f"intrinsics has a lens of {sanitize_text(key, 100)!r}, which is no photograph's: they are called "
+                    f"{sanitize_text(min(names), 100)} to {sanitize_text(max(names), 100)}. Name a photograph, a "
+                    "camera with "
+                    "which names begin, or a pattern such as left*.png"
+                )
+
+
+def find_key(keys: Collection[str], name: str, camera: str = "") -> str | None:
+    """Returns which of the keys an image with this name, of this camera, matches; None: none. See `Lenses`."""
+    for exact in (name, name.rpartition(".")[0], PurePosixPath(name).name, camera):
+        if exact and exact in keys:
+            return exact
+    begins = (key for key in keys if key and name.startswith(key) and name[len(key) : len(key) + 1] in _AFTER_CAMERA)
+    patterns = (key for key in keys if fnmatchcase(name, key))
+    return next(begins, None) or next(patterns, None)
+
+
+def describe_image(frame: Frame) -> tuple[str, str, int, int]:
+    """Returns what `Lenses.check` asks of an image: name, camera, width and height."""
+    return frame.name, frame.camera, frame.width, frame.height
+
+
+def same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
+    """Whether an image of this size can be one of the camera's, resized."""
+    return abs(intrinsics.width * height - intrinsics.height * width) <= max(width, height)
+
+
+def assign_lens(each: Any, known: Intrinsics) -> Any:
+    """The frame with this lens, if it can be one of its images."""
+    if not isinstance(each, Frame) or not same_aspect(known, each.width, each.height):
+        return each
+    return replace(each, intrinsics=known.resized(each.width, each.height))
+
+
+def check_fits(known: Intrinsics, sizes: Collection[tuple[int, int]]) -> None:
+    """Raises ValueError where there are photographs, of these sizes, and the lens can be of none of them."""
+    if sizes and not any(same_aspect(known, *size) for size in sizes):
+        shown = ", ".join(f"{width} x {height}" for width, height in sorted(set(sizes)))
+        raise ValueError(
+            f"intrinsics must be of images of the photographs' aspect ratio, got those of {known.width} x "
+            f"{known.height} for {shown}. Give the size of the images that were calibrated, or photographs of its "
+            "aspect ratio"
+        )
+
 
 # What each of COLMAP's models holds, in its order. f is fx and fy.
 _COLMAP = {
@@ -47,7 +143,8 @@ def read_lens(path: Path) -> Intrinsics:
     lenses = read_lenses(path).by_key
     if len(lenses) > 1:
         raise UnusableLens(
-            f"{sanitize_text(str(path))} must be of one camera here, it has {', '.join(map(sanitize_text, list(lenses)[:5]))}; "
+            f"{sanitize_text(str(path))} must be of one camera here, it has "
+            f"{', '.join(map(sanitize_text, list(lenses)[:5]))}; "
             "leave the one that took the photographs"
         )
     return next(iter(lenses.values()))
@@ -174,8 +271,10 @@ def _parse_kalibr(shown: str, name: object, given: Mapping[str, Any]) -> Intrins
     projection, bending = given["camera_model"], given.get("distortion_model", "none")
     if projection != "pinhole" or str(bending) not in _KALIBR:
         raise UnusableLens(
-            f"{shown}: {sanitize_text(name)} must have camera_model pinhole and distortion_model {', '.join(_KALIBR)}, got "
-            f"{sanitize_text(projection, 40)} and {sanitize_text(bending, 40)}; calibrate with pinhole-radtan or pinhole-equi"
+            f"{shown}: {sanitize_text(name)} must have camera_model pinhole and distortion_model "
+            f"{', '.join(_KALIBR)}, got "
+            f"{sanitize_text(projection, 40)} and {sanitize_text(bending, 40)}; calibrate with pinhole-radtan or "
+            "pinhole-equi"
         )
     try:
         width, height = (int(side) for side in given["resolution"])

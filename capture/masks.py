@@ -17,12 +17,17 @@ import numpy.typing as npt
 
 from splatnode.capture import exif
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_any_image, read_image_file
+from splatnode.capture.image_file import (
+    ORIENTATION,
+    SUFFIXES,
+    UnusableImage,
+    decode_any_image,
+    read_image_file,
+    upright,
+)
 from splatnode.capture.image_header import read_header
-from splatnode.capture.orientation import ORIENTATION, upright
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.printable import sanitize_name
+from splatnode.capture.process.system import outlast
+from splatnode.capture.process.text import guard_untrusted, sanitize_name
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]  # (H, W), True where the photograph is used

@@ -14,9 +14,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.nothing_new import KeepAlive
-from splatnode.capture.unavailable import CameraUnavailable
+from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, KeepAlive
 
 log = logging.getLogger(__name__)
 

@@ -20,21 +20,25 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
-from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.gravity import Gravity
+from splatnode.capture.frame import (
+    Baseline,
+    DroppedFrame,
+    ExposureSettings,
+    Frame,
+    Intrinsics,
+    RightImage,
+    Stamp,
+    grey,
+    make_frame,
+    make_optional_field,
+    read_optional_field,
+)
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
-from splatnode.capture.left_out import make_optional_field, read_optional_field
-from splatnode.capture.motion import Motion
-from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.printable import LONGEST_NAME, digest_name, is_printable, sanitize_text
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.process.files import read_bounded, sync_folder
 from splatnode.capture.process.records import record_in
-from splatnode.capture.right_image import Baseline, RightImage, grey
-from splatnode.capture.stamp import Stamp
+from splatnode.capture.process.system import outlast
+from splatnode.capture.process.text import LONGEST_NAME, digest_name, guard_untrusted, is_printable, sanitize_text
 
 log = logging.getLogger(__name__)
 

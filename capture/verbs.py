@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.calibration.verb import CALIBRATE
-from splatnode.capture.process.arguments import add_json, natural, positive, seconds
-from splatnode.capture.process.lengths import metres_argument
-from splatnode.capture.process.verb import Verb, import_lazily
+from splatnode.capture.process.arguments import Verb, add_json, import_lazily, natural, positive, seconds
+from splatnode.capture.process.text import metres_argument
 
 
 def _camera_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +77,7 @@ VERBS = (
         "config",
         "list the example configurations, or write them into a folder",
         _config_arguments,
-        import_lazily("splatnode.capture.examples", "config"),
+        import_lazily("splatnode.capture.cli", "config"),
     ),
     CALIBRATE,
     Verb("find", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")),
@@ -92,7 +91,7 @@ VERBS = (
         "marker",
         "write markers of known size as a PDF to print: in a scene, they give it metres",
         _marker_arguments,
-        import_lazily("splatnode.capture.calibration.marker_page", "command"),
+        import_lazily("splatnode.capture.calibration.board", "command"),
     ),
     Verb(
         "status",

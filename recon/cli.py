@@ -15,45 +15,42 @@ from pathlib import Path
 from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
-from splatnode.capture.choosing import THINNED
-from splatnode.capture.given_lens import Lenses
-from splatnode.capture.lens_file import read_lenses
-from splatnode.capture.poses_file import poses_of, read_poses
+from splatnode.capture.keyframe_selection import THINNED
+from splatnode.capture.lens_file import Lenses, read_lenses
+from splatnode.capture.pose_files import poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.progress import ProgressStep, Tell, show_progress
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.recon import cost
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import MethodRunner, Plan, format_run, run_bench
+from splatnode.recon.evaluate.dataset import Split, load_scene
 from splatnode.recon.evaluate.demo import compute_max_capture_bytes, write_held_out_images, write_training_images
-from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
-from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Run, Settings, evaluate
-from splatnode.recon.evaluate.records import Bench, merge_benches, read_bench
-from splatnode.recon.evaluate.report import redraw
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.timing import explain_missing_seconds
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.protocol import (
+    INTERPOLATED_START,
+    PerceptualNetworks,
+    Run,
+    Settings,
+    evaluate,
+    load_networks,
+    psnr,
+)
+from splatnode.recon.evaluate.report import Bench, explain_missing_seconds, merge_benches, read_bench, redraw
+from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, format_run, run_bench
 from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
 from splatnode.recon.metric.arguments import collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.stereo_pairs import make_pairs, stream_right_images
-from splatnode.recon.offline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
-from splatnode.recon.rasterize import device
-from splatnode.recon.rasterize.device import Device
-from splatnode.recon.rasterize.dispatch import make_rasterizer
+from splatnode.recon.metric.stereo import make_pairs, stream_right_images
+from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
+from splatnode.recon.rasterize import dispatch
+from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
 from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_paths
-from splatnode.recon.result import bounds_in_words
-from splatnode.recon.result.export.manifest import LIVE_PICTURE
+from splatnode.recon.result import snapshot as result_snapshot
+from splatnode.recon.result.export.result import LIVE_PICTURE
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.moving_in_words import describe_moving
-from splatnode.recon.result.size import bound_result_bytes
-from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.whole import FILE, is_map_set
-from splatnode.recon.result.write import write_result_folder
+from splatnode.recon.result.report import bound_result_bytes, write_result_folder
+from splatnode.recon.result.snapshot import Snapshot, describe_moving
+from splatnode.recon.result.submap_index import FILE, is_map_set
 from splatnode.recon.viewer_process import Show, viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -165,7 +162,7 @@ def evaluate_held_out_views(
         load_scene(capture),
         split,
         Run("balanced", 0, None, snapshot.seconds, None),
-        rasterize=make_rasterizer(device.choose_device(on)),
+        rasterize=make_rasterizer(dispatch.choose_device(on)),
         networks=PerceptualNetworks(alex=None, vgg=None),
         settings=Settings(alignment_steps=DEMO_STEPS, alignment_levels=2),
         show=report_view,
@@ -195,7 +192,7 @@ def bench(args: argparse.Namespace) -> int:
 
 def _run_bench(args: argparse.Namespace) -> Bench:
     wanted = args.device or "cpu"
-    on = device.choose_device(wanted)
+    on = dispatch.choose_device(wanted)
     one_gpu = on.type != "cpu" and (args.ray is not None or (args.cores or 1) > 1)
     plan = Plan(
         tuple(args.scenes),
@@ -272,7 +269,7 @@ def _print_summary(snapshot: Snapshot, out: Path) -> None:
     if verdict.publishable:
         counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
         say(f"{snapshot.seconds['total']:.1f} s, {counts}")
-        if known := bounds_in_words.format_widest_bounds(snapshot.cameras, snapshot.scale):
+        if known := result_snapshot.format_widest_bounds(snapshot.cameras, snapshot.scale):
             say(f"how well the cameras are known: {known}")
         if snapshot.scale.source is not None:
             say(f"lengths: {snapshot.scale.sentence}")

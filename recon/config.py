@@ -10,18 +10,19 @@ from msgspec import Meta
 
 from splatnode.capture.process.config import Plugin, merge_config, parse_config
 from splatnode.recon.frames import screening
-from splatnode.recon.matching import config as matching
-from splatnode.recon.metric import config as metric
-from splatnode.recon.optimize import dropout, ensemble, perceptual_loss, refinement
+from splatnode.recon.matching import view_graph as matching
+from splatnode.recon.metric import measurement as metric
+from splatnode.recon.optimize import ensemble, photometric_losses, training
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
-from splatnode.recon.rasterize.device import Device
-from splatnode.recon.registration import config as registration
-from splatnode.recon.result import consistent_depth
+from splatnode.recon.rasterize.dispatch import Device
+from splatnode.recon.registration import registration
+from splatnode.recon.result import npz_files
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians
-from splatnode.recon.scene import background, completion, denied, initialisation, light, pixelwise, seeding
-from splatnode.recon.verification import decision, verify
+from splatnode.recon.scene import background as scene_background
+from splatnode.recon.scene import exposure, initialization, transients
+from splatnode.recon.verification import decision, evidence
 
 
 class PriorChoice(Plugin):
@@ -33,13 +34,13 @@ class PriorChoice(Plugin):
 
 
 # After each keyframe, for a look at once: nothing is pruned or left out.
-PREVIEW = refinement.RefinementConfig(
+PREVIEW = training.RefinementConfig(
     iterations=20,
     half_resolution_share=1.0,
     dssim=0.2,
     first_opacity=None,
-    dropout=dropout.DropoutConfig(share=0.0),
-    rates=refinement.CAUTIOUS,
+    dropout=ensemble.DropoutConfig(share=0.0),
+    rates=training.CAUTIOUS,
     control=None,
 )
 
@@ -65,21 +66,21 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     screening: screening.ScreeningConfig = screening.ScreeningConfig()
     matching: matching.MatchingConfig = matching.MatchingConfig()
     registration: registration.RegistrationConfig = registration.RegistrationConfig()
-    verification: verify.VerificationConfig = verify.VerificationConfig()
+    verification: evidence.VerificationConfig = evidence.VerificationConfig()
     decision: decision.DecisionConfig = decision.DecisionConfig()
     ladder: FallbackConfig = FallbackConfig()
-    light: light.ExposureConfig = light.ExposureConfig()
-    denied: denied.TransientMaskConfig = denied.TransientMaskConfig()
-    completion: completion.DepthCompletionConfig = completion.DepthCompletionConfig()
-    seeding: seeding.GaussianInitializationConfig = seeding.GaussianInitializationConfig()
-    background: background.BackgroundConfig = background.BackgroundConfig()
+    light: exposure.ExposureConfig = exposure.ExposureConfig()
+    denied: transients.TransientMaskConfig = transients.TransientMaskConfig()
+    completion: scene_background.DepthCompletionConfig = scene_background.DepthCompletionConfig()
+    seeding: initialization.GaussianInitializationConfig = initialization.GaussianInitializationConfig()
+    background: scene_background.BackgroundConfig = scene_background.BackgroundConfig()
     # In place of completion, seeding and background: a Gaussian a pixel, for comparison
-    pixelwise: pixelwise.PixelwiseConfig | None = None
-    preview: refinement.RefinementConfig = PREVIEW  # the refinement after each keyframe
-    optimize: refinement.RefinementConfig = refinement.RefinementConfig()  # the refinement after the last keyframe
+    pixelwise: initialization.PixelwiseConfig | None = None
+    preview: training.RefinementConfig = PREVIEW  # the refinement after each keyframe
+    optimize: training.RefinementConfig = training.RefinementConfig()  # the refinement after the last keyframe
     metric: metric.MetricConfig = metric.MetricConfig()  # the scale in metres of what is published
     # From how much depth that other views confirm a scene counts as seen, also away from the cameras
-    consistent_depth: consistent_depth.ConsistentDepthConfig = consistent_depth.ConsistentDepthConfig()
+    consistent_depth: npz_files.ConsistentDepthConfig = npz_files.ConsistentDepthConfig()
     # At most so many in the scene; None: as many as it calls for
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets
@@ -101,27 +102,27 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         return most if most is None or self.optimize.control is None else round(self.surplus * most)
 
     @property
-    def initialisation(self) -> initialisation.SceneInitializationConfig:
+    def initialisation(self) -> initialization.SceneInitializationConfig:
         """Returns the configuration of the initial Gaussians of a scene."""
         most = self.first_gaussians
-        return initialisation.SceneInitializationConfig(
+        return initialization.SceneInitializationConfig(
             self.completion, self.seeding, self.background, self.pixelwise, most
         )
 
 
 PRESETS: dict[str, ReconstructionConfig] = {
     "preview": ReconstructionConfig(
-        size=384, optimize=refinement.RefinementConfig(half_resolution_share=0.25, iterations=150)
+        size=384, optimize=training.RefinementConfig(half_resolution_share=0.25, iterations=150)
     ),
-    "fast": ReconstructionConfig(optimize=refinement.RefinementConfig(iterations=200)),
+    "fast": ReconstructionConfig(optimize=training.RefinementConfig(iterations=200)),
     "balanced": ReconstructionConfig(),
     # Two scenes and one that agrees with both. For texture: two thirds more Gaussians, and LPIPS where its weights are
     "quality": ReconstructionConfig(
-        seeding=seeding.GaussianInitializationConfig(max_error=0.0009),
-        optimize=refinement.RefinementConfig(
+        seeding=initialization.GaussianInitializationConfig(max_error=0.0009),
+        optimize=training.RefinementConfig(
             checkpoints=(150, 500),
             ensemble=ensemble.EnsembleConfig(members=2),
-            perceptual=perceptual_loss.PerceptualLossConfig(weight=0.08, start=0.0, every=2),
+            perceptual=photometric_losses.PerceptualLossConfig(weight=0.08, start=0.0, every=2),
             control=ControlChoice("prune", prune.Config(least_change=0.00125)),
         ),
     ),

@@ -16,9 +16,8 @@ from pathlib import Path
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
-from splatnode.capture.process.packages import EXTRAS, REQUIRED
-from splatnode.capture.process.progress import show_waiting
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.system import EXTRAS, REQUIRED
+from splatnode.capture.process.terminal import say, show_waiting
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
 
@@ -118,7 +117,7 @@ def _poselib() -> Finding:
 def _gpu() -> Finding:
     """Whether Gaussians can be refined on a GPU: the answer of those who would do it."""
     try:
-        from splatnode.recon.rasterize.device import choose_device, format_device
+        from splatnode.recon.rasterize.dispatch import choose_device, format_device
 
         device = choose_device("auto")
     except (ImportError, OSError) as error:
@@ -160,7 +159,7 @@ def _network() -> Finding:
 
 def _spool() -> Finding:
     """Room for keyframes that wait."""
-    config = spool.Config()
+    config = spool.SpoolConfig()
     try:
         directory = spool.spool_directory(config)
     except ValueError as error:

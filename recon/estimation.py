@@ -5,33 +5,35 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from splatnode.capture.stamp import Stamp
+from splatnode.capture.frame import Stamp
+from splatnode.recon.clock import make_deadline_pause
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.deadline import make_deadline_pause
 from splatnode.recon.frames.screening import Rejected
-from splatnode.recon.locating.gathering import collect_landmarks
+from splatnode.recon.locating.landmarks import collect_landmarks
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, apply_image_masks
-from splatnode.recon.registration import continuation
+from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.registration.hand_eye import offset_of
-from splatnode.recon.registration.inliers import compute_pooled_ratio
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.posed import register_posed
-from splatnode.recon.registration.register import Registration, register
-from splatnode.recon.registration.straightened import undistort_keyframes
-from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.result.verdict import SURE, Verdict
-from splatnode.recon.verification.claims import predict_bounds, shape_bounds
+from splatnode.recon.registration.registration import Registration, register
+from splatnode.recon.registration.resection import compute_pooled_ratio
+from splatnode.recon.registration.undistortion import undistort_keyframes
+from splatnode.recon.result.snapshot import Landmarks
+from splatnode.recon.result.verdict import SURE, Bounds, Verdict
 from splatnode.recon.verification.decision import decide, refuse_before_registration
-from splatnode.recon.verification.evidence import Evidence
+from splatnode.recon.verification.error_model import (
+    compute_log_odds,
+    make_evidence_record,
+    predict_bounds,
+    shape_bounds,
+)
+from splatnode.recon.verification.evidence import Evidence, verify, verify_further
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import explain_refusal, refuse_stereo_or_panorama
-from splatnode.recon.verification.likelihood import compute_log_odds, make_evidence_record
 from splatnode.recon.verification.posed import compute_posed_bounds, decide_posed
-from splatnode.recon.verification.verify import verify, verify_further
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
 # that were taken for this one had up to 20.
@@ -251,7 +253,9 @@ def extend_reconstruction(
     if not position.keys() >= set(names):
         return None
     start = [replace(camera, index=position[names[camera.index]]) for camera in known.registration.cameras]
-    registration = continuation.extend_registration(graph.keyframes, graph.pairs, start, config.registration)
+    registration = registration_registration.extend_registration(
+        graph.keyframes, graph.pairs, start, config.registration
+    )
     further = position.keys() - set(names)
     if registration is None or not _has_cameras_of(registration, [position[name] for name in further]):
         return None

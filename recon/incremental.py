@@ -15,16 +15,14 @@ from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.budget import find_budget_hits
-from splatnode.recon.clock import Clock
+from splatnode.recon.clock import Clock, OutOfTime, Timer
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.deadline import OutOfTime, Timer
 from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth, extend_reconstruction
+from splatnode.recon.fallbacks.run import make_fallback_key, run_fallbacks
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.screening import Rejected, ScreeningState
-from splatnode.recon.ladder.ladder import make_fallback_key, run_fallbacks
-from splatnode.recon.matching.match import match_newest, match_pending
-from splatnode.recon.matching.moving import mask_moving_objects
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.dynamic_objects import mask_moving_objects
+from splatnode.recon.matching.view_graph import ViewGraph, match_newest, match_pending
 from splatnode.recon.memory import Key, ReconstructionCache
 from splatnode.recon.modelling import (
     SceneWithVerdict,
@@ -34,12 +32,12 @@ from splatnode.recon.modelling import (
     refine_scene,
     snapshot,
 )
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import training
 from splatnode.recon.preparation import UnusableFrame, check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import apply_image_masks
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene import growth, warping
+from splatnode.recon.scene import growth
 from splatnode.recon.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -311,9 +309,9 @@ class IncrementalReconstruction:
         estimate, scene = self.estimate_soon(pause), self.scene
         if scene is None or estimate.registration is None or not estimate.verdict.publishable:
             return False
-        beside = warping.align_registration(scene, estimate.registration, estimate.graph, estimate.verdict.provisional)
-        carried = warping.update_pointmaps(self._known.pointmaps, beside.registration, beside.graph) if beside else {}
-        moved = beside and warping.warp_scene(beside.scene, self._known.pointmaps, carried, MAX_CAMERA_SHIFT)
+        beside = growth.align_registration(scene, estimate.registration, estimate.graph, estimate.verdict.provisional)
+        carried = growth.update_pointmaps(self._known.pointmaps, beside.registration, beside.graph) if beside else {}
+        moved = beside and growth.warp_scene(beside.scene, self._known.pointmaps, carried, MAX_CAMERA_SHIFT)
         if beside is None or moved is None:
             return False
         graph, placed = beside.graph, beside.registration
@@ -331,7 +329,7 @@ class IncrementalReconstruction:
         self.clock.lap("points")
 
     def refine(
-        self, scene: Scene | None, steps: refinement.RefinementConfig, pause: Pause = ignore_cancel
+        self, scene: Scene | None, steps: training.RefinementConfig, pause: Pause = ignore_cancel
     ) -> Iterator[SceneWithVerdict]:
         """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet."""
         self.clock.lap("wait")

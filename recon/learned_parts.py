@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from splatnode.recon.config import PriorChoice
-from splatnode.recon.networks import depth_anything, weight_catalogue
-from splatnode.recon.networks.weight_catalogue import Weights
-from splatnode.recon.networks.weight_download import find_mismatch
-from splatnode.recon.networks.weight_folder import locate_weights
+from splatnode.recon.networks import depth_anything
+from splatnode.recon.networks import weights as networks_weights
+from splatnode.recon.networks.weights import Weights, find_mismatch, locate_weights
 from splatnode.recon.optimize.losses import dino
 
 
@@ -53,7 +52,7 @@ def find_unavailable_reason(part: LearnedPart) -> str:
     known = _catalogue()
     for path in part.weights:
         if path not in known:
-            return f"{path} is not in the catalogue of weights: recon/networks/weight_catalogue.py needs its entry"
+            return f"{path} is not in the catalogue of weights: recon/networks/weights.py needs its entry"
         entry, file = known[path], locate_weights(path)
         if file is None:
             return f"no weights: splatnode weights fetch {entry.name}" if entry.url else f"no weights: see {entry.name}"
@@ -73,4 +72,4 @@ def _priors() -> list[LearnedPart]:
 
 def _catalogue() -> dict[str, Weights]:
     """The catalogue's entries by their paths."""
-    return {entry.path: entry for entry in weight_catalogue.CATALOGUE}
+    return {entry.path: entry for entry in networks_weights.CATALOGUE}

@@ -15,23 +15,22 @@ from splatnode.recon.budget import BudgetHit
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.estimation import Reconstruction, ReconstructionSummary
-from splatnode.recon.frames import border
+from splatnode.recon.frames import screening
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.optimize import refinement
-from splatnode.recon.optimize.torch_threads import single_torch_thread
-from splatnode.recon.optimize.watch import examine, start_watch
-from splatnode.recon.priors.confirmed import compute_consistent_depths
-from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.rasterize.device import choose_device
-from splatnode.recon.registration.straightened import undistort_keyframes
-from splatnode.recon.result.consistent_depth import append_consistent_depth
+from splatnode.recon.optimize import training
+from splatnode.recon.optimize.monitor import examine, start_watch
+from splatnode.recon.optimize.training import single_torch_thread
+from splatnode.recon.priors.pointmap import Pointmap, compute_consistent_depths
+from splatnode.recon.rasterize.dispatch import choose_device
+from splatnode.recon.registration.undistortion import undistort_keyframes
+from splatnode.recon.result.npz_files import append_consistent_depth
 from splatnode.recon.result.snapshot import GaussianArrays, InGivenWorld, Snapshot
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene import denied, growth, light
-from splatnode.recon.scene.first_look import create_coarse_scene
-from splatnode.recon.scene.initialisation import initialize_scene
+from splatnode.recon.scene import exposure as scene_exposure
+from splatnode.recon.scene import growth, transients
+from splatnode.recon.scene.exposure import compute_exposure_priors
+from splatnode.recon.scene.initialization import create_coarse_scene, initialize_scene
 from splatnode.recon.scene.scene import Scene
-from splatnode.recon.scene.told_light import compute_exposure_priors
 
 COARSE = "Coarse so far: the matched points alone; depth and refinement follow."
 
@@ -80,8 +79,10 @@ def create_initial_scene(
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     told = compute_exposure_priors(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
-    exposures, headroom = light.apply_headroom(images, light.estimate_exposures(pointmaps, images, config.light, told))
-    images = light.compensate_images(images, exposures)
+    exposures, headroom = scene_exposure.apply_headroom(
+        images, scene_exposure.estimate_exposures(pointmaps, images, config.light, told)
+    )
+    images = scene_exposure.compensate_images(images, exposures)
     seen_through = _find_transient_masks(pointmaps, images, masks, config) if all_at_hand else {}
     for name, hidden in seen_through.items():
         free, own = ~hidden, masks[name]
@@ -104,17 +105,17 @@ def _find_transient_masks(
         return {}
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     used = []
-    for pointmap, rim in zip(pointmaps, border.valid_masks(pictures), strict=True):
+    for pointmap, rim in zip(pointmaps, screening.valid_masks(pictures), strict=True):
         mask = masks[pointmap.name]
         used.append(rim if mask is None else rim & mask)
-    found = zip(pointmaps, denied.find_transient_masks(pointmaps, pictures, used), used, strict=True)
+    found = zip(pointmaps, transients.find_transient_masks(pointmaps, pictures, used), used, strict=True)
     return {pointmap.name: hidden & own for pointmap, hidden, own in found if hidden is not None}
 
 
 def refine_scene(
     scene: Scene | None,
     config: ReconstructionConfig,
-    steps: refinement.RefinementConfig,
+    steps: training.RefinementConfig,
     deadline: float | None = None,
     gone_on: Callable[[int], None] = lambda done: None,
 ) -> Iterator[SceneWithVerdict]:
@@ -130,12 +131,12 @@ def refine_scene(
     watching = start_watch(scene, steps.iterations)
     limit = config.most_gaussians
     give_back_memory()
-    work = refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit, gone_on=gone_on)
+    work = training.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit, gone_on=gone_on)
     for later in work:
         give_back_memory()
         verdict = None
         # A scene that started soft shows its photographs after so many steps: looked at earlier, it is not judged.
-        looked_at = later.iterations >= refinement.MIN_SOFT and later.iterations in config.optimize.checkpoints
+        looked_at = later.iterations >= training.MIN_SOFT and later.iterations in config.optimize.checkpoints
         if later.losses or looked_at:
             watching, verdict = examine(watching, later)
         if verdict is not None:

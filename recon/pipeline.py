@@ -10,20 +10,26 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.capture.process.progress import ProgressStep, Tell, ignore_progress, report_items
+from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, report_items
+from splatnode.capture.process.text import sanitize_text
+from splatnode.recon import threads
 from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, ReconstructionSummary, estimate_cameras, estimate_depth
+from splatnode.recon.fallbacks.run import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.ladder.ladder import run_fallbacks
-from splatnode.recon.matching.match import match
-from splatnode.recon.matching.moving import mask_moving_objects
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.dynamic_objects import mask_moving_objects
+from splatnode.recon.matching.view_graph import ViewGraph, match
+from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
+from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.modelling import (
     create_coarse_preview,
     create_initial_scene,
@@ -33,6 +39,9 @@ from splatnode.recon.modelling import (
 )
 from splatnode.recon.preparation import check_device, load_prior, prepare_all
 from splatnode.recon.priors.prior import Prior
+from splatnode.recon.replay_source import IMAGES, Source
+from splatnode.recon.result.levels_of_detail import remove_unconfirmed
+from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene
 
@@ -182,3 +191,108 @@ def rebuild_from_scratch(work: IncrementalReconstruction, tell: Tell = ignore_pr
         show_begun=False,
         tell=tell,
     )
+
+
+# Photographs that are all at hand, from what is asked for to what is written.
+#
+# `splatnode replay` and the Python interface call this.
+
+
+@dataclass(frozen=True, eq=False)
+class OfflineResult:
+    """The result of an offline reconstruction, with what its report says of how it was made."""
+
+    snapshot: Snapshot
+    source: Source  # without its frames where a folder has them
+    seed: int
+    preset: str
+
+    def write(self, out: Path) -> dict[str, object]:
+        """Writes the result folder and returns its report.
+
+        Raises ResultWriteError, with what was there before intact.
+        """
+        files = self.source.files() if self.snapshot.verdict.publishable else {}
+        lie_in = self.source.photographs or (out / IMAGES if files else None)
+        told: dict[str, object] = {"photographs": None if lie_in is None else _encode_path(lie_in.resolve())}
+        if self.source.choice is not None:
+            told["selection"] = self.source.choice.record()
+        return write_result_folder(
+            self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, told=told
+        )
+
+
+def _encode_path(folder: Path) -> str | None:
+    """The folder's path; None where it is no text, as Linux allows, which no JSON file can hold."""
+    try:
+        return folder.as_posix().encode().decode()
+    except UnicodeEncodeError:
+        return None
+
+
+def ignore_snapshot(_: Snapshot) -> None:
+    """Ignores a snapshot: nobody watches."""
+
+
+def reconstruct_source(
+    source: Source,
+    config: ReconstructionConfig,
+    preset_name: str,
+    without_guesses: bool = False,
+    most_threads: int | None = None,
+    given: Evidence = NOTHING,
+    *,
+    show: Callable[[Snapshot], None] = ignore_snapshot,
+    tell: Tell = ignore_progress,
+) -> OfflineResult:
+    """The final snapshot of what `source` gives, in metres where `config` knows how.
+
+    `given` is what is known of metres beside the photographs. `without_guesses` leaves out what no two photographs
+    confirm. `show` gets every snapshot, and `tell` hears what is being done. The work takes `most_threads` threads at
+    most; None: as many as the process may use.
+    Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
+    """
+    with threads.apply_thread_limit(most_threads):
+        evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
+        snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)
+    if without_guesses:
+        snapshot = remove_unconfirmed(snapshot)
+    kept = source if source.photographs is None else replace(source, frames=())
+    return OfflineResult(snapshot, kept, config.seed, preset_name)
+
+
+def run(
+    frames: Iterable[Frame | DroppedFrame],
+    config: ReconstructionConfig,
+    show: Callable[[Snapshot], None] = ignore_snapshot,
+    tell: Tell = ignore_progress,
+) -> Snapshot:
+    """The final snapshot; every one is given to `show`, and what is being done to `tell`."""
+    snapshot = None
+    for snapshot in reconstruct(frames, config, tell):
+        show(snapshot)
+    if snapshot is None:
+        raise AssertionError("reconstruct always yields a last snapshot")
+    return snapshot
+
+
+def check_baseline(config: ReconstructionConfig, source: Source) -> None:
+    """Raises ValueError before the work where a measured distance names a photograph that is not used."""
+    names = [frame.name for frame in source.frames]
+    missing = [name for baseline in config.metric.baselines for name in baseline[:2] if name not in names]
+    if missing and source.choice is not None:
+        raise ValueError(
+            f"the baseline's photograph {missing[0]!r} is not among those that were chosen: {', '.join(names)}. "
+            f"Measure between two of these, or use all {source.choice.what}s (--every-frame)"
+        )
+    if missing:
+        raise ValueError(
+            f"the baseline's photograph {missing[0]!r} is not among those that are used: {', '.join(names)}. "
+            "Measure between two of these, or have it used, too"
+        )
+
+
+def set_preview_interval(config: ReconstructionConfig, every: int) -> ReconstructionConfig:
+    """The same reconstruction, with a snapshot to look at `every` so many iterations."""
+    looks = tuple(range(every, config.optimize.iterations, every))
+    return msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, looks=looks))

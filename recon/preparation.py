@@ -10,12 +10,12 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses.undistort import undistort_frame
-from splatnode.capture.process.memory_shortage import raise_shortage
+from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.priors.prior import Prior
-from splatnode.recon.rasterize.device import choose_device, format_device
+from splatnode.recon.rasterize.dispatch import choose_device, format_device
 
 log = logging.getLogger(__name__)
 

@@ -17,17 +17,16 @@ import numpy.typing as npt
 
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
-from splatnode.capture.choosing import THINNED, Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.given_lens import Lenses, describe_image
-from splatnode.capture.given_pose import make_given_pose
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose
+from splatnode.capture.lens_file import Lenses, describe_image
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, mask_frames, open_masks
-from splatnode.capture.process.printable import sanitize_name
-from splatnode.capture.process.progress import Tell, ignore_progress, report_items
+from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
+from splatnode.capture.process.text import sanitize_name
 from splatnode.capture.quality import Limits
-from splatnode.capture.selection import Config
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -135,7 +134,10 @@ def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
 def select_frames(
     frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = ignore_progress
 ) -> Source:
-    """Photographs that lie in no folder, or what is used of them: as of a folder's. Raises ValueError as `load_source`."""
+    """Photographs that lie in no folder, or what is used of them: as of a folder's.
+
+    Raises ValueError as `load_source`.
+    """
     if views:
         return Source(tuple(frames[i] for i in _select_evenly(views, len(frames))), None, None)
     if every_frame or len(frames) <= ALL:

@@ -8,8 +8,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import add_json, megabytes, names, natural, percent, positive, seconds
-from splatnode.capture.process.verb import Verb, import_lazily
+from splatnode.capture.process.arguments import (
+    Verb,
+    add_json,
+    import_lazily,
+    megabytes,
+    names,
+    natural,
+    percent,
+    positive,
+    seconds,
+)
 from splatnode.recon.metric.arguments import add_baseline, add_marker, add_poses, add_stereo
 from splatnode.recon.shared_arguments import add_device, add_multi_view_only
 

@@ -11,15 +11,16 @@ from pathlib import Path
 from pkgutil import iter_modules
 
 from splatnode.capture.process.arguments import (
+    Verb,
     add_json,
     angle,
     box,
+    import_lazily,
     length,
     megabytes,
     natural,
     positive,
 )
-from splatnode.capture.process.verb import Verb, import_lazily
 from splatnode.recon.batch.verb import BATCH
 from splatnode.recon.evaluate.verbs import BENCH, STABILITY
 from splatnode.recon.metric.arguments import add_marker
@@ -180,13 +181,13 @@ VERBS = (
         "recon",
         "reconstruct what comes, for ever",
         _recon_arguments,
-        import_lazily("splatnode.recon.daemon.daemon", "recon"),
+        import_lazily("splatnode.recon.daemon.node", "recon"),
     ),
     Verb(
         "retract",
         "take a keyframe back",
         _retract_arguments,
-        import_lazily("splatnode.recon.daemon.control", "retract"),
+        import_lazily("splatnode.recon.daemon.node", "retract"),
     ),
     BENCH,
     STABILITY,

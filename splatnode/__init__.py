@@ -8,18 +8,14 @@ from importlib import import_module
 TYPE_CHECKING = False  # to a type checker it is true; `typing` would take time
 
 if TYPE_CHECKING:
-    from splatnode.api.camera import Camera
     from splatnode.api.live_map import NodeMap
-    from splatnode.api.loading import load
     from splatnode.api.node import Node, NodeUpdate, connect
-    from splatnode.api.reconstruction import reconstruct
-    from splatnode.api.result import Result
-    from splatnode.api.scale import Marker, Stereo
+    from splatnode.api.reconstruct import Marker, Stereo, reconstruct
+    from splatnode.api.result import Camera, Result, View, load
     from splatnode.api.session import Session, Update
-    from splatnode.api.view import View
     from splatnode.capture.frame import Intrinsics
     from splatnode.recon.locating.outcome import Located, NotLocated
-    from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+    from splatnode.recon.occupancy.grid import OccupancyMap
     from splatnode.recon.result.verdict import Verdict
 
 __all__ = [
@@ -44,24 +40,24 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Camera": "splatnode.api.camera",
+    "Camera": "splatnode.api.result",
     "Intrinsics": "splatnode.capture.frame",
     "Located": "splatnode.recon.locating.outcome",
-    "Marker": "splatnode.api.scale",
+    "Marker": "splatnode.api.reconstruct",
     "Node": "splatnode.api.node",
     "NodeMap": "splatnode.api.live_map",
     "NodeUpdate": "splatnode.api.node",
     "NotLocated": "splatnode.recon.locating.outcome",
-    "OccupancyMap": "splatnode.recon.occupancy.occupancy_map",
+    "OccupancyMap": "splatnode.recon.occupancy.grid",
     "Result": "splatnode.api.result",
     "Session": "splatnode.api.session",
-    "Stereo": "splatnode.api.scale",
+    "Stereo": "splatnode.api.reconstruct",
     "Update": "splatnode.api.session",
     "Verdict": "splatnode.recon.result.verdict",
-    "View": "splatnode.api.view",
+    "View": "splatnode.api.result",
     "connect": "splatnode.api.node",
-    "load": "splatnode.api.loading",
-    "reconstruct": "splatnode.api.reconstruction",
+    "load": "splatnode.api.result",
+    "reconstruct": "splatnode.api.reconstruct",
 }
 
 

@@ -24,7 +24,7 @@ def recordings(
     Sources are folders of photographs, videos, MCAP files, LeRobot data sets, folders that hold such, and lists (.txt).
     What lies in the folder `results`, if one is given, is none. Raises FileNotFoundError, ValueError.
     """
-    from splatnode.recon.batch.sources import recordings as found
+    from splatnode.recon.batch.batch import recordings as found
 
     there = found([Path(source) for source in sources], None if results is None else Path(results))
     return [{"name": each.name, "source": each.source} for each in there]

@@ -24,11 +24,9 @@ import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
 from splatnode.capture.process.logs import use_plain_lines
-from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
-from splatnode.capture.process.packages import remedy
-from splatnode.capture.process.printable import sanitize_lines, sanitize_text
-from splatnode.capture.process.stop_signals import handle_first_signal
+from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
 from splatnode.capture.process.terminal import is_output_closed, sanitize_output
+from splatnode.capture.process.text import sanitize_lines, sanitize_text
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -2,12 +2,190 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from dataclasses import dataclass
 
-from splatnode.viewer.advice import Advice, next_view, surface_points
-from splatnode.viewer.moment import Moment
-from splatnode.viewer.support import Support, support
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.viewer.colours import Support, mean_camera_centre, normals, support
+from splatnode.viewer.state import Moment
+from splatnode.viewer.viewpoint import look_at, scene_up
+
+# Where to take the next photograph: the move that would show the most that is not yet well known.
+
+Array = npt.NDArray[np.float64]
+
+GOOD_ANGLE_DEG = 12.0  # between two rays to a point: wider adds little to its depth, and matches fail
+GOOD_ANGLE = math.radians(GOOD_ANGLE_DEG)
+GOOD_VIEWS = 3  # two confirm each other, the third tells which is wrong
+ENOUGH = 0.03  # a gain below this is not worth a photograph
+MIN_OVERLAP = 0.5  # part of the points that a new view must share with old ones to be placed among them
+_MIN_SHOWN = 0.2  # part of all points that a new view must show: less is a glance at the scene's edge
+_MIN_FACING = 0.2  # cosine between a surface's normal and the ray to it: flatter, it is seen edge-on
+_STEPS = tuple(math.radians(degrees) for degrees in (8.0, 16.0, 24.0))  # around the scene, from a camera
+_TURNS = {
+    "to the right": (1.0, 0.0),
+    "to the left": (-1.0, 0.0),
+    "up": (0.0, 1.0),
+    "down": (0.0, -1.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    sentence: str
+    arrow: tuple[Array, Array] | None  # from a camera's centre to where the next one should be, (3,) each
+    target: Array | None  # (3,) where that one should look
+    gain: float  # 0: nothing to gain; 1: everything was unknown
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """M points on the surfaces of the scene."""
+
+    positions: Array  # (M, 3)
+    normals: Array  # (M, 3) unit, towards where they were seen from
+    seen_by: npt.NDArray[np.bool_]  # (M, C) by which cameras
+
+
+def surface_points(
+    gaussians: GaussianArrays, cameras: tuple[CameraEstimate, ...], support: Support, most: int = 1500
+) -> Points:
+    """At most `most` Gaussians, evenly spread over those that any camera sees, as points."""
+    visible = np.flatnonzero(support.views > 0)
+    chosen = visible[:: max(1, math.ceil(len(visible) / most))]
+    return Points(
+        positions=gaussians.means[chosen].astype(np.float64),
+        normals=normals(select_gaussians(gaussians, chosen), mean_camera_centre(cameras)).astype(np.float64),
+        seen_by=support.sizes[chosen] > 0,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Move:
+    base: CameraEstimate
+    centre: Array
+    turn: str
+    angle: float
+    parallax: float  # mean gain of the points' angles, in parts of GOOD_ANGLE
+    coverage: float  # mean gain of their number of views, in parts of GOOD_VIEWS
+
+    @property
+    def gain(self) -> float:
+        return (self.parallax + self.coverage) / 2.0
+
+
+def next_view(cameras: tuple[CameraEstimate, ...], points: Points) -> Advice:
+    """The best of the moves around the scene from each camera, by what it adds to the points' angles and views.
+
+    A point gains parallax when it is seen under a wider angle than before, up to GOOD_ANGLE, and coverage when it has
+    fewer than GOOD_VIEWS. A new view shows a point that is inside its image and turned towards it; what hides what is
+    not looked at. Moves that would lose touch with the known views are not offered. What no photograph shows has no
+    points and cannot be asked for.
+    """
+    if not cameras or not len(points.positions):
+        return Advice("No camera is placed yet: take photographs that overlap, with a step to the side.", None, None, 0)
+    sight = _measure_viewing_angles(cameras, points)
+    moves = [move for camera in cameras for move in _moves(camera, cameras, points, sight)]
+    best = max(moves, key=lambda move: (round(move.gain, 3), move.base.frame_id), default=None)
+    if best is None or best.gain < ENOUGH:
+        return Advice("The scene is covered well: more photographs from around here would add little.", None, None, 0)
+    pivot = _pivot(best.base, points, cameras)
+    return Advice(_describe_move(best, points, sight), (best.base.T_world_camera[:3, 3], best.centre), pivot, best.gain)
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewingAngles:
+    """How the cameras see the points."""
+
+    rays: Array  # (C, M, 3) unit, from each camera to each point
+    angles: Array  # (M,) the widest between two cameras that see the point; 0 where fewer than two do
+
+
+def _measure_viewing_angles(cameras: tuple[CameraEstimate, ...], points: Points) -> _ViewingAngles:
+    rays = np.stack([_rays(points, camera.T_world_camera[:3, 3]) for camera in cameras])
+    angles = np.zeros(len(points.positions))
+    for index, ray in enumerate(rays):
+        to_others = _angles_to(ray, rays, points)
+        angles = np.maximum(angles, np.where(points.seen_by[:, index], to_others, 0.0))
+    return _ViewingAngles(rays, angles)
+
+
+def _moves(
+    camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: Points, sight: _ViewingAngles
+) -> list[_Move]:
+    up = scene_up(cameras)
+    pivot = _pivot(camera, points, cameras)
+    angles, views = sight.angles, points.seen_by.sum(1)
+    moves = []
+    for turn, (right, upwards) in _TURNS.items():
+        for step in _STEPS:
+            centre = _orbit_camera(camera, pivot, up, right * step, upwards * step)
+            shown = _find_visible_points(camera, look_at(centre, pivot, up), points)
+            if shown.sum() == 0 or (views[shown] > 0).mean() < MIN_OVERLAP or shown.mean() < _MIN_SHOWN:
+                continue
+            wider = np.where(shown, np.maximum(angles, _angles_to(_rays(points, centre), sight.rays, points)), angles)
+            parallax = (np.minimum(wider, GOOD_ANGLE) - np.minimum(angles, GOOD_ANGLE)).mean() / GOOD_ANGLE
+            coverage = (np.minimum(views + shown, GOOD_VIEWS) - np.minimum(views, GOOD_VIEWS)).mean() / GOOD_VIEWS
+            moves.append(_Move(camera, centre, turn, step, float(parallax), float(coverage)))
+    return moves
+
+
+def _orbit_camera(camera: CameraEstimate, pivot: Array, up: Array, right: float, upwards: float) -> Array:
+    """The camera's centre after a walk around the pivot by angles, to its own right or upwards."""
+    offset = camera.T_world_camera[:3, 3] - pivot
+    distance = float(np.linalg.norm(offset))
+    sideways = np.cross(-offset / distance, up)
+    sideways /= max(float(np.linalg.norm(sideways)), 1e-9)
+    over = np.cross(sideways, -offset / distance)
+    direction = math.cos(right) * math.cos(upwards) * offset / distance
+    direction = direction + math.sin(right) * sideways + math.sin(upwards) * over
+    return pivot + distance * direction / float(np.linalg.norm(direction))
+
+
+def _pivot(camera: CameraEstimate, points: Points, cameras: tuple[CameraEstimate, ...]) -> Array:
+    """The point ahead of the camera at the median depth of what it sees."""
+    mine = points.seen_by[:, next(i for i, other in enumerate(cameras) if other is camera)]
+    centre, forward = camera.T_world_camera[:3, 3], camera.T_world_camera[:3, 2]
+    depths = (points.positions[mine] - centre) @ forward
+    return centre + (float(np.median(depths)) if len(depths) else 1.0) * forward
+
+
+def _find_visible_points(lens: CameraEstimate, T_world_camera: Array, points: Points) -> npt.NDArray[np.bool_]:
+    """(M,) points inside the image that `lens` would take from there, on surfaces turned towards it."""
+    offsets = points.positions - T_world_camera[:3, 3]
+    local = offsets @ T_world_camera[:3, :3]
+    ahead = local[:, 2] > 1e-3
+    pixels = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
+    facing = -(offsets * points.normals).sum(1) > _MIN_FACING * np.linalg.norm(offsets, axis=1)
+    return ahead & facing & (pixels >= 0).all(1) & (pixels < [lens.width, lens.height]).all(1)
+
+
+def _rays(points: Points, centre: Array) -> Array:
+    offsets = points.positions - centre
+    return offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
+
+
+def _angles_to(ray: Array, rays: Array, points: Points) -> Array:
+    """(M,) the widest angle between the point's `ray` (M, 3) and one of a camera that sees it; 0 where none does."""
+    cosines = np.einsum("cmi,mi->cm", rays, ray)
+    return np.arccos(np.clip(np.where(points.seen_by.T, cosines, 1.0).min(0), -1.0, 1.0))
+
+
+def _describe_move(move: _Move, points: Points, sight: _ViewingAngles) -> str:
+    distance = 2.0 * math.sin(move.angle / 2.0)
+    where = f"From {move.base.name} move {move.turn} by {distance:.0%} of the distance to the scene"
+    if move.parallax >= move.coverage:
+        narrow = float((sight.angles < GOOD_ANGLE).mean())
+        return (
+            f"{where}, look at the same place: {narrow:.0%} of it is seen under less than {GOOD_ANGLE_DEG:.0f}° so far."
+        )
+    few = float((points.seen_by.sum(1) < GOOD_VIEWS).mean())
+    return f"{where}, look at the same place: {few:.0%} of it has fewer than {GOOD_VIEWS} views."
 
 
 @dataclass(frozen=True, eq=False)

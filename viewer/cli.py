@@ -13,20 +13,17 @@ import cv2
 
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config, read_yaml
-from splatnode.capture.process.progress import show_progress, show_waiting
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.terminal import say, show_progress, show_waiting
 from splatnode.recon.result.rendering import use_threads
 from splatnode.recon.result.stored_snapshot import load_images
-from splatnode.recon.result.whole import is_map_set
-from splatnode.viewer.map_source import BUDGET, Maps, MapSource, map_moment
-from splatnode.viewer.moment import Moment
+from splatnode.recon.result.submap_index import is_map_set
 from splatnode.viewer.pictures import update_picture, write_movie, write_series
 from splatnode.viewer.probe import open3d_installed, probe_window
 from splatnode.viewer.rerun_stream import URL, stream
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import FixedSource, LiveSource, Source, load_result
+from splatnode.viewer.sources import BUDGET, FixedSource, LiveSource, Maps, MapSource, Source, load_result, map_moment
 from splatnode.viewer.splash import splash
-from splatnode.viewer.state import ViewerState
+from splatnode.viewer.state import Moment, ViewerState
 from splatnode.viewer.web import stage as web
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69

@@ -14,13 +14,11 @@ import numpy.typing as npt
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians, write_files
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
-from splatnode.recon.result.export.selection import Box, Selection
-from splatnode.recon.result.export.sources import SOURCES, encode_sources
-from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import SHELL, find_confirmed
-from splatnode.viewer.moment import Moment
+from splatnode.recon.result.export.prepare import Box, Selection
+from splatnode.recon.result.export.stored import SOURCES, encode_sources
+from splatnode.recon.result.snapshot import SHELL, GaussianArrays, find_confirmed
 from splatnode.viewer.shapes import Colour, Lines
-from splatnode.viewer.state import Span
+from splatnode.viewer.state import Moment, Span
 from splatnode.viewer.viewpoint import scene_pivot, scene_spread
 
 Edits = tuple[Selection, ...]  # in the order in which they were made; undo takes the last one away

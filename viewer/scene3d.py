@@ -14,10 +14,9 @@ from open3d.visualization import gui, rendering  # pyright: ignore[reportMissing
 
 from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.shapes import ImageQuad, Label, Lines, Shapes
 from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import Viewpoint
+from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint
 
 _BOUNDS = o3d.geometry.AxisAlignedBoundingBox(np.full(3, -20.0), np.full(3, 20.0))  # for near and far planes
 _CLOUD = "gaussians"

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.recon.result.export.selection import Selection
+from splatnode.recon.result.export.prepare import Selection
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.analysis import Analysis, Analyst
-from splatnode.viewer.canvas import Canvas, Image, project
-from splatnode.viewer.colours import colour_gaussians
+from splatnode.viewer.colours import Support, colour_gaussians
 from splatnode.viewer.editing import (
     EditError,
     Edits,
@@ -22,16 +21,45 @@ from splatnode.viewer.editing import (
     compute_crop_bounds,
     write_edited,
 )
-from splatnode.viewer.ground import Ground, ground, ground_lines
-from splatnode.viewer.legend import legend
-from splatnode.viewer.measuring import add_point, measurement_shapes, surface_point
-from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, append_moment, same_world
 from splatnode.viewer.paint import blend_image, overlay_shapes, paint_coarsely
-from splatnode.viewer.shapes import ImageQuad, Shapes, live_camera, merge_shapes, shapes
+from splatnode.viewer.shapes import (
+    Ground,
+    ImageQuad,
+    Shapes,
+    add_point,
+    ground,
+    ground_lines,
+    legend,
+    live_camera,
+    measurement_shapes,
+    merge_shapes,
+    shapes,
+    surface_point,
+)
 from splatnode.viewer.sources import PagedSource, Source
-from splatnode.viewer.state import Colouring, ViewerState, current_moment, go_to_camera, press
-from splatnode.viewer.support import Support
-from splatnode.viewer.viewpoint import Viewpoint, first_view, move_to_camera, overview, scene_pivot, set_pivot_depth
+from splatnode.viewer.state import (
+    MEMORY_BYTES,
+    Colouring,
+    History,
+    Moment,
+    ViewerState,
+    append_moment,
+    current_moment,
+    go_to_camera,
+    press,
+    same_world,
+)
+from splatnode.viewer.viewpoint import (
+    Canvas,
+    Image,
+    Viewpoint,
+    first_view,
+    move_to_camera,
+    overview,
+    project,
+    scene_pivot,
+    set_pivot_depth,
+)
 
 _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 

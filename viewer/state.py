@@ -4,13 +4,184 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.selection import Selection
-from splatnode.viewer.moment import History, Moment
+from splatnode.recon.result.export.prepare import Selection
+from splatnode.recon.result.snapshot import Snapshot
+
+# A map as a graph: its scenes, how they are linked, and how much of each is loaded. Its lines and its words.
+
+Array = npt.NDArray[np.float64]
+
+FULL = 0  # the level of a scene that is shown as it is; 1, 2 ... are coarser
+NOTHING = -1  # of a scene that is not loaded
+
+_MOST_PLACES = 14  # that the panel lists
+_MOST_LINKS = 8  # loops, and what was retracted
+_DASHES = 9  # of a line that no longer counts
+_MARK = 0.015  # half the size of a scene's mark, in parts of the scene's depth, which is about 1
+
+
+@dataclass(frozen=True, eq=False)
+class GraphNode:
+    """A scene of the map, or a place that is in no map: that has no centre."""
+
+    scene_id: str
+    verdict: str
+    good: bool  # whether its scene is shown
+    centre: Array | None  # (3,) the middle of its cameras
+    num_gaussians: int  # that are loaded
+    level: int  # FULL, coarser, or NOTHING
+
+
+@dataclass(frozen=True, eq=False)
+class GraphEdge:
+    """A link between two scenes of the map."""
+
+    scene: str
+    other: str
+    ends: Array  # (2, 3) the middles of the cameras
+    loop: bool  # the place was found again
+    retracted: str | None  # why the link no longer counts; None: it does
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    nodes: tuple[GraphNode, ...]  # the nearest first
+    edges: tuple[GraphEdge, ...]
+    which: int  # the map's number, from 0 on
+    maps: int  # how many there are
+    merged: bool  # whether what is shown was merged
+
+
+def edge_lines(edges: tuple[GraphEdge, ...], *, loop: bool, retracted: bool) -> Array:
+    """(M, 2, 3) the lines of one kind of links: whole, or dashed where they no longer count."""
+    ends = [edge.ends for edge in edges if edge.loop is loop and (edge.retracted is not None) is retracted]
+    whole = np.array(ends, np.float64).reshape(-1, 2, 3)
+    return _dash_lines(whole) if retracted else whole
+
+
+def node_marks(nodes: tuple[GraphNode, ...], *, good: bool) -> Array:
+    """(M, 2, 3) an octahedron around the middle of each scene of one kind that has one."""
+    centres = np.array([node.centre for node in nodes if node.centre is not None and node.good is good])
+    tips = _MARK * np.concatenate([np.eye(3), -np.eye(3)])
+    pairs = [(a, b) for a in range(6) for b in range(a + 1, 6) if b != a + 3]
+    edges = np.array([[tips[a], tips[b]] for a, b in pairs])
+    return (centres.reshape(-1, 1, 1, 3) + edges[None]).reshape(-1, 2, 3)
+
+
+def place_lines(graph: Graph) -> list[str]:
+    """The places with what was found of each and how much of it is loaded, and the links that are no mere chain."""
+    title = f"map {graph.which + 1} of {graph.maps} (m: the next)" if graph.maps > 1 else "one map"
+    seams = "merged" if graph.merged else "not merged: splatnode merge makes clean seams"
+    lines = [f"{title}, {seams}"]
+    lines += [f"{node.scene_id} {node.verdict}: {_detail(node)}" for node in graph.nodes[:_MOST_PLACES]]
+    further = len(graph.nodes) - _MOST_PLACES
+    lines += [f"and {further} further away"] * (further > 0)
+    special = [edge for edge in graph.edges if edge.loop or edge.retracted is not None]
+    for edge in special[:_MOST_LINKS]:
+        kind = "loop" if edge.loop else "chain"
+        why = f", taken back: {edge.retracted}" if edge.retracted is not None else ""
+        lines.append(f"{kind} {edge.scene} to {edge.other}{why}")
+    return lines
+
+
+def _detail(node: GraphNode) -> str:
+    if node.level == NOTHING:
+        return "not loaded" if node.good else "no scene"
+    how = "full detail" if node.level == FULL else f"coarse, level {node.level}"
+    return f"{node.num_gaussians} Gaussians, {how}"
+
+
+def _dash_lines(lines: Array) -> Array:
+    """Every other part of the lines (M, 2, 3)."""
+    at = np.linspace(0.0, 1.0, 2 * _DASHES)
+    start, step = lines[:, :1], lines[:, 1:] - lines[:, :1]
+    points = start + at[None, :, None] * step  # (M, 2 dashes, 3)
+    return points.reshape(-1, 2, 3)
+
+
+# Moments: snapshots as they reached the viewer, and the bounded history of them that the time slider goes through.
+
+MEMORY_BYTES = 256_000_000  # of a history: some fifty moments of 30 000 Gaussians and 12 cameras
+_SMALLEST = 16  # pixels: a photograph that is drawn smaller is a spot
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A snapshot as it reached the viewer. Its `images` may be of any size, and may lack some cameras."""
+
+    snapshot: Snapshot
+    received_s: float  # monotonic clock of the viewer
+    scene_id: str = ""  # another one is another place: a viewpoint does not carry over
+    graph: Graph | None = None  # of a map of several scenes, of which this is what is loaded; None: of one scene
+
+    @cached_property
+    def photographs(self) -> dict[str, tuple[npt.NDArray[np.uint8], ...]]:
+        """The images at their size, at half of it, at a quarter and so on: what is drawn small must not flicker."""
+        return {name: _build_image_pyramid(image) for name, image in self.snapshot.images.items()}
+
+    @property
+    def num_bytes(self) -> int:
+        gaussians = self.snapshot.gaussians
+        arrays = sum(getattr(gaussians, field.name).nbytes for field in fields(gaussians))
+        return arrays + sum(4 * image.nbytes // 3 for image in self.snapshot.images.values())  # with `photographs`
+
+
+History = tuple[Moment, ...]  # oldest first
+
+_MOST_MOVED = 0.5  # of the spread of the cameras, by which those of a scene that grows may move from moment to moment
+
+
+def same_world(one: Moment, other: Moment) -> bool:
+    """Whether a point of one is at the same place in the other: in one scene and unit, with cameras where they were.
+
+    A scene comes into another world when metres, or poses that were given, become known.
+    """
+    if one.scene_id != other.scene_id or one.snapshot.scale.metric != other.snapshot.scale.metric:
+        return False
+    if one.graph is not None:
+        return True  # a map stays where it is
+    known = {camera.name: camera.T_world_camera[:3, 3] for camera in other.snapshot.cameras}
+    both = [
+        (camera.T_world_camera[:3, 3], known[camera.name]) for camera in one.snapshot.cameras if camera.name in known
+    ]
+    if len(both) < 2:
+        return True
+    here, there = np.array(both).swapaxes(0, 1)
+    spread = max(float(np.linalg.norm(each.std(axis=0))) for each in (here, there))  # RMS distance from their mean
+    return bool(np.linalg.norm(here - there, axis=1).max() <= _MOST_MOVED * spread)
+
+
+def append_moment(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTES) -> History:
+    """The history with `moment` as its newest, thinned until it fits into `memory_bytes`.
+
+    What goes first is the moment whose neighbours are closest together in time, so that the whole time axis stays
+    covered. The first and the newest moment always stay. Of a map only the newest does: the others had parts of it.
+    """
+    if moment.graph is not None:
+        return (moment,)
+    kept = [*history, moment]
+    while len(kept) > 2 and sum(one.num_bytes for one in kept) > memory_bytes:
+        gaps = [after.received_s - before.received_s for before, after in zip(kept, kept[2:], strict=False)]
+        del kept[1 + int(np.argmin(gaps))]
+    return tuple(kept)
+
+
+def _build_image_pyramid(image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], ...]:
+    levels = [image]
+    while min(levels[-1].shape[:2]) >= 2 * _SMALLEST:
+        height, width = levels[-1].shape[:2]
+        levels.append(
+            np.asarray(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
+        )
+    return tuple(levels)
+
 
 POINT_SIZES = (1, 12)  # pixels
 BLEND_STEP = 0.25

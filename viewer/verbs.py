@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import address, port, positive, size
-from splatnode.capture.process.verb import Verb, import_lazily
+from splatnode.capture.process.arguments import Verb, address, import_lazily, port, positive, size
 
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:

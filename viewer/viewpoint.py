@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.result.snapshot import CameraEstimate
-from splatnode.viewer.moment import Moment
+from splatnode.viewer.state import Moment
 
 Array = npt.NDArray[np.float64]
 
@@ -194,3 +194,35 @@ def _rotation(axis: Array, angle: float) -> Array:
     """(3, 3) rotation by Rodrigues' formula; `axis` is a unit vector."""
     cross = np.cross(np.eye(3), axis)  # cross @ v is axis x v
     return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+
+
+# The picture that is being painted: colours, and how far what they show is away.
+
+FloatArray = npt.NDArray[np.floating]
+Image = npt.NDArray[np.uint8]  # (H, W, 3) RGB
+
+BACKGROUND = (24, 26, 30)
+NEAR = 0.005  # world units: nothing closer is drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    image: Image
+    depth: npt.NDArray[np.float32]  # (H, W) z of what is there, infinite where there is nothing
+
+
+def empty_canvas(width: int, height: int) -> Canvas:
+    return Canvas(np.full((height, width, 3), BACKGROUND, np.uint8), np.full((height, width), np.inf, np.float32))
+
+
+def project(points: FloatArray, view: Viewpoint, width: int, height: int) -> FloatArray:
+    """(M, 3) pixel x, pixel y and z of world points (M, 3) in the window."""
+    local = transform_to_camera(points, np.linalg.inv(view.T_world_camera))
+    z = np.where(np.abs(local[:, 2]) > 1e-9, local[:, 2], 1e-9)
+    homogeneous = local @ view.K(width, height).T
+    return np.column_stack([homogeneous[:, :2] / z[:, None], local[:, 2]])
+
+
+def transform_to_camera(points: FloatArray, T_camera_world: FloatArray) -> FloatArray:
+    """(..., 3) world points in the camera's frame."""
+    return points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]

@@ -17,14 +17,92 @@ from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
 from splatnode.capture.image_file import encode_png
 from splatnode.recon.result.export import ResultWriteError, write_files
-from splatnode.viewer import words
+from splatnode.viewer import text
 from splatnode.viewer.editing import EditError
-from splatnode.viewer.help_sheet import HelpSheet
 from splatnode.viewer.panel.panel import Panel
-from splatnode.viewer.pointer import Pointer
 from splatnode.viewer.session import Session
 from splatnode.viewer.stage import Image, WindowStage
-from splatnode.viewer.state import Engine, open3d_draws
+from splatnode.viewer.state import Engine, help_lines, open3d_draws
+from splatnode.viewer.viewpoint import orbit, pan, zoom
+
+# What can be done with mouse and keys, on a sheet over the picture.
+
+
+class HelpSheet:
+    """Two columns, each one label: in a grid the rows would stand far apart."""
+
+    def __init__(self, window: gui.Window) -> None:
+        em = window.theme.font_size
+        self._window = window
+        self.root = gui.Horiz(round(em), gui.Margins(round(em)))
+        self.root.background_color = gui.Color(0.1, 0.11, 0.13, 0.92)
+        self.root.visible = False
+        for column in zip(*help_lines(), strict=True):
+            self.root.add_child(gui.Label("\n".join(column)))
+
+    def lay_out(self, context: gui.LayoutContext, area: gui.Rect) -> None:
+        """In the middle of `area`, as large as it must be."""
+        wanted = self.root.calc_preferred_size(context, gui.Widget.Constraints())
+        width, height = min(wanted.width, area.width), min(wanted.height, area.height)
+        self.root.frame = gui.Rect(
+            area.x + (area.width - width) // 2, area.y + (area.height - height) // 2, width, height
+        )
+
+    def show(self, shown: bool) -> None:
+        if self.root.visible != shown:
+            self.root.visible = shown
+            self._window.set_needs_layout()
+
+
+# The pointer over the picture: it orbits, pans and zooms, or goes to the camera that was clicked.
+
+_TURN_PER_PIXEL = 0.006  # radians
+_ZOOM_PER_NOTCH = 0.88
+_CLICK_PX = 4  # a pointer that moves less between press and release clicks
+
+
+class Pointer:
+    """Remembers between events where it went down, and what it has done since."""
+
+    def __init__(self, session: Session) -> None:
+        self.dragging = False
+        self._session = session
+        self._pressed: tuple[float, float] | None = None  # where it went down, None: it is up
+        self._last = (0.0, 0.0)
+
+    def handle_event(self, event: gui.MouseEvent, x: float, y: float, size: tuple[int, int]) -> bool:
+        """Handles an event at a pixel of the picture, which has this size; returns whether it changes the picture."""
+        if event.type == gui.MouseEvent.Type.BUTTON_DOWN:
+            self._pressed = self._last = (x, y)
+        elif event.type == gui.MouseEvent.Type.DRAG and self._pressed is not None:
+            return self._drag(event, x, y, size)
+        elif event.type == gui.MouseEvent.Type.BUTTON_UP and self._pressed is not None:
+            if not self.dragging:
+                self._session.click(x, y, *size)
+            self._pressed, self.dragging = None, False
+            return True
+        elif event.type == gui.MouseEvent.Type.WHEEL:
+            view = self._session.viewpoint_to_move()
+            if view is not None:
+                self._session.move(zoom(view, _ZOOM_PER_NOTCH**event.wheel_dy))
+                return True
+        return False
+
+    def _drag(self, event: gui.MouseEvent, x: float, y: float, size: tuple[int, int]) -> bool:
+        start = self._pressed or (x, y)
+        if not self.dragging and max(abs(x - start[0]), abs(y - start[1])) < _CLICK_PX:
+            return False
+        view = self._session.viewpoint_to_move()
+        right, down = x - self._last[0], y - self._last[1]
+        self._last, self.dragging = (x, y), True
+        if view is None:
+            return False
+        if event.is_button_down(gui.MouseButton.LEFT):
+            self._session.move(orbit(view, -_TURN_PER_PIXEL * right, _TURN_PER_PIXEL * down))
+        else:
+            self._session.move(pan(view, right, down, float(view.K(*size)[0, 0])))
+        return True
+
 
 _IDLE_AFTER_S = 1.0  # without anything to do, ticks begin to sleep
 _IDLE_SLEEP_S = 0.05  # Open3D ticks a hundred times a second, which would take 2 % of a processor
@@ -152,7 +230,7 @@ class _Window:
         self._words_at = time.monotonic()
         state = self._session.state
         refused = state.engine is Engine.OPEN3D and not open3d_draws(state, self._software)
-        self._panel.show(self._session, self._stage.paint_time_s, words.NO_SPLATS if refused else self._notice)
+        self._panel.show(self._session, self._stage.paint_time_s, text.NO_SPLATS if refused else self._notice)
         self._help.show(self._session.state.help)
 
     def _layout(self, context: gui.LayoutContext) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import millimetres, positive, seconds
-from splatnode.capture.process.verb import Verb, import_lazily
+from splatnode.capture.process.arguments import Verb, import_lazily, millimetres, positive, seconds
 
 _MODELS = ("auto", "pinhole", "opencv2", "opencv4", "fisheye", "opencv5", "opencv8")
 
@@ -38,5 +37,5 @@ CALIBRATE = Verb(
     "calibrate",
     "find a camera's lens from a printed board",
     _arguments,
-    import_lazily("splatnode.capture.calibration.command", "calibrate"),
+    import_lazily("splatnode.capture.calibration.collect", "calibrate"),
 )

@@ -18,14 +18,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.building import view
-from splatnode.capture.diorama.building.overlap import CoarseView, compute_overlap, render_coarse_view
-from splatnode.capture.diorama.building.rooms import CHAIR_ROOM
-from splatnode.capture.diorama.building.walk import Walk, walk
-from splatnode.capture.diorama.cast import Camera
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.diorama.building import walk as building_walk
+from splatnode.capture.diorama.building.building import CHAIR_ROOM
+from splatnode.capture.diorama.building.walk import CoarseView, Walk, compute_overlap, render_coarse_view, walk
+from splatnode.capture.diorama.render import Camera
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
-from splatnode.capture.stamp import Clock, Stamp
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
 BARE = 16.0  # texels a metre, where only surfaces matter: they are the same at every density, and soon made
@@ -83,7 +81,9 @@ def render_image(config: Config, index: float) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB as the camera of keyframe `index` (held out where it ends with .5) sees the building of then."""
     T_world_camera, K = scene_camera(config, index)
     dense = T_world_camera, np.diag([config.samples, config.samples, 1.0]) @ K
-    colours = view.view(state(config, index), dense, config.width * config.samples, config.height * config.samples)
+    colours = building_walk.view(
+        state(config, index), dense, config.width * config.samples, config.height * config.samples
+    )
     image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
     grain = np.random.default_rng([config.seed, round(2 * index)]).standard_normal(image.shape, dtype=np.float32)
     return np.clip(np.rint(image + np.float32(config.noise) * grain), 0, 255).astype(np.uint8)
@@ -91,7 +91,7 @@ def render_image(config: Config, index: float) -> npt.NDArray[np.uint8]:
 
 def depth(config: Config, index: float) -> npt.NDArray[np.float32]:
     """(H, W) true z in the keyframe's camera frame, metres, at pixel centres; of the mirror, that of its glass."""
-    return view.depth(state(config, index), scene_camera(config, index), config.width, config.height)
+    return building_walk.depth(state(config, index), scene_camera(config, index), config.width, config.height)
 
 
 def measure_shared_surface(config: Config, first: int, second: int) -> float:
@@ -104,12 +104,12 @@ def same_place(config: Config, first: int, second: int) -> bool:
     return measure_shared_surface(config, first, second) >= SAME_PLACE
 
 
-def state(config: Config, index: float) -> view.BuildingState:
+def state(config: Config, index: float) -> building_walk.BuildingState:
     """The building when a keyframe is taken: the chair is moved whenever its room has been left."""
     position = _position(config, index)
     left = sum(visit.room == CHAIR_ROOM and visit.last < position for visit in _walk(config).visits)
     density = float(np.clip(0.28 * max(config.width, config.height), 48, 512))
-    return view.BuildingState(config.seed, density, left % 2)
+    return building_walk.BuildingState(config.seed, density, left % 2)
 
 
 def room(config: Config, index: float) -> int | None:

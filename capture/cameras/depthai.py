@@ -19,13 +19,21 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.exposure_settings import ExposureSettings, parse_exposure
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
+from splatnode.capture.frame import (
+    Baseline,
+    CameraUnavailable,
+    DroppedFrame,
+    ExposureSettings,
+    Frame,
+    Intrinsics,
+    RightImage,
+    grey,
+    make_frame,
+    parse_exposure,
+    wall_clock,
+)
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
-from splatnode.capture.right_image import Baseline, RightImage, grey
-from splatnode.capture.stamp import wall_clock
-from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
 

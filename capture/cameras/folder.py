@@ -13,32 +13,43 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from splatnode.capture import heif_file, recording
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame, rename_frame
-from splatnode.capture.given_lens import same_aspect
-from splatnode.capture.given_pose import LARGEST_M, make_given_pose
-from splatnode.capture.given_pose import SIGMA_DEG as POSE_SIGMA_DEG
-from splatnode.capture.given_pose import SIGMA_M as POSE_SIGMA_M
+from splatnode.capture.exif import name_time
+from splatnode.capture.frame import (
+    LONGEST_M,
+    SIGMA_M,
+    Baseline,
+    DroppedFrame,
+    Frame,
+    Intrinsics,
+    RightImage,
+    grey,
+    make_frame,
+    partners,
+    rename_frame,
+)
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     SUFFIXES,
     DecodedImage,
     MaxPixels,
     UnusableImage,
+    ValueRange,
     decode_any_image,
     find_common_range,
     read_image_file,
 )
 from splatnode.capture.image_header import image_kind
+from splatnode.capture.lens_file import same_aspect
 from splatnode.capture.masks import Mask, apply_mask
-from splatnode.capture.name_time import name_time
+from splatnode.capture.odometry import LARGEST_M, make_given_pose
+from splatnode.capture.odometry import SIGMA_DEG as POSE_SIGMA_DEG
+from splatnode.capture.odometry import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
-from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.printable import sanitize_name, sanitize_text
-from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey, partners
-from splatnode.capture.value_range import ValueRange
+from splatnode.capture.process.system import outlast
+from splatnode.capture.process.text import sanitize_name, sanitize_text
 
 if TYPE_CHECKING:
-    from splatnode.capture.poses_file import Trajectory
+    from splatnode.capture.pose_files import Trajectory
 
 DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
 # Photographs that cannot be decoded here; they are reported as dropped.
@@ -126,12 +137,13 @@ def _partners(folder: Path, lefts: list[Path]) -> dict[str, Path]:
 
 def _load_poses(file: Path, paths: list[Path]) -> Trajectory:
     """Loads the poses. Raises ValueError where the file names photographs, and none of these; OSError."""
-    from splatnode.capture.poses_file import read_poses  # brings what interpolates
+    from splatnode.capture.pose_files import read_poses  # brings what interpolates
 
     poses = read_poses(file)
     if poses.by_name and not any(poses.names(frame_name(path)) for path in paths):
         raise ValueError(
-            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(poses.by_name), 100)}, and none of those "
+            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(poses.by_name), 100)}, and none of "
+            "those "
             f"here, such as {frame_name(paths[0])}; give the poses of these photographs"
         )
     return poses

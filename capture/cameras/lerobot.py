@@ -10,12 +10,11 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.cameras import video
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, rename_frame
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp, rename_frame
 from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.lerobot.data_set import Film, film
 from splatnode.capture.pace import Pace, pace_frames
-from splatnode.capture.process.printable import LONGEST_NAME, sanitize_name
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_name
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it

@@ -9,18 +9,27 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
-from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
-from splatnode.capture.logged.calibration import calibration_topic, lens
+from splatnode.capture.lens_file import same_aspect
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
-from splatnode.capture.logged.message import Calibration, UnusableMessage
-from splatnode.capture.logged.order import MessageTime, read_in_order, read_picture, read_times
-from splatnode.capture.logged.pixels import is_colour_image, rgb
-from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES, READ
+from splatnode.capture.logged.messages import (
+    CALIBRATIONS,
+    PICTURES,
+    READ,
+    Calibration,
+    MessageTime,
+    UnusableMessage,
+    calibration_topic,
+    is_colour_image,
+    lens,
+    read_in_order,
+    read_picture,
+    read_times,
+    rgb,
+)
 from splatnode.capture.pace import Pace, pace_frames
-from splatnode.capture.process.foreign import guard_untrusted
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.printable import LONGEST_NAME, sanitize_name, sanitize_text
+from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_name, sanitize_text
 
 log = logging.getLogger(__name__)
 

@@ -16,19 +16,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.cast import Camera, Matrix, cast
-from splatnode.capture.diorama.layout import place
-from splatnode.capture.diorama.look_at import look_at
-from splatnode.capture.diorama.odometry import Config as Odometry
-from splatnode.capture.diorama.odometry import odometry
-from splatnode.capture.diorama.solids import Solid
-from splatnode.capture.diorama.through_lens import cast_through
-from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.gravity import Gravity
-from splatnode.capture.motion import Motion
+from splatnode.capture.diorama.render import Camera, Matrix, Solid, cast, cast_through, look_at
+from splatnode.capture.diorama.scene import Config as Odometry
+from splatnode.capture.diorama.scene import odometry, place
+from splatnode.capture.frame import Baseline, Clock, Frame, Intrinsics, RightImage, Stamp, grey
+from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.pace import FramesPerSecond
-from splatnode.capture.right_image import Baseline, RightImage, grey
-from splatnode.capture.stamp import Clock, Stamp
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
@@ -87,7 +80,7 @@ def frame_name(index: int) -> str:
 
 
 def scene_cameras(config: Config) -> list[Camera]:
-    """The cameras of the stream, in its order; world axes as in splatnode.capture.diorama.layout."""
+    """The cameras of the stream, in its order; world axes as in splatnode.capture.diorama.scene."""
     return [_camera_on_path(config, float(index)) for index in range(config.views)]
 
 

@@ -13,15 +13,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
-from splatnode.capture.given_lens import check_fits
+from splatnode.capture import v4l2_device
+from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, Intrinsics, make_frame, wall_clock
 from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.lens_file import check_fits
 from splatnode.capture.pace import FramesPerSecond
-from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.stamp import wall_clock
-from splatnode.capture.unavailable import CameraUnavailable
-from splatnode.capture.video4linux import locks
-from splatnode.capture.video4linux.device import Device, Format, RawFrame, System
+from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.v4l2_device import Device, Format, RawFrame, System
 
 LIVE = True
 
@@ -83,7 +81,7 @@ def _frames(device: Device, config: Config) -> Iterator[Frame | DroppedFrame]:
         check_fits(config.intrinsics, [(chosen.width, chosen.height)])
     device.set_rate(config.frames_per_second)
     if config.lock:
-        locks.run_free(device)
+        v4l2_device.run_free(device)
     device.start()
     settled, locked, frame_id = time.monotonic() + config.settle_s, not config.lock, 0
     while True:
@@ -93,7 +91,7 @@ def _frames(device: Device, config: Config) -> Iterator[Frame | DroppedFrame]:
         if not locked and time.monotonic() < settled:
             continue
         if not locked:
-            locks.hold(device, config.exposure_us)
+            v4l2_device.hold(device, config.exposure_us)
             locked = True
             continue  # it was exposed before
         item = _frame(raw, chosen, frame_id, config.intrinsics)

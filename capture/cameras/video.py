@@ -9,13 +9,12 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
-from splatnode.capture.given_lens import check_fits, same_aspect
+from splatnode.capture.frame import LARGEST_NS, Clock, DroppedFrame, Frame, Intrinsics, Stamp, make_frame
 from splatnode.capture.image_file import MaxPixels
+from splatnode.capture.lens_file import check_fits, same_aspect
 from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.printable import LONGEST_NAME, sanitize_name
-from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_name
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS, Span, VideoError, VideoFrame, decode_video
 
 log = logging.getLogger(__name__)

@@ -11,24 +11,32 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.cameras.folder import apply_alpha_mask, explain_unreadable_file, frame_name, image_paths
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
-from splatnode.capture.given_lens import same_aspect
+from splatnode.capture.exif import name_time
+from splatnode.capture.frame import (
+    CameraUnavailable,
+    Clock,
+    DroppedFrame,
+    Frame,
+    Intrinsics,
+    KeepAlive,
+    Stamp,
+    make_frame,
+    nearest_stamp,
+)
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     DecodedImage,
     MaxPixels,
     UnusableImage,
+    ValueRange,
     check_whole,
     decode_any_image,
+    find_range,
     measure_values,
     read_image_file,
 )
-from splatnode.capture.name_time import name_time
-from splatnode.capture.nothing_new import KeepAlive
-from splatnode.capture.process.memory_shortage import is_shortage, outlast
-from splatnode.capture.stamp import Clock, Stamp, nearest_stamp
-from splatnode.capture.unavailable import CameraUnavailable
-from splatnode.capture.value_range import ValueRange, find_range
+from splatnode.capture.lens_file import same_aspect
+from splatnode.capture.process.system import is_shortage, outlast
 
 REMEMBERED = 100_000  # photographs that were taken and are no longer there: all may be back
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.frame import Frame, Intrinsics, RightImage, grey
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
 from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.capture.masks import Mask, fill_masked
-from splatnode.capture.right_image import RightImage, grey
 
 Array = npt.NDArray[np.float64]
 

@@ -11,10 +11,9 @@ from typing import Any
 import msgspec
 
 from splatnode.capture.lerobot import tables
-from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_in
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 VERSION = "v3.0"
 INFO, EPISODES = Path("meta", "info.json"), Path("meta", "episodes")
@@ -104,7 +103,8 @@ def episode_name(number: int) -> str:
 
 
 def film(folder: Path, part: str) -> Film:
-    """The episode and camera that `list_parts` names so; "3/KEY" is the episode 3, too, and one camera need not be named.
+    """The episode and camera that `list_parts` names so; "3/KEY" is the episode 3, too, and one camera need not be
+    named.
 
     Raises UnusableDataSet where there is none, or where it has no images; OSError, ModuleNotFoundError.
     """
@@ -159,7 +159,8 @@ def _files(folder: Path) -> list[Path]:
     files = sorted((folder / EPISODES).glob("*/*.parquet"))
     if not files:
         raise UnusableDataSet(
-            f"{_quote_path(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such files: "
+            f"{_quote_path(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such "
+            "files: "
             "copy or download the whole data set, or record an episode first"
         )
     return files

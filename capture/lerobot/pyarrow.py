@@ -26,7 +26,7 @@ from splatnode.capture.lerobot.tables import (
     encode_refusal,
 )
 from splatnode.capture.process import apart
-from splatnode.capture.process.bounded_file import open_regular
+from splatnode.capture.process.files import open_regular
 from splatnode.capture.process.records import decoder_of
 
 MEMORY_BYTES = 1_000_000_000  # of the process that reads, whatever the files say of themselves

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process import apart
-from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.records import decoder_of
+from splatnode.capture.process.text import sanitize_text
 
 MOST_ROWS = 1_000_000  # of all files together: more episodes than any data set has
 _MOST_FILES = 10_000

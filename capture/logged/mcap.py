@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 _MOST_BYTES = 1 << 29  # of a record, and of what it is decompressed to
 

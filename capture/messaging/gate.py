@@ -23,7 +23,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from splatnode.capture.process.crowd import network_of, next_to_go
-from splatnode.capture.process.problems import is_logged
+from splatnode.capture.process.logs import is_logged
 
 log = logging.getLogger(__name__)
 

@@ -15,10 +15,16 @@ from pathlib import Path
 
 import zmq
 
-from splatnode.capture.process.durable import remove_leftovers, write_atomically
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.memory_shortage import outlast
-from splatnode.capture.process.private import NotOwnerOnly, StrayFile, check_owner_only, read_own
+from splatnode.capture.process.files import (
+    NotOwnerOnly,
+    StrayFile,
+    check_owner_only,
+    read_own,
+    remove_leftovers,
+    write_atomically,
+)
+from splatnode.capture.process.system import outlast
+from splatnode.capture.process.text import guard_untrusted
 
 log = logging.getLogger(__name__)
 

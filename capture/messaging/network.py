@@ -17,6 +17,8 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -27,12 +29,43 @@ from zmq.utils.monitor import recv_monitor_message
 from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
-from splatnode.capture.messaging.services import Service
-from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
-from splatnode.capture.process.lock import LockHeld, exclusive
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.capture.process.private import NotOwnerOnly, make_owner_only_folder
-from splatnode.capture.process.problems import is_logged
+from splatnode.capture.process.files import LockHeld, NotOwnerOnly, exclusive, make_owner_only_folder
+from splatnode.capture.process.logs import is_logged
+from splatnode.capture.process.system import make_sure_of_room, raise_file_limit
+from splatnode.capture.process.text import sanitize_text
+
+# The table of services: every message between the processes belongs to one of them.
+
+
+class Pattern(Enum):
+    QUEUE = "ROUTER binds, DEALER connects: acknowledged, nothing is lost"
+    BROADCAST = "PUB binds, SUB connects: newest wins, losses are counted"
+    STATE = "PUB and ROUTER bind, SUB and DEALER connect: newest wins, late subscribers ask for it"
+    COMMANDS = "ROUTER binds, DEALER connects: request and reply"
+
+
+@dataclass(frozen=True)
+class Service:
+    name: str
+    pattern: Pattern
+    tcp_port: int  # counted from the first port of the network
+
+    @property
+    def requests(self) -> Service:
+        """Returns the service on which late subscribers ask for the state; it has a socket of its own."""
+        return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
+
+
+CAPTURE_KEYFRAMES = Service("capture.keyframes", Pattern.QUEUE, 0)
+CAPTURE_PREVIEW = Service("capture.preview", Pattern.BROADCAST, 1)
+CAPTURE_STATUS = Service("capture.status", Pattern.BROADCAST, 2)
+RECON_SCENE = Service("recon.scene", Pattern.STATE, 3)  # and 4, for requests
+RECON_STATUS = Service("recon.status", Pattern.BROADCAST, 5)
+RECON_CONTROL = Service("recon.control", Pattern.COMMANDS, 6)
+CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
+RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured
+RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
+
 
 log = logging.getLogger(__name__)
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import argparse
 
 from splatnode.capture.lens_file import read_lens
-from splatnode.capture.process.progress import show_progress
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.terminal import say, show_progress
 from splatnode.recon.auditing.audit import audit as audited
-from splatnode.recon.auditing.picture import draw_audit
-from splatnode.recon.auditing.stations import find_recordings
-from splatnode.recon.auditing.table import format_heading, format_lines, format_summary, make_values
-from splatnode.recon.auditing.taken import load_first_frames
-from splatnode.recon.locating.photographs import check_lens
+from splatnode.recon.auditing.report import draw_audit, format_heading, format_lines, format_summary, make_values
+from splatnode.recon.auditing.stations import find_recordings, load_first_frames
+from splatnode.recon.locating.localize import check_lens
 from splatnode.recon.result.export.staged import json_bytes, write_file
-from splatnode.recon.result.landmarks_file import read_landmarks
+from splatnode.recon.result.npz_files import read_landmarks
 
 EXIT_GOOD, EXIT_NOTHING = 0, 65
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, islice
 from pathlib import Path
 
 from splatnode.capture import film
+from splatnode.capture.cameras import folder as cameras_folder
 from splatnode.capture.cameras.folder import explain_unreadable_file, frame_name, image_paths
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.lens_file import assign_lens
 from splatnode.capture.lerobot import data_set
-from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.packages import remedy
-from splatnode.capture.process.printable import sanitize_name, sanitize_text
+from splatnode.capture.process.system import raise_shortage, remedy
+from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.recording import is_recording
-from splatnode.recon.batch import sources
+from splatnode.recon.batch import batch
+from splatnode.recon.locating.localize import stream_query_frames
 
 MOST_PHOTOGRAPHS = 3  # of a camera that took many in one recording: the first, the last, and between
 _ONE_CAMERA = "camera"  # the name of that which took a video that is named itself
@@ -95,10 +98,10 @@ def find_recordings(named: Sequence[Path]) -> list[StationRecording]:
 
 def _find_shots(path: Path, seen: set[Path], lists: tuple[Path, ...] = ()) -> Iterator[_Shot | _Unreadable]:
     """Yields what `path` names; `lists` led to it, and those of `seen` were read before."""
-    if path.suffix.lower() == sources.LIST and path.is_file():
-        for listed in sources.read_list(path, lists, seen):
+    if path.suffix.lower() == batch.LIST and path.is_file():
+        for listed in batch.read_list(path, lists, seen):
             try:
-                yield from _find_shots(listed, seen, (*lists, sources.real(path)))
+                yield from _find_shots(listed, seen, (*lists, batch.real(path)))
             except (ValueError, FileNotFoundError) as error:
                 raise_shortage(error)
                 yield _Unreadable(listed.absolute().parts, str(error))
@@ -108,7 +111,7 @@ def _find_shots(path: Path, seen: set[Path], lists: tuple[Path, ...] = ()) -> It
         yield _Shot(path.absolute().parts, camera, pictures)
     if not cameras:
         of_days: dict[Path, bool] = {}  # of each folder, whether those in it are recordings
-        for each in sources.recordings([path], None):
+        for each in batch.recordings([path], None):
             source = Path(each.source)
             above = source.parent
             if source.is_dir() and above not in of_days:
@@ -147,7 +150,7 @@ def _folders_of_photographs(folder: Path) -> list[Path]:
 
 
 def _is_of_one_camera(folder: Path) -> bool:
-    return is_recording(folder) or (bool(image_paths(folder)) and not (folder / sources.REPORT).is_file())
+    return is_recording(folder) or (bool(image_paths(folder)) and not (folder / batch.REPORT).is_file())
 
 
 def _hold_a_camera_a_photograph(folders: Sequence[Path]) -> bool:
@@ -184,7 +187,7 @@ def _make_shot(path: Path, named: Path) -> _Shot | _Unreadable:
             number, key = data_set.episode_and_camera(file, data_set.read_info(file), part)
             return _Shot((*file.parts, data_set.episode_name(number)), sanitize_name(key), Film(path))
         if not part and (data_set.is_data_set(file) or file.suffix.lower() == film.MCAP):
-            sources.list_parts(file)  # which has found none; one of both tells why
+            batch.list_parts(file)  # which has found none; one of both tells why
             film.stream(file)
     except ModuleNotFoundError as error:
         return _Unreadable(path.parts, f"{error.name} is not installed. {remedy(error.name or '')}")
@@ -211,3 +214,74 @@ def _make_short_names(places: Sequence[_Place]) -> list[str]:
     while len({place[-length:] for place in places}) < len(places):
         length += 1
     return [sanitize_name("/".join(place[-length:])) for place in places]
+
+
+# The few photographs of a camera that tell where it stood in a recording, and whether it stood still.
+
+_MOST_HELD = 9  # photographs in memory, evenly spread over what was read of a film so far
+
+
+def load_sample_frames(pictures: ImageFiles | Film, given: Intrinsics | None) -> list[Frame | DroppedFrame]:
+    """The photographs; of a film the first, one from about the middle and the last. `given` is their lens.
+
+    At least one: where nothing can be read, it is a dropped frame that says why.
+    """
+    if isinstance(pictures, ImageFiles):
+        return _read_all(stream_query_frames(pictures.paths, given), pictures.paths[0])
+    frames = _read_all(_sample_frames(_stream(pictures.path)), pictures.path)
+    return frames if given is None else [assign_lens(frame, given) for frame in frames]
+
+
+def load_first_frames(recordings: Iterable[StationRecording]) -> Iterator[Frame | DroppedFrame]:
+    """The first photograph that can be read of each camera in each recording; where there is none, why."""
+    for pictures in (each for recording in recordings for each in recording.cameras.values()):
+        if isinstance(pictures, ImageFiles):
+            frames, path = stream_query_frames(pictures.paths, None), pictures.paths[0]
+        else:
+            frames, path = _stream(pictures.path), pictures.path
+        yield from _read_all(islice((frame for frame in frames if isinstance(frame, Frame)), 1), path)
+
+
+def _stream(path: Path) -> Iterator[Frame | DroppedFrame]:
+    yield from film.stream(path) if film.is_film(path) else cameras_folder.stream(cameras_folder.Config(folder=path))
+
+
+def _read_all(frames: Iterator[Frame | DroppedFrame], path: Path) -> list[Frame | DroppedFrame]:
+    """All of them; in place of what cannot be read from `path`, why."""
+    found: list[Frame | DroppedFrame] = []
+    try:
+        found += frames
+    except ModuleNotFoundError as error:
+        reason = f"{error.name} is not installed. {remedy(error.name or '')}"
+    except (ValueError, OSError) as error:
+        raise_shortage(error)
+        reason = str(error)
+    else:
+        reason = "it holds no photographs"
+    return found or [DroppedFrame(sanitize_name(path.name), sanitize_text(reason))]
+
+
+def _sample_frames(frames: Iterator[Frame | DroppedFrame]) -> Iterator[Frame | DroppedFrame]:
+    """The first, one within an eighth of the middle, and the last; what cannot be used only where there is no other.
+
+    However many there are, few are in memory: when these are too many, every second one is given up, and from then on
+    every second one is held.
+    """
+    held: list[tuple[int, Frame]] = []
+    unusable: DroppedFrame | None = None
+    last, count, step = None, 0, 1
+    for frame in frames:
+        if isinstance(frame, DroppedFrame):
+            unusable = unusable or frame
+            continue
+        if count % step == 0:
+            held.append((count, frame))
+        if len(held) > _MOST_HELD:
+            held, step = held[::2], 2 * step
+        last, count = frame, count + 1
+    if last is not None:
+        middle, between = min(held, key=lambda each: abs(2 * each[0] - count + 1))
+        chosen = {0: held[0][1], middle: between, count - 1: last}
+        yield from chosen.values()
+    elif unusable is not None:
+        yield unusable

@@ -12,9 +12,8 @@ from typing import Any
 
 import msgspec
 
-from splatnode.recon.batch.answer import Outcome, make_failed_outcome
+from splatnode.recon.batch.batch import BatchRecording, Outcome, make_failed_outcome
 from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import NOT_RUN
 
 

@@ -12,20 +12,34 @@ from functools import partial
 from pathlib import Path
 
 from splatnode.capture.process import python
-from splatnode.capture.process.folders import LOCK
-from splatnode.capture.process.packages import remedy
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.capture.process.progress import ProgressStep, Tell, format_times, show_progress, show_waiting
-from splatnode.capture.process.terminal import clear_progress, is_interactive, say
+from splatnode.capture.process.files import LOCK
+from splatnode.capture.process.system import remedy
+from splatnode.capture.process.terminal import (
+    ProgressStep,
+    Tell,
+    clear_progress,
+    format_times,
+    is_interactive,
+    say,
+    show_progress,
+    show_waiting,
+)
+from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.batch import cluster
-from splatnode.recon.batch.answer import FAILED, Outcome
-from splatnode.recon.batch.engine import Plan, Work, run_all
-from splatnode.recon.batch.keeping import remove_leftovers
-from splatnode.recon.batch.ledger import LEDGER, Ledger
-from splatnode.recon.batch.page import PAGE, write_page
+from splatnode.recon.batch.batch import (
+    FAILED,
+    LEDGER,
+    BatchRecording,
+    Ledger,
+    Outcome,
+    Plan,
+    Work,
+    recordings,
+    remove_leftovers,
+    run_all,
+)
 from splatnode.recon.batch.remote import Job
-from splatnode.recon.batch.sources import BatchRecording, recordings
-from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
+from splatnode.recon.batch.report import CSV, PAGE, PARQUET, write_csv, write_page, write_parquet
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.batch.write_back import write_back
 from splatnode.recon.jobs.child import Limits

@@ -13,8 +13,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from splatnode.capture.logged.mcap import UnusableLog, unpack_chunk
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.recon.result.export.foxglove import Message, add_messages, encode_mcap
 
 

@@ -17,9 +17,8 @@ import pyarrow.parquet as pq
 from splatnode.capture.lerobot.data_set import UnusableDataSet
 from splatnode.capture.lerobot.pyarrow import open_bounded_table
 from splatnode.capture.lerobot.tables import check_whole
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.recon.batch.answer import Outcome
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
+from splatnode.recon.batch.batch import Outcome
 
 _ROWS, _AT_A_TIME = 10_000, 500  # in memory at a time: of a batch, and of cameras
 _KINDS = {"str": pa.string(), "bool": pa.bool_(), "int": pa.int64(), "float": pa.float64()}
@@ -77,7 +76,10 @@ def _raise_as_unusable_data_set(said: str) -> Iterator[None]:
 
 
 def _read_rows(file: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a table that `write_cameras` wrote, some at a time. Raises UnusableDataSet where it is none, OSError."""
+    """The rows of a table that `write_cameras` wrote, some at a time.
+
+    Raises UnusableDataSet where it is none, OSError.
+    """
     shown = sanitize_text(str(file))
     must = f"{shown!r} must be a table of cameras that splatnode wrote, for others to be added"
     said = f"{must}; move it away, or mend it"

@@ -12,10 +12,16 @@ import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.recon.batch.answer import Outcome, make_failed_outcome
-from splatnode.recon.batch.engine import Work
-from splatnode.recon.batch.keeping import finalize_result, partial_folder, partial_log
-from splatnode.recon.batch.sources import REPORT, BatchRecording
+from splatnode.recon.batch.batch import (
+    REPORT,
+    BatchRecording,
+    Outcome,
+    Work,
+    finalize_result,
+    make_failed_outcome,
+    partial_folder,
+    partial_log,
+)
 from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, wait_for_end
 from splatnode.recon.jobs.cores import free_core
 from splatnode.recon.jobs.version import other_version

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import add_json, positive, seconds
-from splatnode.capture.process.verb import Verb, import_lazily
+from splatnode.capture.process.arguments import Verb, add_json, import_lazily, positive, seconds
 from splatnode.recon.jobs.arguments import add_max_memory, add_ray
 from splatnode.recon.replay_verb import add_reconstruction_options, add_selection_options
 

@@ -18,12 +18,10 @@ from typing import Any
 from splatnode.capture import film
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.logged.mcap import topics
-from splatnode.capture.logged.order import read_times
-from splatnode.capture.process.folders import LOCK
-from splatnode.capture.process.lock import LockHeld, exclusive
-from splatnode.recon.batch.answer import Outcome
-from splatnode.recon.batch.sources import OWN_SUFFIX
-from splatnode.recon.batch.tables import BEING_WRITTEN, replacing
+from splatnode.capture.logged.messages import read_times
+from splatnode.capture.process.files import LOCK, LockHeld, exclusive
+from splatnode.recon.batch.batch import OWN_SUFFIX, Outcome
+from splatnode.recon.batch.report import BEING_WRITTEN, replacing
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.foxglove import Message, make_calibration, make_pose, make_time
 from splatnode.recon.result.snapshot import CameraEstimate

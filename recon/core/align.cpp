@@ -24,7 +24,7 @@ constexpr float kLargestStretch = 4;   // of an axis of the warp: beyond it, two
 
 }  // namespace
 
-// As splatnode.recon.registration.patch_alignment.Images: grey images of one allocation each.
+// As splatnode.recon.registration.subpixel.Images: grey images of one allocation each.
 struct Images {
     const float* const* pixels;
     const int32_t *widths, *heights;

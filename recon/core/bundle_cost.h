@@ -15,7 +15,7 @@ constexpr double kBehind = 1e6;      // squared pixels: the error of a point beh
 constexpr int kPose = 6, kLens = 6;  // numbers of a camera's pose and of a lens
 constexpr int kOwn = kPose + kLens;  // parameters of an observation but its point
 
-// As splatnode.recon.registration.bundle.Problem; observations ordered by point. Parameters are the cameras' poses (rotation
+// As splatnode.recon.registration.bundle_adjustment.Problem; observations ordered by point. Parameters are the cameras' poses (rotation
 // vector applied from the left, translation), then the lenses' (log focal, two radial, shift of the principal point, log
 // of the focal length down over that across).
 struct Bundle {

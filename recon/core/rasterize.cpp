@@ -1,4 +1,4 @@
-// The C interface of the rasteriser. recon/rasterize/check.py checks shapes and types before it is called.
+// The C interface of the rasteriser. recon/rasterize/reference.py checks shapes and types before it is called.
 #include "rasterize.h"
 
 #include <ctime>

@@ -10,7 +10,7 @@ import msgspec
 from splatnode.capture.messaging.network import Network
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
-from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
+from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.result.message import MAX_CAMERAS
 
 Positive = Annotated[int, msgspec.Meta(ge=1)]

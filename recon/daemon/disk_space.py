@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 
-from splatnode.capture.process.disk_space import shortage
+from splatnode.capture.process.files import shortage
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.memory_shortage import is_shortage
+from splatnode.capture.process.system import is_shortage
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.result.size import estimate_result_bytes
+from splatnode.recon.result.report import estimate_result_bytes
 
 log = logging.getLogger(__name__)
 

@@ -12,13 +12,12 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.memory_shortage import raise_shortage
+from splatnode.capture.process.system import raise_shortage
+from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState
-from splatnode.recon.daemon.watcher import FinalScene
-from splatnode.recon.occupancy.build import occupancy_map
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap
-from splatnode.recon.result.depth_file import read_depths
+from splatnode.recon.occupancy.grid import OccupancyMap, occupancy_map
 from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.npz_files import read_depths
 from splatnode.recon.result.snapshot import Snapshot
 
 log = logging.getLogger(__name__)

@@ -4,21 +4,72 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import Any
+from weakref import WeakKeyDictionary
 
+import msgspec
+
+from splatnode.capture.frame import Frame
+from splatnode.capture.messaging.pubsub import StateServer
+from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
-from splatnode.recon.daemon import places
+from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
+from splatnode.recon.daemon import submap_index
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.metres import MetricScaler
-from splatnode.recon.daemon.places import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
+from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
+from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.result import bounds_in_words
+from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
+from splatnode.recon.metric.measurement import MetricConfig
+from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.modelling import add_landmarks
+from splatnode.recon.occupancy.message import encode_map, no_map
+from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import remove_result
+from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.write import write_result_folder
+
+# The metres of what the daemon shows and writes: what its keyframes tell of them, looked for once in each.
+
+
+class MetricScaler:
+    """Puts scenes into metres as `splatnode replay` does. For one thread."""
+
+    def __init__(self, config: MetricConfig) -> None:
+        self._config = config
+        self._told: WeakKeyDictionary[Frame, Evidence] = WeakKeyDictionary()
+
+    def scale_snapshot(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
+        """Returns the snapshot for viewers, in metres where a scale source is available, else unchanged.
+
+        A network, which takes seconds, is asked about a final scene alone. Landmarks are gathered for a final scene, by
+        which it is measured in its files, too; for others where stereo pairs are measured by them.
+        """
+        evidence = self.collect_evidence(work.graph.keyframes)
+        config = self._config if snapshot.final else msgspec.structs.replace(self._config, network=False)
+        came = evidence.tracked or evidence.motions
+        if evidence.pairs or (snapshot.final and (config != MetricConfig() or came)):
+            snapshot = add_landmarks(snapshot, work.find_reconstruction())
+        measured = apply_metric_scale(snapshot, config, evidence)
+        return measured if snapshot.final else replace(measured, landmarks=None)
+
+    def scale_result(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
+        """Returns the snapshot for a result folder, with its estimate's landmarks if still known."""
+        with_all = add_landmarks(snapshot, work.find_reconstruction())
+        return apply_metric_scale(with_all, self._config, self.collect_evidence(work.graph.keyframes))
+
+    def collect_evidence(self, keyframes: Sequence[Keyframe]) -> Evidence:
+        """Collects the keyframes' scale evidence: markers, poses, motions, gravity, right images."""
+        for frame in (each.frame for each in keyframes):
+            if frame not in self._told:
+                self._told[frame] = gather_evidence((frame,), self._config)
+        return reduce(Evidence.merge, (self._told[each.frame] for each in keyframes), NOTHING)
+
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +146,7 @@ class Output:
         except OSError as error:
             self.complain(SHORT_OF_MEMORY if is_shortage(error) else error.strerror or str(error))
             return False
-        known = bounds_in_words.format_widest_bounds(measured.cameras, measured.scale)
+        known = result_snapshot.format_widest_bounds(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
         return True
 
@@ -105,7 +156,7 @@ class Output:
 
     def add_split_submap(self, scene_id: str, names: Sequence[str]) -> None:
         """Writes into the index that these keyframes of a place that was left are one of their own."""
-        self._write_index(lambda: self.places.update(places.make_unverified_record(scene_id, names)))
+        self._write_index(lambda: self.places.update(submap_index.make_unverified_record(scene_id, names)))
 
     def mark_finished(self, scene_id: str) -> None:
         """Writes into the index that the camera has left a place whose scene is final."""
@@ -129,3 +180,56 @@ def _make_submap_record(
     return make_submap_record(
         place.scene_id, state, folder, snapshot, kept, place.frames_dropped, ledger.follows, ledger.shared
     )
+
+
+# What others are told of the map: it is taken back before anything is shown that it is not of.
+
+
+NO_SCENE = "none"  # in place of a scene's id
+
+
+class OccupancyPublisher:
+    """Says what is known of free space, each thing once. For one thread, that which shows scenes."""
+
+    def __init__(self, server: StateServer, numbering: Numbering) -> None:
+        """`numbering`: of the maps alone, in the session of the scenes."""
+        self._server, self._numbering = server, numbering
+        self._told: tuple[str, OccupancyResult | str] | None = None  # scene, and its map or why there is none
+
+    def serve(self) -> None:
+        """Replies to who asks."""
+        self._server.serve(0)
+
+    def publish(self, found: OccupancyResult | str, shown: PublishedSnapshot | None, sequence: int) -> None:
+        """`found` is the map of a scene, or why there is none; `shown` what viewers see, by message `sequence`."""
+        scene_id = NO_SCENE if shown is None else shown.scene_id
+        now = _match_shown_scene(found, shown)
+        if (scene_id, now) == self._told:
+            return
+        self._told = scene_id, now
+        numbers = self._numbering.next()
+        if isinstance(now, OccupancyResult):
+            now = self._send_map(now, scene_id, sequence, numbers)
+        if now:
+            self._server.publish(no_map(scene_id, now, numbers))
+
+    def _send_map(self, mapped: OccupancyResult, scene_id: str, sequence: int, numbers: dict[str, Any]) -> str:
+        """Sends a map; why not, where there is none to be sent."""
+        if mapped.occupancy is None:
+            return mapped.why
+        try:
+            self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers))
+        except WireError as error:
+            log.warning("the map of %s cannot be sent: %s", scene_id, error)
+            return f"the map is too large: {error}; choose a larger map.voxel"
+        return ""
+
+
+def _match_shown_scene(found: OccupancyResult | str, shown: PublishedSnapshot | None) -> OccupancyResult | str:
+    """The map if it is of what viewers see; else why there is none."""
+    if shown is not None and not shown.snapshot.verdict.publishable:
+        verdict = shown.snapshot.verdict
+        return f"there is no scene: {verdict.code.value}. {verdict.message}"
+    if isinstance(found, str):
+        return found
+    return found if shown is not None and found.of.snapshot is shown.snapshot else NOT_FINAL

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.messaging.values import Amount, Count, Name, Text
-from splatnode.capture.messaging.wire import Header
+from splatnode.capture.messaging.wire import Amount, Count, Header, Name, Text
 from splatnode.recon.result.message import CameraRecord
 
 

@@ -10,20 +10,20 @@ from collections.abc import Callable, Sequence
 
 import msgspec
 
-from splatnode.capture.process.disk_space import is_disk_error
-from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.process.files import is_disk_error
+from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon.atlas.atlas import LoopDetector
-from splatnode.recon.daemon.atlas.links import EdgeKind
+from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
+from splatnode.recon.daemon.atlas.pose_graph import EdgeKind
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.finalizer import InactiveSubmaps
 from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
-from splatnode.recon.daemon.inbox import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame
-from splatnode.recon.daemon.left_places import InactiveSubmaps
+from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame
 from splatnode.recon.daemon.output import Output, PublishedSnapshot
-from splatnode.recon.daemon.present_place import Abandoned, ActiveSubmap
 from splatnode.recon.daemon.status import PLACES, SubmapStatus
+from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
 
 log = logging.getLogger(__name__)
 

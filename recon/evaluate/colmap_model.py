@@ -9,12 +9,37 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
-from splatnode.capture.colmap_images import binary_images, content_lines, text_images
-from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.recon.evaluate.json_file import MAX_BYTES, EvaluationFileError
+import msgspec
+
+from splatnode.capture.pose_files import binary_images, content_lines, text_images
+from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.records import record_in
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
+
+# JSON files of evaluations: true cameras, splits, raw results.
+
+T = TypeVar("T")
+
+MAX_BYTES = 500_000_000
+
+
+class EvaluationFileError(ValueError):
+    """A file of an evaluation that is not what it should be; the message names it."""
+
+
+def read_json(path: Path, kind: type[T], expected: str) -> T:
+    """The content of `path`, which must be `expected`, as a `kind`; numbers are finite.
+
+    Raises EvaluationFileError, OSError.
+    """
+    with guard_untrusted(EvaluationFileError, str(path)):
+        try:
+            return record_in(read_bounded(path, MAX_BYTES, EvaluationFileError, str(path)), kind)
+        except msgspec.MsgspecError as error:
+            raise EvaluationFileError(f"{path} must be {expected}: {error}") from error
+
 
 _PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # parameters of each
 _NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE"}

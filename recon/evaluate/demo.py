@@ -7,11 +7,11 @@ from pathlib import Path
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.dataset import Split
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import CameraEstimate
-from splatnode.recon.workers import map_parallel
+from splatnode.recon.threads import map_parallel
 
 
 def write_capture(folder: Path, place: synthetic.Config) -> Split:

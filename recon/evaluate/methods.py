@@ -7,31 +7,141 @@ them. InstantSplat and the paper start as published; and with our far shell, or 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from typing import Literal
 
 import msgspec
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.clock import Clock
 from splatnode.recon.config import PRESETS, ReconstructionConfig
-from splatnode.recon.evaluate import ablation
-from splatnode.recon.evaluate.start import Start, continue_reconstruction, extract_start_config
-from splatnode.recon.optimize import dropout, refinement, regularise
+from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.modelling import create_initial_scene
+from splatnode.recon.optimize import ensemble, regularizers, training
 from splatnode.recon.optimize.losses import depth, normal, point_render, semantic
 from splatnode.recon.optimize.losses.loss import LossChoice
-from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize.device import Device
+from splatnode.recon.pipeline import estimate_frames, model_scene, reconstruct
+from splatnode.recon.rasterize.dispatch import Device
+from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene import pixelwise
+from splatnode.recon.scene import initialization
+
+# What each part of the paper brings: alone on the base, and missing from the whole.
+#
+# The base is InstantSplat with as many iterations, which is the paper's method without its losses. It already refines
+# poses and thins the points, so these two are only taken away.
+
+BASE, WHOLE = "instantsplat-xl", "paper"
+_LOSSES = {"point-render": "point_render", "depth": "depth", "normal": "normal", "semantic": "semantic"}
+_SETTINGS = ("pseudo-views", "down-sampling", "pose-refinement")
+_NO_THINNING = initialization.GaussianInitializationConfig(depth_tolerance=0.0)
+
+
+@dataclass(frozen=True)
+class Variant:
+    method: str
+    against: str
+
+
+def list_names() -> tuple[str, ...]:
+    """Base, each loss alone, the whole, and the whole without each part."""
+    with_one = (f"{BASE}+{part}" for part in _LOSSES)
+    without_one = (f"{WHOLE}-{part}" for part in (*_LOSSES, *_SETTINGS))
+    return BASE, *with_one, WHOLE, *without_one
+
+
+def is_variant(method: str) -> bool:
+    """Whether a method exists for the ablation alone."""
+    return method in list_names() and method not in (BASE, WHOLE)
+
+
+def list_variants(methods: Collection[str]) -> list[Variant]:
+    """Those of `methods` that the ablation compares, in order."""
+    found = [name for name in list_names() if name in methods]
+    return [Variant(name, WHOLE if name.startswith(f"{WHOLE}-") else BASE) for name in found]
+
+
+def make_configs(whole: ReconstructionConfig) -> dict[str, ReconstructionConfig]:
+    """The variants that are no methods by themselves, by name."""
+    losses = whole.optimize.regularise.losses
+
+    def replace_regularise(**changes: object) -> ReconstructionConfig:
+        changed = msgspec.structs.replace(whole.optimize.regularise, **changes)
+        return msgspec.structs.replace(whole, optimize=msgspec.structs.replace(whole.optimize, regularise=changed))
+
+    with_one = {f"{BASE}+{part}": replace_regularise(losses={name: losses[name]}) for part, name in _LOSSES.items()}
+    without_one = {
+        f"{WHOLE}-{part}": replace_regularise(losses={name: loss for name, loss in losses.items() if name != left_out})
+        for part, left_out in _LOSSES.items()
+    }
+    thick = msgspec.structs.replace(whole.pixelwise or initialization.PixelwiseConfig(), down_sampling=_NO_THINNING)
+    fixed = msgspec.structs.replace(whole.optimize, refine_poses=False)
+    return {
+        **with_one,
+        **without_one,
+        f"{WHOLE}-pseudo-views": replace_regularise(pseudo_views=0),
+        f"{WHOLE}-down-sampling": msgspec.structs.replace(whole, pixelwise=thick),
+        f"{WHOLE}-pose-refinement": msgspec.structs.replace(whole, optimize=fixed),
+    }
+
+
+# The cameras and points of a set of photographs, found once for all methods that would find the same.
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Cameras and depth, no Gaussians yet; it is sent from process to process, and serves several reconstructions."""
+
+    estimate: Reconstruction
+    dropped: list[DroppedFrame]
+    clock: Clock
+    peak_rss_mb: float | None
+
+    @property
+    def seconds(self) -> float:
+        """Returns the seconds that it took so far."""
+        return self.clock.last - self.clock.started
+
+
+def extract_start_config(config: ReconstructionConfig) -> ReconstructionConfig:
+    """The part of a configuration that decides cameras and points; all else is at its defaults."""
+    return ReconstructionConfig(
+        size=config.size,
+        prior=config.prior,
+        matching=config.matching,
+        registration=config.registration,
+        screening=config.screening,
+        verification=config.verification,
+        decision=config.decision,
+        quick=config.quick,
+        ladder=config.ladder,
+    )
+
+
+def find_start(frames: Sequence[Frame], config: ReconstructionConfig) -> Start:
+    """Cameras and depth as `config` finds them, or a verdict that forbids them."""
+    clock = Clock()
+    estimate, dropped = estimate_frames(frames, config, clock)
+    return Start(estimate, dropped, clock, peak_rss_mb())
+
+
+def continue_reconstruction(start: Start, config: ReconstructionConfig) -> Iterator[Snapshot]:
+    """Yields what `reconstruct` gives from here on with `config`; the clock resumes where it stopped."""
+    clock = replace(start.clock, seconds=dict(start.clock.seconds))
+    clock.resume()
+    begun = create_initial_scene(start.estimate, config)
+    yield from model_scene(start.estimate.summary, begun, start.dropped, config, clock)
+
 
 # Iterations at which a configuration shows its scene, besides its end
-CHECKPOINTS = (refinement.MIN_SOFT, 150, 500)
+CHECKPOINTS = (training.MIN_SOFT, 150, 500)
 
 # InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns
 # ten times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.
-_INSTANTSPLAT_RATES = refinement.LearningRates(
+_INSTANTSPLAT_RATES = training.LearningRates(
     means=1.6e-4,
     means_unit="depth",
     quats=1e-2,
@@ -56,14 +166,14 @@ _PAPER_LOSSES = {
 
 def _make_instantsplat_config(iterations: int, losses: Mapping[str, LossChoice]) -> ReconstructionConfig:
     return ReconstructionConfig(
-        pixelwise=pixelwise.PixelwiseConfig(),
-        optimize=refinement.RefinementConfig(
+        pixelwise=initialization.PixelwiseConfig(),
+        optimize=training.RefinementConfig(
             iterations=iterations,
             dssim=0.2,
-            dropout=dropout.DropoutConfig(share=0.0),
+            dropout=ensemble.DropoutConfig(share=0.0),
             control=None,
             rates=_INSTANTSPLAT_RATES,
-            regularise=regularise.RegularizerConfig(losses),
+            regularise=regularizers.RegularizerConfig(losses),
         ),
     )
 
@@ -77,15 +187,15 @@ def _add_checkpoints(config: ReconstructionConfig) -> ReconstructionConfig:
 _PAPER = _make_instantsplat_config(1000, _PAPER_LOSSES)
 _PIXELWISE = {
     "instantsplat-s": _make_instantsplat_config(200, {}),
-    ablation.BASE: _make_instantsplat_config(1000, {}),
-    ablation.WHOLE: _PAPER,
+    BASE: _make_instantsplat_config(1000, {}),
+    WHOLE: _PAPER,
 }
 DENSE_CONFIDENCE = 0.05  # from which on points are rendered and depths compared, where the depth has no holes
 
 
 def add_surroundings(config: ReconstructionConfig, surroundings: Literal["shell", "fill"]) -> ReconstructionConfig:
     """A start with what ours has around the pixels that stereo knows, where MASt3R would know all of them."""
-    by_pixel = msgspec.structs.replace(config.pixelwise or pixelwise.PixelwiseConfig(), surroundings=surroundings)
+    by_pixel = msgspec.structs.replace(config.pixelwise or initialization.PixelwiseConfig(), surroundings=surroundings)
     if surroundings == "fill":
         losses = msgspec.structs.replace(config.optimize.regularise, min_confidence=DENSE_CONFIDENCE)
         config = msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, regularise=losses))
@@ -103,7 +213,7 @@ CONFIGS: dict[str, ReconstructionConfig] = {
         **PRESETS,
         **_PIXELWISE,
         **SURROUNDED,
-        **ablation.make_configs(_PAPER),
+        **make_configs(_PAPER),
     }.items()
 }
 
@@ -133,14 +243,14 @@ SETS = {
     "rivals": RIVALS,
     "published": PUBLISHED,
     "surrounded": tuple(SURROUNDED),
-    "ablation": ablation.list_names(),
+    "ablation": list_names(),
 }
 
 
 def find_method(name: str) -> Method:
     """The method called `name`. Raises ValueError when there is none."""
     if name not in METHODS:
-        listed = [each for each in METHODS if not ablation.is_variant(each)]
+        listed = [each for each in METHODS if not is_variant(each)]
         raise ValueError(f"no method {name!r}; there are: {', '.join(listed)}, and the sets {', '.join(SETS)}")
     return METHODS[name]
 

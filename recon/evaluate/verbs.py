@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import counts, names, positive, seconds
-from splatnode.capture.process.verb import Verb, import_lazily
+from splatnode.capture.process.arguments import Verb, counts, import_lazily, names, positive, seconds
 from splatnode.recon.jobs.arguments import add_max_memory, add_ray
 from splatnode.recon.shared_arguments import add_device
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process import python
-from splatnode.capture.process.private import make_owner_only_folder
+from splatnode.capture.process.files import make_owner_only_folder
 from splatnode.recon.jobs.child import Child, End
 
 CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder

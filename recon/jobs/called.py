@@ -9,7 +9,7 @@ import traceback
 from pathlib import Path
 from typing import IO
 
-from splatnode.capture.process.private import check_owner_only
+from splatnode.capture.process.files import check_owner_only
 from splatnode.recon.jobs.call import ANSWER, CALL, ERROR
 
 RAISED = 1  # the exit code where the function raised

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.process.private import NotOwnerOnly, check_owner_only, make_owner_only_folder, temporary_folder
+from splatnode.capture.process.files import NotOwnerOnly, check_owner_only, make_owner_only_folder, temporary_folder
 from splatnode.recon.jobs.call import Answer, answer_of, start_call, write_call
 from splatnode.recon.jobs.child import NOT_RUN, Limits, wait_for_end
 from splatnode.recon.jobs.copies import open_copies

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from splatnode.capture.process import python
-from splatnode.capture.process.durable import open_itself
+from splatnode.capture.process.files import open_itself
 from splatnode.recon.jobs import launch
 from splatnode.recon.jobs.memory import tree_mb
 

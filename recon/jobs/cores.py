@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatnode.capture.process.private import make_owner_only_folder
+from splatnode.capture.process.files import make_owner_only_folder
 
 
 def usable_cores() -> tuple[int, ...]:

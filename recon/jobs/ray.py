@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, TypeVar
 
-from splatnode.capture.process.printable import sanitize_text
 from splatnode.capture.process.terminal import beneath
+from splatnode.capture.process.text import sanitize_text
 
 ray: Any = import_module("ray")  # by its name: where it is not installed, pyright takes this file for it
 _errors: Any = import_module("ray.exceptions")

@@ -19,7 +19,7 @@ import traceback
 from pathlib import Path
 from typing import IO, NoReturn
 
-from splatnode.capture.process.private import check_owner_only
+from splatnode.capture.process.files import check_owner_only
 from splatnode.recon.jobs.call import CALL, LOG
 from splatnode.recon.jobs.called import RAISED, module_of, run_call
 from splatnode.recon.jobs.launch import end_with

@@ -6,15 +6,19 @@ import argparse
 from dataclasses import asdict
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.given_lens import same_aspect
-from splatnode.capture.lens_file import read_lens
+from splatnode.capture.lens_file import read_lens, same_aspect
 from splatnode.capture.process.terminal import say
-from splatnode.recon.locating.locate import localize_query, prepare_query_image
+from splatnode.recon.locating.localize import (
+    check_lens,
+    choose_intrinsics,
+    localize_query,
+    prepare_query_image,
+    stream_query_frames,
+)
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.locating.photographs import check_lens, choose_intrinsics, stream_query_frames
 from splatnode.recon.result.export.staged import json_bytes, write_file
-from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.result.landmarks_file import read_landmarks
+from splatnode.recon.result.npz_files import read_landmarks
+from splatnode.recon.result.snapshot import Landmarks
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 

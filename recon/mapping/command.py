@@ -14,9 +14,8 @@ from typing import Any
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.process.progress import ProgressStep, format_times, show_progress
 from splatnode.capture.process.records import record_in
-from splatnode.capture.process.terminal import is_interactive, progress, say
+from splatnode.capture.process.terminal import ProgressStep, format_times, is_interactive, progress, say, show_progress
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.mapping.scenes import (
     KEYFRAME_BYTES,
@@ -32,7 +31,7 @@ from splatnode.recon.result.export import read_cameras, remove_result, write_fil
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.whole import FILE
+from splatnode.recon.result.submap_index import FILE
 
 _OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
 

@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
-from splatnode.capture.process.memory_shortage import is_shortage
+from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.process.system import is_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.inbox import ArrivedKeyframe, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.preparation import prepare
-from splatnode.recon.result.whole import FILE
+from splatnode.recon.result.submap_index import FILE
 
 log = logging.getLogger(__name__)
 

@@ -8,15 +8,27 @@ keyframe does not become firmly connected with the others, further partners foll
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.matching.components import find_components
-from splatnode.recon.matching.image_code import Code, similarities
+from splatnode.recon.matching.features import Code, similarities
+
+# Connected components of a graph of frames.
+
+
+def find_components(nodes: Iterable[int], edges: Iterable[tuple[int, int]]) -> list[list[int]]:
+    """The connected components of the undirected graph, the largest first; equally large ones by their first nodes."""
+    label = {node: node for node in nodes}
+    for i, j in edges:
+        old, new = max(label[i], label[j]), min(label[i], label[j])
+        label = {node: new if name == old else name for node, name in label.items()}
+    groups = [[node for node, name in label.items() if name == group] for group in sorted(set(label.values()))]
+    return sorted(groups, key=lambda group: (-len(group), group))
+
 
 Pair = tuple[int, int]
 

@@ -8,28 +8,21 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from splatnode.capture.process.progress import show_waiting
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.terminal import say, show_waiting
 from splatnode.recon.merging.merge import MergedScene, merge_submaps
-from splatnode.recon.merging.submap import Submap, Submaps, load_submaps
-from splatnode.recon.merging.unit import scale_and_up
-from splatnode.recon.result.coarser import DetailLevel, make_detail_levels
-from splatnode.recon.result.depth_file import DEPTHS, encode_depths
+from splatnode.recon.merging.submap import Submap, Submaps, load_submaps, scale_and_up
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians, encode_ply
 from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.levels_file import LEVELS_FILE, make_levels_record
-from splatnode.recon.result.pieces import SHELL_PIECE, make_merged_path, make_piece_name
-from splatnode.recon.result.preview import make_contact_sheet
-from splatnode.recon.result.report import build_report, peak_rss_mb
-from splatnode.recon.result.scale import Scale
-from splatnode.recon.result.size import estimate_result_bytes
+from splatnode.recon.result.levels_of_detail import LEVELS_FILE, DetailLevel, make_detail_levels, make_levels_record
+from splatnode.recon.result.npz_files import DEPTHS, encode_depths
+from splatnode.recon.result.report import build_report, estimate_result_bytes, make_contact_sheet, peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.up import Up
-from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.result.whole import JoinedMap, MapSet, read_map_set
+from splatnode.recon.result.stored_snapshot import SHELL_PIECE, make_merged_path, make_piece_name
+from splatnode.recon.result.submap_index import JoinedMap, MapSet, read_map_set
+from splatnode.recon.result.verdict import Code, Scale, Up, Verdict
 from splatnode.recon.scene.background import SHELL
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65

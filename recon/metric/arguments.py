@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.process.lengths import measurement_argument, parse_measurement
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.text import measurement_argument, parse_measurement, sanitize_text
 
 
 def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:

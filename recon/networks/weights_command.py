@@ -7,9 +7,16 @@ import json
 from collections.abc import Iterator, Sequence
 
 from splatnode.capture.process.terminal import say
-from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
-from splatnode.recon.networks.weight_download import fetch, find_mismatch
-from splatnode.recon.networks.weight_folder import WeightsError, find, folder, locate_weights
+from splatnode.recon.networks.weights import (
+    CATALOGUE,
+    Weights,
+    WeightsError,
+    fetch,
+    find,
+    find_mismatch,
+    folder,
+    locate_weights,
+)
 
 _UNAVAILABLE = 75  # the exit code where something is missing or could not be had: EX_TEMPFAIL
 

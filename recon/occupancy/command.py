@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.process.progress import show_waiting
-from splatnode.capture.process.terminal import say
-from splatnode.recon.occupancy.build import occupancy_map
-from splatnode.recon.result.depth_file import read_depths
-from splatnode.recon.result.export.manifest import MAPS
+from splatnode.capture.process.terminal import say, show_waiting
+from splatnode.recon.occupancy.grid import occupancy_map
+from splatnode.recon.result.export.result import MAPS
+from splatnode.recon.result.npz_files import read_depths
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
-from splatnode.recon.result.whole import is_map_set
+from splatnode.recon.result.submap_index import is_map_set
 
 
 def map_result(args: argparse.Namespace) -> int:

@@ -10,9 +10,9 @@ from splatnode.recon.occupancy.formats.nav2 import encode_nav2
 from splatnode.recon.occupancy.formats.npz import encode_npz
 from splatnode.recon.occupancy.formats.octomap import encode_octomap
 from splatnode.recon.occupancy.formats.ply import encode_ply_mesh
+from splatnode.recon.occupancy.grid import OccupancyMap
 from splatnode.recon.occupancy.mesh import surface_mesh
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap
-from splatnode.recon.result.export.manifest import OF_A_MAP, make_entries, read_digests
+from splatnode.recon.result.export.result import OF_A_MAP, make_entries, read_digests
 from splatnode.recon.result.export.staged import json_bytes, write_files
 
 

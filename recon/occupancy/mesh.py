@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
+from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState
 
 # A face's corners, as steps from the voxel's least corner, anticlockwise from outside; by axis, for the far side
 _FAR_FACES = np.array(

@@ -9,14 +9,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.messaging.values import Name, Sequential, Text
-from splatnode.capture.messaging.wire import Header, Message, WireError
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import sanitize_text
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
-from splatnode.recon.occupancy.upright import Upright
-from splatnode.recon.result.camera_check import find_camera_problem
+from splatnode.capture.messaging.wire import Header, Message, Name, Sequential, Text, WireError
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
+from splatnode.recon.occupancy.grid import OccupancyMap, Upright, VoxelState
 from splatnode.recon.result.message import Matrix4, ScaleRecord, Vector3, make_scale_record, parse_scale
+from splatnode.recon.result.snapshot import find_camera_problem
 
 Side = Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)]
 

@@ -17,9 +17,11 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
+from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import pseudo_views
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.result.snapshot import decode_frame_id
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 
 
 class EnsembleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,3 +60,71 @@ def _mean_render(members: Sequence[Scene], camera: Camera) -> Tensor:
     """(height, width, 3) in [0, 1]."""
     renders = [render_gaussians(member.gaussians, camera).rgb for member in members]
     return torch.stack([rgb for rgb in renders if rgb is not None]).mean(0).clamp(0, 1)
+
+
+# Dropout of Gaussians whose depth is uncertain, so that none relies on another in front of it or behind it.
+#
+# With few photographs, Gaussians along a line of sight share a pixel's colour between them in a way that no other view
+# confirms. If any of them may be missing from a render, each has to be right by itself (DropGaussian, Park et al.
+# 2025). Unlike the paper, which drops all Gaussians alike, the probability follows the confidence of multi-view
+# stereo: where the depth is known, dropout could only cost sharpness.
+
+MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are left out
+
+
+class DropoutConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
+    sure: float = 0.6  # least confidence of stereo at which the uncertainty is 0
+    until: float = 0.7  # share of the refinement after which no Gaussian is left out
+
+
+class Dropout:
+    """Draws the Gaussians that each render leaves out."""
+
+    def __init__(self, config: DropoutConfig, gaussians: Gaussians, views: Sequence[TrainingView], seed: int) -> None:
+        if not 0 <= config.share < 1:
+            raise ValueError(f"dropout.share must be from 0 to below 1, got {config.share}")
+        self._config, self._views = config, views
+        self._generator = torch.Generator().manual_seed(seed)
+        self.follow(gaussians)
+
+    def follow(self, gaussians: Gaussians) -> None:
+        """Goes on with `gaussians`, after a density control has changed them."""
+        if self._config.share:
+            self._probabilities = self._config.share * uncertainty(gaussians, self._views, self._config.sure)
+            self._raised = 1 / (1 - self._probabilities)
+
+    def __call__(self, opacities: Tensor, progress: float) -> Tensor:
+        """The opacities (N,) of a render at `progress` in [0, 1]: 0 in what is left out, raised in the rest.
+
+        The opacity of a Gaussian that is drawn with probability p is divided by p, so that its mean is the same.
+        """
+        if self._config.share == 0 or progress >= self._config.until:
+            return opacities
+        # Drawn on the processor. Memory that a GPU reads by itself lets the copy wait for nothing.
+        drawn = torch.rand(len(opacities), generator=self._generator, pin_memory=opacities.is_cuda)
+        drawn = drawn.to(opacities, non_blocking=True) >= self._probabilities
+        return (opacities * (drawn * self._raised)).clamp(max=MAX_OPACITY)
+
+
+@torch.no_grad()
+def uncertainty(gaussians: Gaussians, views: Sequence[TrainingView], sure: float) -> Tensor:
+    """(N,) in [0, 1]: 1 - confidence / `sure` of stereo at the pixel that seeded a Gaussian, at least 0.
+
+    A Gaussian that no view seeded has 1, one whose view has no point map 0.
+    """
+    device = gaussians.means.device
+    result = torch.ones(len(gaussians), device=device)
+    for view in views:
+        own = (decode_frame_id(gaussians.source_frame) == view.frame_id).nonzero()[:, 0]
+        if view.pointmap is None:
+            result[own] = 0.0
+            continue
+        T, K = view.T_world_camera.to(device), view.K.to(device)
+        x, y, z = (transform_to_camera(gaussians.means[own], T) @ K.T).unbind(1)
+        z = z.clamp(min=1e-6)
+        column = (x / z).clamp(0, view.width - 1).long()
+        row = (y / z).clamp(0, view.height - 1).long()
+        confidence = torch.from_numpy(view.pointmap.confidence).to(device)[row, column]
+        result[own] = (1 - confidence / sure).clamp(min=0.0)
+    return result

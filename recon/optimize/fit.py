@@ -12,20 +12,18 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.geometry import exp_se3, twist_gradient
-from splatnode.recon.optimize import dropout, perceptual_loss, regularise
-from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
+from splatnode.recon.optimize import ensemble, photometric_losses, regularizers
 from splatnode.recon.optimize.control.control import Control, OptimizerStep
-from splatnode.recon.optimize.own_axes import Shifts
+from splatnode.recon.optimize.optimizer import Adam, Moments, Shifts, adam_direction
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularise import Regularizer
+from splatnode.recon.optimize.regularizers import Regularizer
 from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
-from splatnode.recon.rasterize.render import Render
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView, compute_fit_masks
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize.reference import Render
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, compute_fit_masks
 
 if TYPE_CHECKING:
-    from splatnode.recon.optimize.refinement import RefinementConfig
+    from splatnode.recon.optimize.training import RefinementConfig
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 _SCALES = {False: 1.0, True: 0.5}  # of the photographs' resolution, by whether it is halved
@@ -60,7 +58,7 @@ class Trainer:
         self._control: Control | None = None
         if config.control is not None:
             self._control = config.control.module.load(config.control.config, seed)
-        self._dropout = dropout.Dropout(config.dropout, gaussians, scene.views, seed)
+        self._dropout = ensemble.Dropout(config.dropout, gaussians, scene.views, seed)
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._Ts_beside = [view.T_world_camera for view in beside]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
@@ -70,7 +68,7 @@ class Trainer:
         shown = (*fitted, *(np.ones((view.height, view.width), bool) for view in beside))
         few = sum(view.width * view.height for view in views) <= _KEPT_PIXELS
         device = gaussians.means.device
-        self._measure = perceptual_loss.load(config.perceptual, device)
+        self._measure = photometric_losses.load(config.perceptual, device)
         measures = (*(self._measure for _ in scene.views), *(None for _ in beside))
         self._images = {
             half: [
@@ -204,7 +202,7 @@ def _leaves(gaussians: Gaussians, shifts: Shifts | None) -> dict[str, Tensor]:
 
 
 def _regularisation(
-    scene: Scene, fitted: Sequence[npt.NDArray[np.bool_]], config: regularise.RegularizerConfig, seed: int
+    scene: Scene, fitted: Sequence[npt.NDArray[np.bool_]], config: regularizers.RegularizerConfig, seed: int
 ) -> Regularizer | None:
     """The losses beside the photometric one, in the pixels (h, w) that are `fitted`; None where all weights are 0.
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from scipy.linalg import expm, logm
 
-from splatnode.recon.rasterize.gaussian_render import Camera
+from splatnode.recon.rasterize.dispatch import Camera
 from splatnode.recon.scene.scene import TrainingView
 
 _SHARES = (0.15, 0.85)  # of the motion between two training views, within which a pseudo view lies

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.losses.perceptual import LpipsDistance
-from splatnode.recon.optimize.perceptual_loss import perceptual_loss
-from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss, perceptual_loss
 from splatnode.recon.scene.scene import TrainingView
 
 _PROCESSOR = torch.device("cpu")

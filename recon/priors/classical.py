@@ -10,14 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.matching.match import Matcher
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.view_graph import Matcher, ViewGraph
 from splatnode.recon.priors import stereo
-from splatnode.recon.priors.consistency import DepthMap
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.multi_view_consistency import DepthMap
+from splatnode.recon.priors.pointmap import Pointmap, compute_depth_range, compute_modelled_K, select_sparse_points
 from splatnode.recon.priors.prior import Prior
-from splatnode.recon.priors.registered_camera import compute_depth_range, compute_modelled_K, select_sparse_points
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.registration.registration import Registration
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,7 +41,9 @@ class DepthEstimator(Protocol):
 
 
 class ClassicalPrior(Prior):
-    """Depth by `recon.priors.stereo`, or by `estimate_depth_maps` in its place; matches by `matcher`, if there is one."""
+    """Depth by `recon.priors.stereo`, or by `estimate_depth_maps` in its place; matches by `matcher`, if there is
+    one.
+    """
 
     def __init__(
         self, config: Config, depth_maps: DepthEstimator = stereo.estimate_depth_maps, matcher: Matcher | None = None

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+
+from splatnode.recon.core import library, pointer
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.priors.stereo import MIN_SPARSE_POINTS, SparsePoints, estimate_depth_range
+from splatnode.recon.registration.known_poses import axis_depths
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.threads import map_parallel
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,3 +64,247 @@ def compute_world_points(
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
     camera_points = rays * depth[..., None]
     return (camera_points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32)
+
+
+# Reprojection of one view's point map into another: which point is nearest at a pixel, and what it would hide.
+
+Float32 = npt.NDArray[np.float32]
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+OVERLAP_STEP = 8  # pixels between the points that tell how much two maps share
+
+
+def find_overlapping(pointmaps: Sequence[Pointmap], most: int) -> list[list[int]]:
+    """For each point map the others that share most with it, at most so many, in order.
+
+    Two maps share the points of either that fall into the other's image; a point of OVERLAP_STEP squared is asked.
+    """
+    if len(pointmaps) <= most + 1:
+        return [[i for i in range(len(pointmaps)) if i != j] for j in range(len(pointmaps))]
+    thinned = [
+        pointmap.points[::OVERLAP_STEP, ::OVERLAP_STEP][pointmap.depth[::OVERLAP_STEP, ::OVERLAP_STEP] > 0]
+        for pointmap in pointmaps
+    ]
+    inside = np.array([[_count_inside(points, pointmap) for pointmap in pointmaps] for points in thinned])
+    shared = inside + inside.T
+    np.fill_diagonal(shared, -1)
+    return [sorted(np.argsort(-row, kind="stable")[:most].tolist()) for row in shared]
+
+
+def _count_inside(points: Float32, pointmap: Pointmap) -> int:
+    """How many of the world's points (M, 3) fall into the point map's image."""
+    height, width = pointmap.depth.shape
+    T_camera_world = np.linalg.inv(pointmap.T_world_camera)
+    x, y, z = pointmap.K @ (T_camera_world[:3, :3] @ points.T + T_camera_world[:3, 3:])
+    return int(((z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)).sum())
+
+
+def project_nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
+    """(h, w) depth in the target of the nearest source point that falls into each target pixel; (h, w) its footprint.
+
+    The footprint is the point's depth in the source over the focal length: how much of the surface a pixel covers.
+    Both are infinite where no point falls.
+    """
+    depth, footprint = (np.full(target.depth.shape, np.inf, np.float32) for _ in range(2))
+    call = _reprojection(source, target)
+    focal = ctypes.c_float(source.K[0, 0])
+    library().core_reproject_nearest(ctypes.byref(call.native), focal, pointer(depth), pointer(footprint))
+    return depth, footprint
+
+
+def find_explained(
+    source: Pointmap, source_image: Image, target: Pointmap, target_image: Image, colour_tolerance: float
+) -> tuple[Mask, Mask]:
+    """(h, w) target pixels on which source points fall; (h, w) those of which one has the pixel's colour.
+
+    Colours are alike when no channel differs by more than `colour_tolerance`, in [0, 1]. Images are (h, w, 3).
+    """
+    falls, alike = np.zeros(target.depth.shape, np.uint8), np.zeros(target.depth.shape, np.uint8)
+    call = _reprojection(source, target)
+    images = [np.ascontiguousarray(image) for image in (source_image, target_image)]
+    library().core_reproject_explained(
+        ctypes.byref(call.native), *map(pointer, images), int(255 * colour_tolerance), pointer(falls), pointer(alike)
+    )
+    return falls > 0, alike > 0
+
+
+def find_hiding(source: Pointmap, target: Pointmap, tolerance: float) -> Mask:
+    """(h, w) source pixels whose point lies before the target's surface by more than `tolerance` of its depth."""
+    marks = np.zeros(source.depth.shape, np.uint8)
+    call = _reprojection(source, target)
+    surface = np.ascontiguousarray(target.depth, np.float32)
+    library().core_reproject_hiding(
+        ctypes.byref(call.native), pointer(surface), ctypes.c_float(tolerance), pointer(marks)
+    )
+    return marks > 0
+
+
+class _Native(ctypes.Structure):
+    """The struct Reprojection of recon/core/reproject.cpp."""
+
+    _fields_ = [
+        ("depth", ctypes.c_void_p),
+        *((name, ctypes.c_int32) for name in ("width", "height", "target_width", "target_height")),
+        ("A", ctypes.c_float * 9),
+        ("t", ctypes.c_float * 3),
+    ]
+
+
+class _Call:
+    """The struct for one call, and the array that it points to, which must live as long."""
+
+    def __init__(self, depth: Float32, target: Pointmap, A: npt.NDArray[np.float64], t: npt.NDArray[np.float64]):
+        self.depth = depth
+        height, width = depth.shape
+        target_height, target_width = target.depth.shape
+        self.native = _Native(
+            depth.ctypes.data, width, height, target_width, target_height,
+            (ctypes.c_float * 9)(*A.ravel()), (ctypes.c_float * 3)(*t),
+        )  # fmt: skip
+
+
+def _reprojection(source: Pointmap, target: Pointmap) -> _Call:
+    T_target_source = np.linalg.inv(target.T_world_camera) @ source.T_world_camera
+    A = target.K @ T_target_source[:3, :3] @ np.linalg.inv(source.K)
+    return _Call(np.ascontiguousarray(source.depth, np.float32), target, A, target.K @ T_target_source[:3, 3])
+
+
+# Depths that two photographs confirm, and what of them a result keeps.
+
+
+LEAST_CONFIDENCE = 0.12  # of stereo for a depth that counts, as in recon.scene.completion
+AGREEING = 0.02  # relative difference of two photographs' depths of one point
+REDUCTION = 2  # pixels along each axis of which a result keeps one depth
+MOST_PARTNERS = 8  # other photographs that each is compared with: those that share most with it
+
+
+def find_consistent_pixels(pointmaps: Sequence[Pointmap]) -> list[Mask]:
+    """(h, w) for each point map the pixels whose depth a point of another one confirms."""
+    known = [pointmap.apply_mask(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
+    partners = find_overlapping(known, MOST_PARTNERS)
+
+    def agrees(j: int) -> Mask:
+        mine = known[j]
+        mask = np.zeros(mine.depth.shape, bool)
+        for i in partners[j]:
+            there, _ = project_nearest(known[i], mine)
+            mask |= np.abs(there - mine.depth) < AGREEING * mine.depth
+        return mask & (mine.depth > 0)
+
+    return map_parallel(agrees, range(len(known)))
+
+
+def compute_consistent_shares(masks: Sequence[Mask], used: Sequence[Mask]) -> list[float]:
+    """The share of each view's used pixels (h, w) whose depth is multi-view consistent, by the masks of
+    `find_consistent_pixels`.
+
+    It is 0 for a view of which nothing is used.
+    """
+    return [float(mask[own].mean()) if own.any() else 0.0 for mask, own in zip(masks, used, strict=True)]
+
+
+def compute_consistent_depths(pointmaps: Sequence[Pointmap]) -> dict[str, npt.NDArray[np.float16]]:
+    """Computes consistent depths by image, one for REDUCTION squared pixels; 0 where there is none.
+
+    It is the mean of those of the square that are confirmed, at least half of its pixels, where these show one surface:
+    at outlines nothing is kept.
+    """
+    return {
+        pointmap.name: _reduce_depth(np.where(mask, pointmap.depth, np.float32(0)))
+        for pointmap, mask in zip(pointmaps, find_consistent_pixels(pointmaps), strict=True)
+    }
+
+
+def _reduce_depth(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float16]:
+    height, width = (side // REDUCTION for side in depth.shape)
+    squares = depth[: height * REDUCTION, : width * REDUCTION].reshape(height, REDUCTION, width, REDUCTION)
+    count = (squares > 0).sum((1, 3))
+    near, far = np.where(squares > 0, squares, np.inf).min((1, 3)), squares.max((1, 3))
+    sure = (2 * count >= REDUCTION**2) & (far - near < AGREEING * near)
+    return np.where(sure, squares.sum((1, 3)) / np.maximum(count, 1), 0.0).astype(np.float16)
+
+
+# Normals of a depth map that has none of its own.
+
+Map = npt.NDArray[np.float32]
+
+
+def compute_depth_normals(depth: Map, K: npt.NDArray[np.float64], max_step: float = 0.1) -> Map:
+    """(H, W, 3) unit normals in the camera frame, facing the camera; 0 where they are not known.
+
+    From the points of the neighbours on both sides (one side at borders and at steps of the depth by more than
+    `max_step`, relatively). `depth` (H, W) is z, 0 where unknown; K is (3, 3).
+    """
+    height, width = depth.shape
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    z = depth.astype(np.float64)
+    points = np.stack([(u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z, z], -1)
+    along_u, along_v = _slope(points, 1, max_step), _slope(points, 0, max_step)
+    normal = np.cross(along_u, along_v)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    known = (length > 0) & (depth[..., None] > 0)
+    normal = np.where(known, normal / np.where(length > 0, length, 1.0), 0.0)
+    away = (normal * points).sum(-1, keepdims=True) > 0
+    return np.where(away, -normal, normal).astype(np.float32)
+
+
+def _slope(points: npt.NDArray[np.float64], axis: int, max_step: float) -> npt.NDArray[np.float64]:
+    """Change of the points (H, W, 3) along `axis`: the sum of the steps to both neighbours that lie on the surface."""
+    step = np.diff(points, axis=axis)
+    first, second = (points.take(range(a, points.shape[axis] + b), axis=axis)[..., 2:] for a, b in ((0, -1), (1, 0)))
+    joined = (first > 0) & (second > 0) & (np.abs(first - second) <= max_step * np.minimum(first, second))
+    step = np.where(joined, step, 0.0)
+    pad = [(0, 0)] * 3
+    pad[axis] = (1, 0)
+    before = np.pad(step, pad)
+    pad[axis] = (0, 1)
+    return before + np.pad(step, pad)
+
+
+# What the registration knows of a camera, at the modelled size of its keyframe's image.
+
+Array = npt.NDArray[np.float64]
+
+_AROUND = 4.0  # times nearer and farther than where the cameras' axes meet: searched of a camera without points
+
+
+def compute_modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
+    """(3, 3) the intrinsics of a registered camera for its image at modelled size."""
+    keyframe = graph.keyframes[camera.index]
+
+    (sx, sy), (fx, fy), (cx, cy) = keyframe.scale, camera.focals, camera.principal
+    return np.array([[fx * sx, 0.0, cx * sx], [0.0, fy * sy, cy * sy], [0.0, 0.0, 1.0]])
+
+
+def select_sparse_points(
+    registration: Registration, camera: RegisteredCamera, scale: tuple[float, float]
+) -> SparsePoints:
+    """The registered points that a camera observes: their pixels at modelled size, and their depths.
+
+    `scale` is modelled over full width and height, as `Keyframe.scale`.
+    """
+    mine = registration.observed_by == camera.index
+    world = registration.points[registration.observed_point[mine]]
+    T_camera_world = np.linalg.inv(camera.T_world_camera)
+    depths = world @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    return SparsePoints(registration.observed_pixels[mine] * scale, depths)
+
+
+def compute_depth_range(
+    registration: Registration, camera: RegisteredCamera, points: SparsePoints
+) -> tuple[float, float]:
+    """(near, far) in which a camera's depth is searched: from its `points`; of too few, where others look, too.
+
+    A camera that a given pose holds may have no points: those of the others count, and where the axes of cameras meet.
+    """
+    if int((points.depths > 0).sum()) >= MIN_SPARSE_POINTS or registration.given is None:
+        return estimate_depth_range(points.depths)
+    T_camera_world = np.linalg.inv(camera.T_world_camera)
+    depths = registration.points @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    if int((depths > 0).sum()) >= MIN_SPARSE_POINTS:
+        return estimate_depth_range(depths)
+    Ts = np.stack([each.T_world_camera for each in registration.cameras])
+    depths = axis_depths(np.swapaxes(Ts[:, :3, :3], 1, 2), Ts[:, :3, 3])
+    middle = float(np.median(depths)) if len(depths) else 1.0  # the unit of length is the distance to the scene
+    return middle / _AROUND, middle * _AROUND

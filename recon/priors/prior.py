@@ -1,7 +1,7 @@
 """The interface of priors. A new prior is one file or folder of recon/priors, and no line elsewhere.
 
 Its module has `Config`, a Struct with at least `seed`, and `load(config)`; `splatnode.recon.learned_parts` says what a
-module with learned weights has beside them. The weights need an entry in recon/networks/weight_catalogue.py.
+module with learned weights has beside them. The weights need an entry in recon/networks/weights.py.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
-from splatnode.recon.matching.match import Matcher
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.view_graph import Matcher, ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.registration.registration import Registration
 
 
 class Prior(Protocol):

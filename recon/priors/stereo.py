@@ -1,6 +1,7 @@
 """PatchMatch multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
 
-`estimate_depth_maps` does it for a set of views, `estimate_further_depth_map` for one more beside those that have a map: there
+`estimate_depth_maps` does it for a set of views, `estimate_further_depth_map` for one more beside those that have a
+map: there
 `rank_partners` tells which views to compare it with, and `estimate_planes` matches it alone.
 """
 
@@ -14,11 +15,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.recon.deadline import OutOfTime
+from splatnode.capture.process.system import raise_shortage
+from splatnode.recon.clock import OutOfTime
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS
-from splatnode.recon.priors import consistency
-from splatnode.recon.priors.consistency import DepthMap
+from splatnode.recon.priors import multi_view_consistency
+from splatnode.recon.priors.multi_view_consistency import DepthMap
 from splatnode.recon.priors.patchmatch import (
     Matching,
     Planes,
@@ -28,7 +29,7 @@ from splatnode.recon.priors.patchmatch import (
     make_level,
     resize_planes,
 )
-from splatnode.recon.workers import map_parallel
+from splatnode.recon.threads import map_parallel
 
 log = logging.getLogger(__name__)
 
@@ -66,7 +67,9 @@ class StereoConfig:
     best_angle_deg: float = 12.0  # triangulation angle that matches best
     stages: tuple[StereoStage, ...] = DEFAULT_STAGES
     matching: Matching = field(default_factory=Matching)
-    consistency: consistency.ConsistencyConfig = field(default_factory=consistency.ConsistencyConfig)
+    consistency: multi_view_consistency.ConsistencyConfig = field(
+        default_factory=multi_view_consistency.ConsistencyConfig
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +147,7 @@ def estimate_depth_maps(
         levels[finest] = map_parallel(_make_level, views, [finest] * len(views))
     planes = map_parallel(resize_planes, planes, levels[finest])
     checked = [select_check_views(ranked, config) for ranked in partners]
-    return consistency.cross_check(levels[finest], planes, checked, config.matching, config.consistency)
+    return multi_view_consistency.cross_check(levels[finest], planes, checked, config.matching, config.consistency)
 
 
 def _call_pause(pause: Callable[[], None], may_end: bool) -> None:
@@ -179,10 +182,10 @@ def estimate_further_depth_map(
     checked = [j for j, _ in partners if j in depths][: config.num_checked]
     levels = {j: _make_level(views[j], finest) for j in (index, *checked)}
     others = [resize_planes(_make_flat_planes(depths[j]), levels[j]) for j in checked]
-    agreeing = consistency.compute_agreement(
+    agreeing = multi_view_consistency.compute_agreement(
         levels[index], planes, [levels[j] for j in checked], others, config.consistency
     )
-    return consistency.make_depth_map(levels[index], planes, agreeing, config.matching, config.consistency)
+    return multi_view_consistency.make_depth_map(levels[index], planes, agreeing, config.matching, config.consistency)
 
 
 def estimate_planes(

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatnode.recon.rasterize.check import check_input
 from splatnode.recon.rasterize.native import (
     CHANNEL_BITS,
     RasterGradients,
@@ -22,8 +21,7 @@ from splatnode.recon.rasterize.native import (
     make_raster_input,
     raster_forward,
 )
-from splatnode.recon.rasterize.reference import CHANNELS, NEAR
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.rasterize.reference import CHANNELS, NEAR, Render, check_input
 
 
 def rasterize(

@@ -11,7 +11,7 @@ from splatnode.recon import poselib
 from splatnode.recon.core import library, pointer
 from splatnode.recon.geometry import undistort_iterations
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle
+from splatnode.recon.registration import bundle_adjustment
 
 Array = npt.NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def relative_pose(pair: TwoView, focal1: float, focal2: float, max_error_px: flo
     return np.asarray(pose.R), np.asarray(pose.t), int(sum(info["inliers"]))
 
 
-def sampson_errors(estimate: bundle.Problem, views: tuple[int, int], pair: TwoView) -> Array:
+def sampson_errors(estimate: bundle_adjustment.Problem, views: tuple[int, int], pair: TwoView) -> Array:
     """(M,) Sampson errors of the matches of `pair` under the estimated poses of its two views, pixels.
 
     Infinite where a match's point lies behind a camera (Hartley and Zisserman, 2004, 11.4.3 for the error).

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras, compute_rms_radius
 from splatnode.recon.registration.known_poses import Offset, has_pose
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.registration.registration import Registration
 
 Array = npt.NDArray[np.float64]
 

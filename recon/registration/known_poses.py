@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import compute_rms_radius
-from splatnode.recon.registration import bundle
+from splatnode.recon.registration import bundle_adjustment
 
 Array = npt.NDArray[np.float64]
 
@@ -23,7 +23,7 @@ _LEAST_SPREAD = 1e-9  # metres, in place of 0
 class Given:
     """Poses of some of C keyframes. A unit of the frame that the poses are in has `metres`, around `origin`."""
 
-    poses: bundle.GivenPoses
+    poses: bundle_adjustment.GivenPoses
     origin: Array  # (3,) metres, in the given world
     metres: float
 
@@ -98,7 +98,7 @@ def collect_known_poses(keyframes: Sequence[Keyframe], offset: Offset | None = N
     origin, metres = centres[known].mean(0), max(apart, _LEAST_SPREAD)
     sigmas[:, 1] /= metres
     centres[known] = (centres[known] - origin) / metres
-    return Given(bundle.GivenPoses(rotations, centres, sigmas), origin, metres)
+    return Given(bundle_adjustment.GivenPoses(rotations, centres, sigmas), origin, metres)
 
 
 def has_pose(keyframe: Keyframe) -> bool:
@@ -107,12 +107,12 @@ def has_pose(keyframe: Keyframe) -> bool:
     return keyframe.frame.given_pose is not None and lens is not None and lens.source in TOLD
 
 
-def distance(problem: bundle.Problem, registered: Sequence[int]) -> float:
+def distance(problem: bundle_adjustment.Problem, registered: Sequence[int]) -> float:
     """The median depth of the points; of too few, that at which the cameras' axes are nearest to one another."""
     if len(problem.points) >= _ENOUGH_POINTS:
-        return float(np.median(bundle.project(problem)[1]))
-    found = axis_depths(problem.rotations[list(registered)], bundle.centres(problem)[list(registered)])
-    centres = bundle.centres(problem)[list(registered)]
+        return float(np.median(bundle_adjustment.project(problem)[1]))
+    found = axis_depths(problem.rotations[list(registered)], bundle_adjustment.centres(problem)[list(registered)])
+    centres = bundle_adjustment.centres(problem)[list(registered)]
     return float(np.median(found)) if len(found) else _FAR_OFF * max(compute_rms_radius(centres), _LEAST_SPREAD)
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, tracks
+from splatnode.recon.registration import bundle_adjustment, triangulation
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -44,8 +44,8 @@ class MapperInput:
     lenses: tuple[Lens, ...]
     pairs: Pairs  # by the positions of their views (i < j)
     scale: Array  # (C,) longer side of each view over REFERENCE_SIDE, at which thresholds in pixels hold
-    growing_tracks: tracks.Tracks  # some, for the time while views are added
-    final_tracks: tracks.Tracks  # more, for the last adjustment
+    growing_tracks: triangulation.Tracks  # some, for the time while views are added
+    final_tracks: triangulation.Tracks  # more, for the last adjustment
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ class PartialMap:
     """A map under way. Its estimate has all C views of the problem as cameras; only the registered ones are valid."""
 
     registered: tuple[int, ...]  # views; the first one is the camera that adjustments fix
-    estimate: bundle.Problem
-    prior: bundle.LensPrior
+    estimate: bundle_adjustment.Problem
+    prior: bundle_adjustment.LensPrior
     track_of_point: Index  # (P,) ascending
 
 
@@ -62,14 +62,14 @@ def prepare(
     views: Sequence[MapperView], lenses: Sequence[Lens], pairs: Pairs, max_growing_tracks: int, max_final_tracks: int
 ) -> MapperInput:
     """The mapping problem of `views`, with about so many tracks a view while views are added, and in the end."""
-    every = tracks.build([view.points for view in views], pairs)
+    every = triangulation.build([view.points for view in views], pairs)
     return MapperInput(
         views=tuple(views),
         lenses=tuple(lenses),
         pairs=pairs,
         scale=np.array([view.longer_side for view in views]) / REFERENCE_SIDE,
-        growing_tracks=tracks.thin(every, max_growing_tracks),
-        final_tracks=tracks.thin(every, max_final_tracks),
+        growing_tracks=triangulation.thin(every, max_growing_tracks),
+        final_tracks=triangulation.thin(every, max_final_tracks),
     )
 
 

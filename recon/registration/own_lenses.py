@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.registration import bundle, triangulation
+from splatnode.recon.registration import bundle_adjustment, triangulation
 from splatnode.recon.registration.mapping_problem import Lens, MapperInput, PartialMap
 
 Array = npt.NDArray[np.float64]
@@ -57,8 +57,8 @@ class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PerViewLensMap:
     """A map in which each view has a lens of its own, near the common one of its group."""
 
-    estimate: bundle.Problem  # with C lenses, one a view
-    prior: bundle.LensPrior  # of these
+    estimate: bundle_adjustment.Problem  # with C lenses, one a view
+    prior: bundle_adjustment.LensPrior  # of these
     stays: Flags  # (C, 6) deviations from the common lens that stay
     widths: Array  # (C, 6) of the deviations of a group many of whose views refute that it has this in common; else 0
     common: Array  # (C, 6) the common parameters of the group of each view
@@ -73,7 +73,7 @@ class PerViewLensMap:
 def free_lenses(
     problem: MapperInput,
     partial: PartialMap,
-    loss: bundle.BundleAdjustmentConfig,
+    loss: bundle_adjustment.BundleAdjustmentConfig,
     config: OwnLensesConfig,
     coarse: triangulation.TriangulationConfig | None = None,
 ) -> PerViewLensMap:
@@ -101,7 +101,9 @@ def free_lenses(
             estimate, _ = triangulation.retriangulate(
                 estimate, problem.growing_tracks, partial.registered, problem.scale, coarse, _COARSE_TOLERANCE
             )
-        estimate = bundle.adjust(estimate, prior, loss if turn == _ROUNDS - 1 else quick, partial.registered[0])
+        estimate = bundle_adjustment.adjust(
+            estimate, prior, loss if turn == _ROUNDS - 1 else quick, partial.registered[0]
+        )
         middles = _common_parameters(estimate, prior, registered)
         # What is `refuted_at` standard errors from its mean, or farther, stays under such a prior
         sizes = kept * _pool_deviations(_parameters(estimate) - middles)
@@ -166,12 +168,12 @@ def split_lenses(
     )
     known = partial.prior.ties
     to, tied = (np.full(len(common), -1), np.zeros_like(common)) if known is None else (known.to, known.sigmas)
-    ties = bundle.LensTies(
+    ties = bundle_adjustment.LensTies(
         to=np.concatenate([to, groups[views]]),
         sigmas=np.concatenate([tied, np.where(freed.stays[views], _WIDER * freed.widths[views], floors)]),
     )
     means = partial.prior.log_focals
-    prior = bundle.LensPrior(
+    prior = bundle_adjustment.LensPrior(
         log_focals=np.concatenate([means, means[groups[views]]]),
         sigmas=sigmas[:, _FOCAL],
         radial_sigmas=sigmas[:, 1:3],
@@ -185,7 +187,7 @@ def split_lenses(
     return problem, replace(partial, estimate=estimate, prior=prior)
 
 
-def find_common_lens(prior: bundle.LensPrior, lens: int, config: OwnLensesConfig) -> int:
+def find_common_lens(prior: bundle_adjustment.LensPrior, lens: int, config: OwnLensesConfig) -> int:
     """The common lens whose focal length and distortion a lens has; the lens itself where these are its own."""
     if prior.ties is None or prior.ties.to[lens] < 0:
         return lens
@@ -196,8 +198,8 @@ def find_common_lens(prior: bundle.LensPrior, lens: int, config: OwnLensesConfig
 
 
 def widen_lens_priors(
-    problem: bundle.Problem, prior: bundle.LensPrior, sides: Array, config: OwnLensesConfig
-) -> tuple[bundle.Problem, bundle.LensPrior]:
+    problem: bundle_adjustment.Problem, prior: bundle_adjustment.LensPrior, sides: Array, config: OwnLensesConfig
+) -> tuple[bundle_adjustment.Problem, bundle_adjustment.LensPrior]:
     """The same map with what is not known of lenses: each view may deviate from the lens that it shares.
 
     `sides` (C,) are the longer sides of the views' pictures. The covariance of the two has that in it.
@@ -219,7 +221,7 @@ def widen_lens_priors(
     return _expand_lenses(problem), _prior(prior, groups, own, common)
 
 
-def _expand_lenses(estimate: bundle.Problem) -> bundle.Problem:
+def _expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Problem:
     groups = estimate.lens_of_camera
     return replace(
         estimate,
@@ -239,29 +241,33 @@ def _sigmas(focal: float, shift: float, radial: float, sides: Array, aspect: flo
     return sigmas
 
 
-def _least_common(prior: bundle.LensPrior, groups: Index, sides: Array, config: OwnLensesConfig) -> Array:
+def _least_common(prior: bundle_adjustment.LensPrior, groups: Index, sides: Array, config: OwnLensesConfig) -> Array:
     """(C, 6) sigmas of what the views of a group have in common, where nothing speaks against what is known of it."""
     least = _sigmas(config.calibrated_focal, config.calibrated_shift, 0.0, sides, config.aspect_sigma)
     return np.maximum(prior.own_sigmas[groups], least)
 
 
-def _prior(of_groups: bundle.LensPrior, groups: Index, own: Array, common: Array) -> bundle.LensPrior:
-    return bundle.LensPrior(
+def _prior(
+    of_groups: bundle_adjustment.LensPrior, groups: Index, own: Array, common: Array
+) -> bundle_adjustment.LensPrior:
+    return bundle_adjustment.LensPrior(
         log_focals=of_groups.log_focals[groups],
         sigmas=own[:, _FOCAL],
         radial_sigmas=own[:, 1:3],
         shift_sigmas=own[:, 3],
         aspect_sigmas=own[:, _ASPECT],
-        common=bundle.CommonLensPrior(groups, common),
+        common=bundle_adjustment.CommonLensPrior(groups, common),
     )
 
 
-def _parameters(estimate: bundle.Problem) -> Array:
+def _parameters(estimate: bundle_adjustment.Problem) -> Array:
     """(G, 6)"""
     return np.column_stack([estimate.log_focals, estimate.radials, estimate.shifts, np.log(estimate.aspects)])
 
 
-def _common_parameters(estimate: bundle.Problem, prior: bundle.LensPrior, registered: Flags) -> Array:
+def _common_parameters(
+    estimate: bundle_adjustment.Problem, prior: bundle_adjustment.LensPrior, registered: Flags
+) -> Array:
     """(C, 6) the most likely common parameters of each view's group."""
     if prior.common is None:
         raise ValueError("the prior must have common parameters")
@@ -296,7 +302,7 @@ def add_lens(problem: MapperInput, partial: PartialMap, view: int, focal: float)
         shifts=np.vstack([before.shifts, np.zeros((1, 2))]),
         log_aspects=np.append(np.log(before.aspects), 0.0),
     )
-    prior = bundle.LensPrior(
+    prior = bundle_adjustment.LensPrior(
         log_focals=np.append(prior.log_focals, np.log(focal)),
         sigmas=np.append(prior.sigmas, _OWN_SIGMA),
         radial_sigmas=np.vstack([prior.radial_sigmas, np.zeros((1, 2))]),
@@ -304,7 +310,7 @@ def add_lens(problem: MapperInput, partial: PartialMap, view: int, focal: float)
         aspect_sigmas=None if prior.aspect_sigmas is None else np.append(prior.aspect_sigmas, 0.0),
         ties=None
         if prior.ties is None
-        else bundle.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
+        else bundle_adjustment.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
     )
     views = tuple(replace(each, lens=number) if index == view else each for index, each in enumerate(problem.views))
     problem = replace(problem, views=views, lenses=(*problem.lenses, Lens((focal,), _OWN_SIGMA)))

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from splatnode.recon.registration import bundle
+from splatnode.recon.registration import bundle_adjustment
 
 Array = npt.NDArray[np.float64]
 
@@ -38,7 +38,9 @@ class Residual:
         return float(norm.isf(max(self.probability, _SMALLEST) / 2.0))
 
 
-def residuals(problem: bundle.Problem, given: bundle.GivenPoses, covariance: bundle.Covariance) -> dict[int, Residual]:
+def residuals(
+    problem: bundle_adjustment.Problem, given: bundle_adjustment.GivenPoses, covariance: bundle_adjustment.Covariance
+) -> dict[int, Residual]:
     """Computes the residual of each camera that `given` has a pose of and `covariance` is finite for.
 
     Where `problem.given` holds a camera, its residual is against all others; where not, against the images alone.
@@ -61,7 +63,9 @@ def residuals(problem: bundle.Problem, given: bundle.GivenPoses, covariance: bun
     return found
 
 
-def deviation(problem: bundle.Problem, given: bundle.GivenPoses, camera: int) -> tuple[Array, Array, Array]:
+def deviation(
+    problem: bundle_adjustment.Problem, given: bundle_adjustment.GivenPoses, camera: int
+) -> tuple[Array, Array, Array]:
     """Turn (3,) and shift (3,) of a camera from its given pose, and their derivatives (6, 6) by the camera's pose."""
     rotation = problem.rotations[camera]
     turn = Rotation.from_matrix(rotation @ given.rotations[camera].T).as_rotvec()

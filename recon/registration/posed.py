@@ -10,12 +10,20 @@ import numpy as np
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, guided, known_poses, lenses, mapping_problem, posed_mapping
-from splatnode.recon.registration.config import RegistrationConfig
+from splatnode.recon.registration import (
+    bundle_adjustment,
+    guided,
+    known_poses,
+    mapping_problem,
+    posed_mapping,
+    self_calibration,
+)
+from splatnode.recon.registration.bundle_adjustment import differentiate_by_pose
 from splatnode.recon.registration.known_poses import Given, GivenWorld, Offset
 from splatnode.recon.registration.posed_mapping import PosedMap
-from splatnode.recon.registration.register import (
+from splatnode.recon.registration.registration import (
     Registration,
+    RegistrationConfig,
     convert_to_lens_pixels,
     make_registration,
     make_views,
@@ -23,7 +31,6 @@ from splatnode.recon.registration.register import (
     relabel_pairs,
     sort_by_content,
 )
-from splatnode.recon.registration.uncertainty import differentiate_by_pose
 
 Pairs = Mapping[tuple[int, int], TwoView]
 
@@ -45,11 +52,11 @@ def register_posed(
     given = known_poses.collect_known_poses(ordered, offset)
     if given is None:
         return None
-    grouping = lenses.group(ordered, across_sizes=True)
+    grouping = self_calibration.group(ordered, across_sizes=True)
     matched = guided.add_guided_matches(ordered, relabel_pairs(pairs, rank), given)
     pause()
     views = make_views(ordered, grouping)
-    known = lenses.candidates(ordered, grouping, matched, config.lenses)
+    known = self_calibration.candidates(ordered, grouping, matched, config.lenses)
     settings = config.mapper
     problem = mapping_problem.prepare(
         views,
@@ -78,7 +85,7 @@ def _world(
     first, unit = views[0], _unit(built, found)
     to_first, from_first = estimate.rotations[first], estimate.translations[first]
     held = [] if estimate.given is None else [view for view in views if estimate.given.is_held[view]]
-    covariance = bundle.covariance(estimate, built.map.prior, built.map.loss, -1)
+    covariance = bundle_adjustment.covariance(estimate, built.map.prior, built.map.loss, -1)
     turns, moves = differentiate_by_pose(estimate.rotations[views], estimate.translations[views])
     rows = (6 * np.array(views)[:, None] + np.arange(6)).ravel()
     joint = covariance.joint[np.ix_(rows, rows)]
@@ -88,7 +95,7 @@ def _world(
     turn_sigma, shift_sigma = (0.0, 0.0) if offset is None else (offset.turn_sigma, offset.shift_sigma)
     of_turn, of_shift = turn_sigma**2 * np.eye(3), (shift_sigma * unit / given.metres) ** 2 * np.eye(3)
     sigmas = given.poses.sigmas[np.argsort(order)][held, 1] * given.metres
-    centres = given.metres * bundle.centres(estimate)[held]
+    centres = given.metres * bundle_adjustment.centres(estimate)[held]
     return GivenWorld(
         scale=given.metres / unit,
         rotation=to_first.T,

@@ -14,19 +14,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.registration import (
-    bundle,
-    epipolar,
-    finishing,
-    incremental,
-    inliers,
-    mapper,
-    pose_test,
-    resection,
-)
+from splatnode.recon.registration import bundle_adjustment, epipolar, incremental_mapper, pose_test, resection
 from splatnode.recon.registration.known_poses import Deviation, Given
 from splatnode.recon.registration.mapping_problem import MapperInput, PartialMap
-from splatnode.recon.registration.patch_image import PatchImage
+from splatnode.recon.registration.subpixel import PatchImage
 
 Array = npt.NDArray[np.float64]
 
@@ -49,7 +40,7 @@ _ROUNDS = 3  # of tests after a map was finished
 class PosedMap:
     """A map in the frame of the given poses."""
 
-    map: mapper.Map
+    map: incremental_mapper.Map
     deviations: tuple[Deviation, ...]  # of views, the worst first; lengths in metres
 
 
@@ -58,7 +49,7 @@ def build_map(
     focals: Sequence[float],
     given: Given,
     images: Sequence[PatchImage],
-    config: mapper.MapperConfig,
+    config: incremental_mapper.MapperConfig,
     pause: Callable[[], None] = lambda: None,
 ) -> PosedMap | None:
     """The map of all views with a given pose, and of the others that images place; None where too few poses hold.
@@ -76,7 +67,7 @@ def build_map(
     if partial is None:
         return None
     if len(partial.estimate.points) >= config.incremental.min_points:
-        partial = incremental.extend(problem, partial, config.incremental)
+        partial = incremental_mapper.extend(problem, partial, config.incremental)
     finished = _finish_map(problem, partial, images, config)
     for _ in range(_ROUNDS):
         pause()
@@ -88,12 +79,14 @@ def build_map(
         finished = _finish_map(problem, again, images, config)
     finished = _remove_unseen_cameras(finished)
     return PosedMap(
-        mapper.make_map(problem, finished, config.incremental.triangulation.max_error_px, len(problem.lenses)),
+        incremental_mapper.make_map(
+            problem, finished, config.incremental.triangulation.max_error_px, len(problem.lenses)
+        ),
         _deviations(finished, given),
     )
 
 
-def _less_sure(config: mapper.MapperConfig) -> mapper.MapperConfig:
+def _less_sure(config: incremental_mapper.MapperConfig) -> incremental_mapper.MapperConfig:
     correlated = _LESS_SURE**2 * config.finishing.correlated
     return msgspec.structs.replace(config, finishing=msgspec.structs.replace(config.finishing, correlated=correlated))
 
@@ -101,7 +94,7 @@ def _less_sure(config: mapper.MapperConfig) -> mapper.MapperConfig:
 def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> PartialMap:
     """The map of the given poses alone, without points."""
     poses, log_focals = given.poses, np.log(focals)
-    estimate = bundle.make_empty_problem(
+    estimate = bundle_adjustment.make_empty_problem(
         rotations=poses.rotations.copy(),
         translations=-np.einsum("cij,cj->ci", poses.rotations, poses.centres),
         lens_of_camera=np.array([view.lens for view in problem.views]),
@@ -109,7 +102,7 @@ def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> Parti
         radials=np.array([lens.radial for lens in problem.lenses]),
         shifts=np.zeros((len(problem.lenses), 2)),
     )
-    prior = bundle.focal_prior(log_focals, np.array([lens.sigma for lens in problem.lenses]))
+    prior = bundle_adjustment.focal_prior(log_focals, np.array([lens.sigma for lens in problem.lenses]))
     known = tuple(np.flatnonzero(poses.is_held).tolist())
     return PartialMap(known, replace(estimate, given=poses), prior, np.zeros(0, np.int64))
 
@@ -121,22 +114,22 @@ def _first_tolerance(problem: MapperInput, focals: Sequence[float], given: Given
     turns = given.poses.sigmas[known, 0] * np.array(focals)[lenses] / problem.scale[known]
     # Positions that are known as well as orientations move points as much: how far the scene is is not known yet.
     most = _FIRST_ERRORS * math.sqrt(2.0) * float(turns.max())
-    return float(np.clip(most, incremental.SETTLED_TOLERANCE, _MOST_TOLERANCE))
+    return float(np.clip(most, incremental_mapper.SETTLED_TOLERANCE, _MOST_TOLERANCE))
 
 
 def _adjust_until_settled(
-    problem: MapperInput, partial: PartialMap, tolerance: float, config: mapper.MapperConfig
+    problem: MapperInput, partial: PartialMap, tolerance: float, config: incremental_mapper.MapperConfig
 ) -> PartialMap:
     """The map with points, adjusted while observations may have smaller and smaller errors."""
     scale = float(np.median(problem.scale))
     while True:
-        robust_px = max(config.incremental.robust_px, tolerance / incremental.SETTLED_TOLERANCE) * scale
-        loss = bundle.BundleAdjustmentConfig(robust_px=robust_px, noise_px=_NOISE_PX * scale)
+        robust_px = max(config.incremental.robust_px, tolerance / incremental_mapper.SETTLED_TOLERANCE) * scale
+        loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=robust_px, noise_px=_NOISE_PX * scale)
         settings = config.incremental.triangulation
-        partial = incremental.adjust(problem, partial, problem.growing_tracks, loss, tolerance, settings)
-        if tolerance <= incremental.SETTLED_TOLERANCE:
+        partial = incremental_mapper.adjust(problem, partial, problem.growing_tracks, loss, tolerance, settings)
+        if tolerance <= incremental_mapper.SETTLED_TOLERANCE:
             return partial
-        tolerance = max(tolerance / 3.0, incremental.SETTLED_TOLERANCE)
+        tolerance = max(tolerance / 3.0, incremental_mapper.SETTLED_TOLERANCE)
 
 
 def _find_held_views(partial: PartialMap) -> list[int]:
@@ -153,7 +146,7 @@ def _release_poses(partial: PartialMap, views: Sequence[int]) -> PartialMap:
     return replace(partial, estimate=replace(partial.estimate, given=given.release(views)))
 
 
-def _let_go(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> PartialMap:
+def _let_go(problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig) -> PartialMap:
     """The map without the poses of views whose matches hardly fit, and fit another pose much better."""
     tried: set[int] = set()
     while len(_find_held_views(partial)) > _LEAST_HELD:
@@ -170,10 +163,12 @@ def _let_go(problem: MapperInput, partial: PartialMap, config: mapper.MapperConf
     return partial
 
 
-def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> list[int]:
+def _find_doubtful_views(
+    problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
+) -> list[int]:
     """The views that a given pose holds and few of whose matches fit; those first that fit least."""
-    ratios = inliers.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
-    of_view = {view: inliers.compute_pooled_ratio(ratios, problem.pairs, view) for view in _find_held_views(partial)}
+    ratios = resection.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
+    of_view = {view: resection.compute_pooled_ratio(ratios, problem.pairs, view) for view in _find_held_views(partial)}
     matched = {view for pair in ratios for view in pair}
     return sorted(
         (view for view, ratio in of_view.items() if ratio < _DOUBTED_RATIO and view in matched), key=of_view.__getitem__
@@ -181,25 +176,25 @@ def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: mapp
 
 
 def _place_by_matches(
-    problem: MapperInput, partial: PartialMap, view: int, config: mapper.MapperConfig
+    problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig
 ) -> PartialMap | None:
     """The map with `view` where its matches place it; None where no more of them fit then."""
     rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
-    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental.SETTLED_TOLERANCE, config)
+    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental_mapper.SETTLED_TOLERANCE, config)
     if len(rest.estimate.points) < config.incremental.min_points:
         return None
     found = resection.resect(problem, rest, view, config.incremental.resection)
     if found is None:
         return None
-    estimate = bundle.replace_pose(rest.estimate, view, found.rotation, found.translation)
+    estimate = bundle_adjustment.replace_pose(rest.estimate, view, found.rotation, found.translation)
     freed = replace(rest, estimate=estimate, registered=partial.registered)
-    freed = _adjust_until_settled(problem, freed, 2.0 * incremental.SETTLED_TOLERANCE, config)
+    freed = _adjust_until_settled(problem, freed, 2.0 * incremental_mapper.SETTLED_TOLERANCE, config)
     before, after = (_observations(each)[view] for each in (partial, freed))
     return freed if after > _MORE * before + _MORE_POINTS else None
 
 
 def _place_refuted_view(
-    problem: MapperInput, partial: PartialMap, view: int, config: mapper.MapperConfig
+    problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig
 ) -> PartialMap | None:
     """The map with `view` where one pair places it, where its pairs with views that others confirm refute its pose.
 
@@ -212,11 +207,13 @@ def _place_refuted_view(
         return None
     best = max(refuting, key=lambda pair: (len(problem.pairs[pair].matches), pair))
     rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
-    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental.SETTLED_TOLERANCE, config)
+    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental_mapper.SETTLED_TOLERANCE, config)
     return replace(_place_by_pair(problem, rest, view, best, config), registered=partial.registered)
 
 
-def _release_undecided_pairs(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> PartialMap:
+def _release_undecided_pairs(
+    problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
+) -> PartialMap:
     """The map without both views of a pair that refutes one of their poses, where nothing tells which.
 
     As it is where most of the poses would be gone with them.
@@ -235,11 +232,13 @@ def _release_undecided_pairs(problem: MapperInput, partial: PartialMap, config: 
         for view in pair:
             found = _place_by_pair(problem, partial, view, pair, config).estimate
             pose = found.rotations[view], found.translations[view]
-            moved = replace(moved, estimate=bundle.replace_pose(moved.estimate, view, *pose))
-    return _adjust_until_settled(problem, moved, incremental.SETTLED_TOLERANCE, config)
+            moved = replace(moved, estimate=bundle_adjustment.replace_pose(moved.estimate, view, *pose))
+    return _adjust_until_settled(problem, moved, incremental_mapper.SETTLED_TOLERANCE, config)
 
 
-def _pairs_say(problem: MapperInput, partial: PartialMap, config: mapper.MapperConfig) -> dict[tuple[int, int], int]:
+def _pairs_say(
+    problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
+) -> dict[tuple[int, int], int]:
     """Judges pairs of held views: 1 where the matches agree with the poses, -1 where with others, else 0."""
     held, found = set(_find_held_views(partial)), {}
     limit = config.incremental.triangulation.max_error_px
@@ -257,7 +256,7 @@ def _pairs_say(problem: MapperInput, partial: PartialMap, config: mapper.MapperC
 
 
 def _relative(
-    problem: MapperInput, partial: PartialMap, pair: tuple[int, int], config: mapper.MapperConfig
+    problem: MapperInput, partial: PartialMap, pair: tuple[int, int], config: incremental_mapper.MapperConfig
 ) -> tuple[Array, Array, int]:
     """The pose of the second view of `pair` in the first one, and how many matches agree, by these alone."""
     i, j = pair
@@ -267,12 +266,12 @@ def _relative(
 
 
 def _place_by_pair(
-    problem: MapperInput, partial: PartialMap, view: int, pair: tuple[int, int], config: mapper.MapperConfig
+    problem: MapperInput, partial: PartialMap, view: int, pair: tuple[int, int], config: incremental_mapper.MapperConfig
 ) -> PartialMap:
     """The map with `view` where the matches of `pair` alone place it, as far from the other view as it was."""
     estimate, (first, second) = partial.estimate, pair
     rotation, direction, _ = _relative(problem, partial, pair, config)
-    centres = bundle.centres(estimate)
+    centres = bundle_adjustment.centres(estimate)
     move = direction / np.linalg.norm(direction) * np.linalg.norm(centres[second] - centres[first])
     if view == second:
         turned = rotation @ estimate.rotations[first]
@@ -280,7 +279,7 @@ def _place_by_pair(
     else:
         turned = rotation.T @ estimate.rotations[second]
         shifted = rotation.T @ (estimate.translations[second] - move)
-    return replace(partial, estimate=bundle.replace_pose(estimate, view, turned, shifted))
+    return replace(partial, estimate=bundle_adjustment.replace_pose(estimate, view, turned, shifted))
 
 
 def _observations(partial: PartialMap) -> npt.NDArray[np.int64]:
@@ -292,14 +291,14 @@ def _test_poses(
     problem: MapperInput,
     partial: PartialMap,
     given: Given,
-    config: mapper.MapperConfig,
-    loss: bundle.BundleAdjustmentConfig | None = None,
+    config: incremental_mapper.MapperConfig,
+    loss: bundle_adjustment.BundleAdjustmentConfig | None = None,
 ) -> PartialMap | None:
     """The map without the given poses that it contradicts, and with those again that it does not; None: too few hold.
 
     What is returned is `partial` where nothing changes.
     """
-    loss = loss or bundle.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+    loss = loss or bundle_adjustment.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
     while len(partial.estimate.points):
         found = _residuals(partial, given, loss)
         held = set(_find_held_views(partial))
@@ -307,9 +306,9 @@ def _test_poses(
         if worst is None or found[worst].probability >= pose_test.LEAST_PROBABILITY:
             break
         partial = _adjust_until_settled(
-            problem, _release_poses(partial, [worst]), 2.0 * incremental.SETTLED_TOLERANCE, config
+            problem, _release_poses(partial, [worst]), 2.0 * incremental_mapper.SETTLED_TOLERANCE, config
         )
-        loss = bundle.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+        loss = bundle_adjustment.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
     return partial if len(_find_held_views(partial)) >= _LEAST_HELD and _most_hold(partial, given) else None
 
 
@@ -317,28 +316,30 @@ def _most_hold(partial: PartialMap, given: Given) -> bool:
     return 2 * len(_find_held_views(partial)) > int(given.poses.is_held.sum())
 
 
-def _residuals(partial: PartialMap, given: Given, loss: bundle.BundleAdjustmentConfig) -> dict[int, pose_test.Residual]:
-    covariance = bundle.covariance(partial.estimate, partial.prior, loss, -1)
+def _residuals(
+    partial: PartialMap, given: Given, loss: bundle_adjustment.BundleAdjustmentConfig
+) -> dict[int, pose_test.Residual]:
+    covariance = bundle_adjustment.covariance(partial.estimate, partial.prior, loss, -1)
     return pose_test.residuals(partial.estimate, given.poses, covariance)
 
 
 def _finish_map(
-    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: mapper.MapperConfig
-) -> finishing.FinalMap:
+    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: incremental_mapper.MapperConfig
+) -> incremental_mapper.FinalMap:
     """The map after its last adjustment; as it is where there are too few points for one."""
     finished = (
-        finishing.run_final_adjustment(problem, partial, images, config.finishing)
+        incremental_mapper.run_final_adjustment(problem, partial, images, config.finishing)
         if len(partial.estimate.points)
         else None
     )
     if finished is not None:
         return finished
-    errors = bundle.reprojection_errors(partial.estimate) / problem.scale[partial.estimate.camera_of]
-    loss = bundle.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
-    return finishing.FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0)
+    errors = bundle_adjustment.reprojection_errors(partial.estimate) / problem.scale[partial.estimate.camera_of]
+    loss = bundle_adjustment.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+    return incremental_mapper.FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0)
 
 
-def _remove_unseen_cameras(finished: finishing.FinalMap) -> finishing.FinalMap:
+def _remove_unseen_cameras(finished: incremental_mapper.FinalMap) -> incremental_mapper.FinalMap:
     """The map without cameras that nothing holds: neither a given pose nor enough observations."""
     partial, held = finished.map, set(_find_held_views(finished.map))
     estimate = partial.estimate
@@ -358,11 +359,11 @@ def _remove_unseen_cameras(finished: finishing.FinalMap) -> finishing.FinalMap:
         point_of=point_of,
         pixels=estimate.pixels[own],
     )
-    rest = bundle.adjust(rest, partial.prior, finished.loss) if len(points) else rest
+    rest = bundle_adjustment.adjust(rest, partial.prior, finished.loss) if len(points) else rest
     return replace(finished, map=replace(partial, registered=kept, estimate=rest))
 
 
-def _deviations(finished: finishing.FinalMap, given: Given) -> tuple[Deviation, ...]:
+def _deviations(finished: incremental_mapper.FinalMap, given: Given) -> tuple[Deviation, ...]:
     """Lists the given poses that do not hold their cameras."""
     held, found = set(_find_held_views(finished.map)), []
     residuals = _residuals(finished.map, given, finished.loss) if len(finished.map.estimate.points) else {}

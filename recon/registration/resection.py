@@ -14,11 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon import poselib
+from splatnode.recon.geometry import cross
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, epipolar
-from splatnode.recon.registration.cross_product import cross
-from splatnode.recon.registration.mapping_problem import MapperInput, Pair, PartialMap
-from splatnode.recon.registration.tracks import Tracks
+from splatnode.recon.registration import bundle_adjustment, epipolar
+from splatnode.recon.registration.mapping_problem import MapperInput, Pair, Pairs, PartialMap
+from splatnode.recon.registration.triangulation import Tracks
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -77,7 +77,7 @@ def resect(problem: MapperInput, partial: PartialMap, view: int, config: Resecti
     for rotation, translation in _proposals(problem, partial, correspondences, view, neighbours, config):
         errors = reprojection_errors(correspondences, rotation, translation, focal)
         num_inliers = int((errors < _POINT_TOLERANCE * limit).sum())
-        proposed = bundle.replace_pose(partial.estimate, view, rotation, translation)
+        proposed = bundle_adjustment.replace_pose(partial.estimate, view, rotation, translation)
         for other, pair in neighbours.items():
             errors = epipolar.sampson_errors(proposed, _pair(view, other), pair)
             num_inliers += int((errors < _PAIR_TOLERANCE * limit).sum())
@@ -126,12 +126,12 @@ def _correspondences(partial: PartialMap, tracks: Tracks, view: int) -> Correspo
     return Correspondences(straight, partial.estimate.points[position[found]], track_of[found])
 
 
-def _straight(estimate: bundle.Problem, view: int, pixels: Array) -> Array:
+def _straight(estimate: bundle_adjustment.Problem, view: int, pixels: Array) -> Array:
     """(M, 2) pixels as a pinhole would show them: a lens that is known to bend lines is taken out."""
     lens = estimate.lens_of_camera[view]
     if not (estimate.radials[lens].any() or estimate.shifts[lens].any()):
         return pixels
-    return bundle.normalise(estimate, np.full(len(pixels), view), pixels) * np.exp(estimate.log_focals[lens])
+    return bundle_adjustment.normalise(estimate, np.full(len(pixels), view), pixels) * np.exp(estimate.log_focals[lens])
 
 
 def _proposals(
@@ -241,3 +241,27 @@ def _length(turned: Array, direction: Array, rays: Array, limit: float, min_poin
     counts = agree(turned[None] + possible[:, None, None] * direction).sum(1)
     best = int(counts.argmax())
     return float(possible[best]) if counts[best] >= max(min_points, _MIN_SCALE_RATIO * len(possible)) else None
+
+
+# Inlier ratios: the share of a pair's matches that agree with the poses of a map, used or not in making it.
+
+
+def pair_errors(problem: MapperInput, partial: PartialMap) -> dict[Pair, Array]:
+    """Sampson errors of the matches of all pairs of registered views, pixels at REFERENCE_SIDE."""
+    return {
+        (i, j): epipolar.sampson_errors(partial.estimate, (i, j), pair) / problem.scale[i]
+        for (i, j), pair in problem.pairs.items()
+        if i in partial.registered and j in partial.registered
+    }
+
+
+def inlier_ratios(problem: MapperInput, partial: PartialMap, max_error_px: float) -> dict[Pair, float]:
+    """The share of each pair's matches with Sampson errors below `max_error_px`, pixels at REFERENCE_SIDE."""
+    return {pair: float((errors < max_error_px).mean()) for pair, errors in pair_errors(problem, partial).items()}
+
+
+def compute_pooled_ratio(ratios: Mapping[Pair, float], pairs: Pairs, view: int | None = None) -> float:
+    """The share of inliers among all matches of the pairs with `ratios`, or of those with `view`; 0 without any."""
+    chosen = {pair: ratio for pair, ratio in ratios.items() if view is None or view in pair}
+    num_matches = sum(len(pairs[pair].matches) for pair in chosen)
+    return sum(ratio * len(pairs[pair].matches) for pair, ratio in chosen.items()) / max(1, num_matches)

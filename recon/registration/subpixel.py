@@ -7,28 +7,148 @@ which the point was not matched are tried too, so that tracks become longer.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.core import library
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
-from splatnode.recon.registration import bundle, patch_alignment, patch_image
-from splatnode.recon.registration.patch_alignment import Patches
-from splatnode.recon.registration.patch_image import PatchImage
+from splatnode.recon.registration import bundle_adjustment
+
+# Affine alignment of image patches to parts of a pixel (Baker and Matthews, 2004).
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Grey = npt.NDArray[np.float32]
+
+MAX_RADIUS = 12  # pixels; `kMaxRadius` of recon/core/align.cpp
+
+
+class PatchAlignmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    radius: int = 8  # of a patch, pixels; at most 12
+    max_iterations: int = 20  # of Gauss-Newton, at most
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """M patches of reference images, with a first guess of their positions in target images.
+
+    Pixels are those of the images given to `align`, the top-left pixel's centre at (0.5, 0.5).
+    """
+
+    reference_image: Index  # (M,)
+    reference: Array  # (M, 2) pixels
+    target_image: Index  # (M,)
+    target: Array  # (M, 2) pixels
+    affine: Array  # (M, 2, 2) from offsets in the reference to offsets in the target
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedPatches:
+    """The M patches after alignment."""
+
+    target: Array  # (M, 2) pixels
+    affine: Array  # (M, 2, 2)
+    correlation: Array  # (M,) normalised, of grey levels after the warp; -1 where a patch could not be aligned
+    sigma: Array  # (M,) standard deviation of the position along its worst direction, pixels; infinite where it failed
+
+
+def align(images: Sequence[Grey], patches: Patches, config: PatchAlignmentConfig) -> AlignedPatches:
+    """Aligns the patches with their targets, by an affine warp and a gain and offset of the grey levels.
+
+    `images` are (H, W) float32, grey levels of 0 to 255. With `max_iterations` 0 nothing moves: the result has the
+    correlations of the first guess. Raises ValueError for a radius or an image number out of range.
+    """
+    count = len(patches.reference)
+    if not 1 <= config.radius <= MAX_RADIUS:
+        raise ValueError(f"the radius of a patch must be 1 to {MAX_RADIUS} pixels, got {config.radius}")
+    for name, index in (("reference", patches.reference_image), ("target", patches.target_image)):
+        if count and not 0 <= index.min() <= index.max() < len(images):
+            raise ValueError(f"{name} images must be in [0, {len(images)}), got {index.min()} to {index.max()}")
+    contiguous = [np.ascontiguousarray(image, dtype=np.float32) for image in images]
+    pixels = (ctypes.c_void_p * len(images))(*(image.ctypes.data for image in contiguous))
+    heights, widths = (np.array([image.shape[axis] for image in images], np.int32) for axis in (0, 1))
+    indices = [np.ascontiguousarray(index, np.int32) for index in (patches.reference_image, patches.target_image)]
+    reference = np.ascontiguousarray(patches.reference, np.float32)
+    target, affine = (np.array(values, np.float32, order="C") for values in (patches.target, patches.affine))
+    correlation, sigma = np.empty(count, np.float32), np.empty(count, np.float32)
+    native_images = _Images(ctypes.cast(pixels, ctypes.c_void_p), widths.ctypes.data, heights.ctypes.data)
+    arrays = (*indices, reference, target, affine, correlation, sigma)
+    native = _Patches(*(array.ctypes.data for array in arrays), count, config.radius, config.max_iterations)
+    library().core_align(ctypes.byref(native_images), ctypes.byref(native))
+    return AlignedPatches(*(result.astype(np.float64) for result in (target, affine, correlation, sigma)))
+
+
+class _Images(ctypes.Structure):
+    """`Images` of recon/core/align.cpp."""
+
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("pixels", "widths", "heights"))
+
+
+class _Patches(ctypes.Structure):
+    """`Patches` of recon/core/align.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("reference_image", "target_image", "reference", "target", "affine")),
+        *((name, ctypes.c_void_p) for name in ("correlation", "sigma")),
+        *((name, ctypes.c_int32) for name in ("count", "radius", "max_iterations")),
+    )
+
+
+# The image of a view as patches are taken from it: grey, smoothed, and of limited size.
+
+
+class PatchImageConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    max_longer_side: int = 1600  # larger images are shrunk, pixels
+    blur_px: float = 0.7  # sigma of the smoothing, after shrinking: interpolation errs less in a smooth image
+
+
+@dataclass(frozen=True, eq=False)
+class PatchImage:
+    """A grey image of a frame; the frame's pixels are relative to its nominal principal point."""
+
+    grey: Grey  # (h, w) 0 to 255
+    scale: Array  # (2,) its pixels per pixel of the frame, horizontally and vertically
+    principal: Array  # (2,) nominal principal point, pixels of the frame
+    size: Array  # (2,) width and height of the frame, pixels
+
+    def map_to_grey(self, pixels: Array) -> Array:
+        """(M, 2) pixels of the grey image, from `pixels` (M, 2) of the frame relative to its principal point."""
+        return (pixels + self.principal) * self.scale
+
+    def map_from_grey(self, pixels: Array) -> Array:
+        """(M, 2) the inverse of `map_to_grey`."""
+        return pixels / self.scale - self.principal
+
+    def rescale(self, scale: float) -> PatchImage:
+        """The same image, as that of the frame resized by this factor."""
+        return PatchImage(self.grey, self.scale / scale, scale * self.principal, scale * self.size)
+
+
+def patch_image(image: npt.NDArray[np.uint8], principal: Array, config: PatchImageConfig) -> PatchImage:
+    """The patch image of a frame's `image` (H, W, 3) RGB with its principal point (2,) in pixels."""
+    height, width = image.shape[:2]
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    shrink = min(1.0, config.max_longer_side / max(width, height))
+    if shrink < 1.0:
+        grey = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    grey = cv2.GaussianBlur(grey, (0, 0), config.blur_px).astype(np.float32)
+    size = np.array([width, height], np.float64)
+    return PatchImage(grey, np.array(grey.shape[::-1]) / size, principal, size)
+
 
 _PARALLEL = 0.7  # component of a unit vector below which its axis is clearly not parallel to it
 _MIN_ALONG_NORMAL = 1e-12  # component of a ray along a surface's normal, in place of 0: the surface is seen edge-on
 
 
 class SubpixelConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    patch_alignment: patch_alignment.PatchAlignmentConfig = patch_alignment.PatchAlignmentConfig()
-    patch_image: patch_image.PatchImageConfig = patch_image.PatchImageConfig()
+    patch_alignment: PatchAlignmentConfig = PatchAlignmentConfig()
+    patch_image: PatchImageConfig = PatchImageConfig()
     # Angles that are tried, of the surface's normal from the direction to the reference
     slants_deg: tuple[float, ...] = (0.0, 50.0)
     directions: int = 6  # that are tried for a slanted normal, evenly around
@@ -50,8 +170,8 @@ class _Observations:
 
 
 def refine(
-    problem: bundle.Problem, registered: Sequence[int], images: Sequence[PatchImage], config: SubpixelConfig
-) -> bundle.Problem:
+    problem: bundle_adjustment.Problem, registered: Sequence[int], images: Sequence[PatchImage], config: SubpixelConfig
+) -> bundle_adjustment.Problem:
     """The problem with aligned observations, sorted by point.
 
     Observations that do not align are dropped, and points with fewer than two. `images` are those of the cameras.
@@ -87,9 +207,9 @@ def refine(
     )
 
 
-def _references(problem: bundle.Problem) -> Index:
+def _references(problem: bundle_adjustment.Problem) -> Index:
     """(P,) each point's most central observation, from which the warps to the others are smallest."""
-    towards = bundle.centres(problem)[problem.camera_of] - problem.points[problem.point_of]
+    towards = bundle_adjustment.centres(problem)[problem.camera_of] - problem.points[problem.point_of]
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     mean = np.zeros_like(problem.points)
     np.add.at(mean, problem.point_of, towards)
@@ -99,7 +219,7 @@ def _references(problem: bundle.Problem) -> Index:
     return order[first]
 
 
-def _others(problem: bundle.Problem, reference: Index) -> _Observations:
+def _others(problem: bundle_adjustment.Problem, reference: Index) -> _Observations:
     """The observations that are not the reference of their point."""
     others = np.ones(len(problem.camera_of), bool)
     others[reference] = False
@@ -107,7 +227,7 @@ def _others(problem: bundle.Problem, reference: Index) -> _Observations:
 
 
 def _predict_observations(
-    problem: bundle.Problem,
+    problem: bundle_adjustment.Problem,
     reference: Index,
     registered: Sequence[int],
     images: Sequence[PatchImage],
@@ -119,10 +239,10 @@ def _predict_observations(
     unobserved[problem.point_of, problem.camera_of] = False
     point, camera = np.nonzero(unobserved)
     elsewhere = replace(problem, camera_of=camera, point_of=point, pixels=np.zeros((len(camera), 2)))
-    pixels, depth = bundle.project(elsewhere)
+    pixels, depth = bundle_adjustment.project(elsewhere)
     size = np.array([image.size for image in images])[camera]
     in_frame = pixels + np.array([image.principal for image in images])[camera]
-    centres = bundle.centres(problem)
+    centres = bundle_adjustment.centres(problem)
     similar = _cosines(problem.points[point], centres[camera], centres[problem.camera_of[reference]][point])
     good = (depth > 0) & (in_frame > 0).all(1) & (in_frame < size).all(1)
     good &= similar > np.cos(np.radians(config.max_angle_deg))
@@ -130,14 +250,14 @@ def _predict_observations(
 
 
 def _best_normals(
-    problem: bundle.Problem,
+    problem: bundle_adjustment.Problem,
     reference: Index,
     matched: _Observations,
     images: Sequence[PatchImage],
     config: SubpixelConfig,
 ) -> Array:
     """(P, 3) the surface normal, of those tried, with the highest summed correlation of a point's matched patches."""
-    towards = bundle.centres(problem)[problem.camera_of[reference]] - problem.points
+    towards = bundle_adjustment.centres(problem)[problem.camera_of[reference]] - problem.points
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     unmoved = msgspec.structs.replace(config.patch_alignment, max_iterations=0)
     best, chosen = np.full(len(towards), -1.0), towards
@@ -164,13 +284,13 @@ def _slant_directions(towards: Array, slants_deg: Sequence[float], directions: i
 
 
 def _align(
-    problem: bundle.Problem,
+    problem: bundle_adjustment.Problem,
     reference: Index,
     observations: _Observations,
     normals: Array,  # (S, 3)
     images: Sequence[PatchImage],
-    config: patch_alignment.PatchAlignmentConfig,
-) -> patch_alignment.AlignedPatches:
+    config: PatchAlignmentConfig,
+) -> AlignedPatches:
     """Aligns the reference patch of each observed point, warped as a plane with its normal, with the observation."""
     observed = reference[observations.point]
     source = problem.camera_of[observed]
@@ -183,10 +303,12 @@ def _align(
         target=_per_image(images, observations.camera, observations.pixels, PatchImage.map_to_grey),
         affine=affine * (scale[observations.camera] / scale[source])[:, None, None],
     )
-    return patch_alignment.align([image.grey for image in images], patches, config)
+    return align([image.grey for image in images], patches, config)
 
 
-def plane_affines(problem: bundle.Problem, points: Array, normals: Array, source: Index, target: Index) -> Array:
+def plane_affines(
+    problem: bundle_adjustment.Problem, points: Array, normals: Array, source: Index, target: Index
+) -> Array:
     """(S, 2, 2) derivatives of pixels in the cameras `target` (S,) by pixels in the cameras `source` (S,).
 
     They are those of the plane's homography at `points` (S, 3) with the `normals` (S, 3). Distortion is left out: over
@@ -198,7 +320,7 @@ def plane_affines(problem: bundle.Problem, points: Array, normals: Array, source
         for camera in (source, target)
     )
     axes = problem.rotations[source]  # rows: the camera's axes in the world
-    ray = points - bundle.centres(problem)[source]
+    ray = points - bundle_adjustment.centres(problem)[source]
     along_normal = (normals * ray).sum(1)
     # A step of one pixel moves the ray aside by depth / focal at the point, and from there along the ray to the plane.
     steps = axes[:, :2] * (in_source[:, 2] / focal[source])[:, None, None]

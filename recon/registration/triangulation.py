@@ -2,19 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from splatnode.recon.core import library, pointer
-from splatnode.recon.registration import bundle
-from splatnode.recon.registration.tracks import Tracks
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import bundle_adjustment
+
+# Tracks: the observations, in several frames, that pairwise matches say are of one scene point.
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """O observations of T tracks, sorted by track."""
+
+    camera_of: Index  # (O,)
+    track_of: Index  # (O,) in [0, T)
+    pixels: Array  # (O, 2) relative to the principal point of the camera
+    num_tracks: int
+
+
+def build(points: Sequence[Array], pairs: Mapping[tuple[int, int], TwoView]) -> Tracks:
+    """Connected components of the matches of all pairs. `points[i]` (M, 2) are frame i's centred feature pixels.
+
+    Where a component holds two features of one frame, that frame's observations of it contradict each other and are
+    dropped; so are components that are left with one observation.
+    """
+    offsets = np.concatenate([[0], np.cumsum([len(frame_points) for frame_points in points])])
+    if not pairs:
+        return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), 0)
+    first = np.concatenate([view.matches[:, 0] + offsets[i] for (i, _), view in pairs.items()])
+    second = np.concatenate([view.matches[:, 1] + offsets[j] for (_, j), view in pairs.items()])
+    size = int(offsets[-1])
+    _, label = connected_components(coo_matrix((np.ones(len(first)), (first, second)), (size, size)), directed=False)
+    node = np.unique(np.concatenate([first, second]))
+    camera, track = np.searchsorted(offsets, node, side="right") - 1, label[node]
+    _, group, count = np.unique(track * len(points) + camera, return_inverse=True, return_counts=True)
+    unique = count[group] == 1
+    node, camera, track = node[unique], camera[unique], track[unique]
+    _, track, count = np.unique(track, return_inverse=True, return_counts=True)
+    observed_twice = count[track] >= 2
+    node, camera, track = node[observed_twice], camera[observed_twice], track[observed_twice]
+    kept, track = np.unique(track, return_inverse=True)
+    order = np.lexsort((camera, track))
+    pixels = np.concatenate([np.asarray(frame_points) for frame_points in points])[node]
+    return Tracks(camera[order].astype(np.int64), track[order].astype(np.int64), pixels[order], len(kept))
+
+
+def thin(tracks: Tracks, per_camera: int) -> Tracks:
+    """The tracks that `longest` chooses."""
+    chosen = longest(tracks.camera_of, tracks.track_of, tracks.num_tracks, per_camera)
+    observed = chosen[tracks.track_of]
+    _, track_of = np.unique(tracks.track_of[observed], return_inverse=True)
+    return Tracks(tracks.camera_of[observed], track_of, tracks.pixels[observed], int(chosen.sum()))
+
+
+def longest(camera_of: Index, track_of: Index, num_tracks: int, per_camera: int) -> npt.NDArray[np.bool_]:
+    """(T,) whether a track is among the `per_camera` longest of at least one of its cameras.
+
+    `camera_of` (O,) and `track_of` (O,) are the observations. Among tracks of one length a fixed random order decides,
+    which spreads them over the image.
+    """
+    length = np.bincount(track_of, minlength=num_tracks)
+    shuffled = np.random.default_rng(0).permutation(num_tracks)
+    rank = np.empty(num_tracks, np.int64)
+    rank[np.lexsort((shuffled, -length))] = np.arange(num_tracks)
+    chosen = np.zeros(num_tracks, bool)
+    for camera in np.unique(camera_of):
+        own = track_of[camera_of == camera]
+        chosen[own[np.argsort(rank[own], kind="stable")[:per_camera]]] = True
+    return chosen
+
+
 Index32 = npt.NDArray[np.int32]
 
 
@@ -63,13 +131,13 @@ def _sort_by_point(
 
 
 def retriangulate(
-    problem: bundle.Problem,
+    problem: bundle_adjustment.Problem,
     all_tracks: Tracks,
     registered: Sequence[int],
     scale: Array,
     config: TriangulationConfig,
     tolerance: float,
-) -> tuple[bundle.Problem, Index]:
+) -> tuple[bundle_adjustment.Problem, Index]:
     """The problem with all points that the registered cameras agree on, and the tracks of these (P,).
 
     An observation is kept up to `tolerance` times the largest error; `scale` (C,) is each view's longer side over
@@ -77,14 +145,14 @@ def retriangulate(
     """
     own = np.isin(all_tracks.camera_of, registered)
     camera, track, pixels = all_tracks.camera_of[own], all_tracks.track_of[own], all_tracks.pixels[own]
-    rays = bundle.normalise(problem, camera, pixels)
+    rays = bundle_adjustment.normalise(problem, camera, pixels)
     matrices = np.concatenate([problem.rotations, problem.translations[:, :, None]], 2)
     limit = tolerance * config.max_error_px * scale
     errors = np.zeros(0)
     points = np.zeros((all_tracks.num_tracks, 3))
     for _ in range(_ROUNDS):
         points = triangulate(matrices, rays, camera, track, all_tracks.num_tracks)
-        errors = bundle.reprojection_errors(
+        errors = bundle_adjustment.reprojection_errors(
             replace(problem, points=np.nan_to_num(points), camera_of=camera, point_of=track, pixels=pixels)
         )
         errors = np.where(np.isnan(points[track, 0]), np.inf, errors) / limit[camera]
@@ -94,7 +162,7 @@ def retriangulate(
         if keep.all():
             break
         camera, track, pixels, rays, errors = camera[keep], track[keep], pixels[keep], rays[keep], errors[keep]
-    angles = largest_angles(bundle.centres(problem), np.nan_to_num(points), camera, track)
+    angles = largest_angles(bundle_adjustment.centres(problem), np.nan_to_num(points), camera, track)
     count = np.bincount(track, minlength=all_tracks.num_tracks)
     worst = np.zeros(all_tracks.num_tracks)
     np.maximum.at(worst, track, errors)

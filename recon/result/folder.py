@@ -7,9 +7,7 @@ import errno
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatnode.capture.process.disk_space import shortage
-from splatnode.capture.process.folders import claim_folder
-from splatnode.capture.process.lock import LockHeld
+from splatnode.capture.process.files import LockHeld, claim_folder, shortage
 from splatnode.recon.result.export.staged import ResultWriteError, explain_error, finish_interrupted_write
 
 

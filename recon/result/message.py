@@ -7,7 +7,7 @@ photograph (JPEG).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated
 
 import cv2
@@ -16,19 +16,19 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame, Intrinsics
-from splatnode.capture.left_out import make_optional_field, read_optional_field
-from splatnode.capture.messaging.jpeg import decode_jpeg, make_jpeg_array
-from splatnode.capture.messaging.values import Amount, Count, Finite, Name, Text
-from splatnode.capture.messaging.wire import Header, Message, WireError
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
-from splatnode.capture.stamp import Stamp
-from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.camera_check import find_camera_problem
-from splatnode.recon.result.scale import RELATIVE, Scale
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.capture.frame import (
+    LARGEST_SIDE,
+    DroppedFrame,
+    Intrinsics,
+    Stamp,
+    make_optional_field,
+    read_optional_field,
+)
+from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
+from splatnode.capture.messaging.wire import Amount, Count, Finite, Header, Message, Name, Sequential, Text, WireError
+from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, find_camera_problem
+from splatnode.recon.result.verdict import RELATIVE, Bounds, Code, Scale, Verdict
 
 THUMBNAIL_SIDE = 320  # pixels
 THUMBNAIL_QUALITY = 85  # of 100, as JPEG
@@ -267,3 +267,41 @@ def _drop_unbounded(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
     for array in arrays[:-1]:
         kept &= (np.abs(array) <= LARGEST_VALUE).all(axis=tuple(range(1, array.ndim)))  # not so where it is nan
     return GaussianArrays(*arrays) if kept.all() else GaussianArrays(*(array[kept] for array in arrays))
+
+
+# The share of multi-view consistent depth as a message of its own, beside that of the scene.
+#
+# A receiver that is older than the share refuses a scene with a field that it does not know; this message it never
+# asks for. Who knows both joins them by the scene's session and sequence.
+
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+class DepthHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How much of a scene several views measured."""
+
+    scene_id: Name
+    scene_sequence: Sequential  # of the message of recon.scene that it is about, in this session
+    consistent_depth: Share | None  # of all pixels; None: not known
+    views: Annotated[tuple[tuple[Name, Share], ...], msgspec.Meta(max_length=MAX_CAMERAS)]  # name, share; where known
+
+
+def make_depth_header(
+    snapshot: Snapshot, scene_id: str, scene_sequence: int, numbering: Mapping[str, object]
+) -> DepthHeader:
+    """The message on a snapshot that is shown by message `scene_sequence`; `numbering` as for `encode_snapshot`."""
+    shares = ((camera.name, camera.consistent_depth) for camera in snapshot.cameras)
+    return DepthHeader(
+        **numbering,  # pyright: ignore[reportArgumentType]
+        scene_id=scene_id,
+        scene_sequence=scene_sequence,
+        consistent_depth=snapshot.consistent_depth,
+        views=tuple((name, share) for name, share in shares if share is not None)[:MAX_CAMERAS],
+    )
+
+
+def add_depth_shares(snapshot: Snapshot, header: DepthHeader) -> Snapshot:
+    """The snapshot of the scene that `header` is about, with what it says of each view."""
+    shares = dict(header.views)
+    cameras = tuple(replace(camera, consistent_depth=shares.get(camera.name)) for camera in snapshot.cameras)
+    return replace(snapshot, cameras=cameras)

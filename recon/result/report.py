@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import math
 import platform
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
 
-from splatnode.recon.result.bounds import find_widest
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.image_file import encode_png
+from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import make_camera_dict
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.export.prepare import sanitize_gaussians
-from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.export.stored import SOURCES, encode_sources
+from splatnode.recon.result.npz_files import DEPTHS, LANDMARKS, encode_depths, encode_landmarks
+from splatnode.recon.result.rendering import render_arrays
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import find_widest
 
 _PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
 
@@ -97,3 +108,98 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+# preview.png: what the cameras saw beside what the Gaussians show. It needs no torch.
+
+Image = npt.NDArray[np.uint8]
+
+
+def render_rgb(
+    gaussians: GaussianArrays,
+    T_world_camera: npt.NDArray[np.float64],
+    K: npt.NDArray[np.float64],
+    width: int,
+    height: int,
+) -> npt.NDArray[np.float32]:
+    """(H, W, 3) the Gaussians' image on black, in [0, 1]."""
+    return np.clip(render_arrays(gaussians, T_world_camera, K, width, height).rgb, 0.0, 1.0)
+
+
+def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:
+    """(H, W, 3) RGB of the Gaussians from an estimated camera."""
+    rgb = render_rgb(gaussians, camera.T_world_camera, camera.K, camera.width, camera.height)
+    return np.rint(rgb * 255).astype(np.uint8)
+
+
+def make_contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> bytes:
+    """A PNG: photographs above, the Gaussians seen from the same cameras below; cameras from the first to the last.
+
+    Without photographs where the snapshot does not have one of each camera.
+    """
+    count = len(snapshot.cameras)
+    photographed = all(camera.name in snapshot.images for camera in snapshot.cameras)
+    shown = np.linspace(0, count - 1, min(count, max_views)).round().astype(int)
+    columns = []
+    for camera in (snapshot.cameras[index] for index in shown):
+        above = [snapshot.images[camera.name]] if photographed else []
+        pair = [*above, render_camera(snapshot.gaussians, camera)]
+        size = (round(camera.width * height / camera.height), height)
+        columns.append(np.vstack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in pair]))
+    return encode_png(np.hstack(columns))
+
+
+# How much a result takes on the disk, before it is made.
+
+BYTES_A_GAUSSIAN = 124  # 68 in scene.ply, 46 to 50 in colmap/points3D.txt, 4 in sources.bin
+OTHER_BYTES = 2_000_000  # preview.png (1.2 MB measured at most), report and cameras
+DEPTH_BYTES = 130_000  # a photograph of 512 x 384 pixels, of depth.npz, before it is packed
+LANDMARK_BYTES = 310_000  # a photograph, of landmarks.npz: 2000 descriptors and their points, before they are packed
+# Photographs of real scenes led to a Gaussian for 28 to 60 pixels; four times as many are allowed for.
+PIXELS_A_GAUSSIAN = 8
+
+
+def bound_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, most_gaussians: int | None) -> int:
+    """Bytes that the result of photographs of these `sizes` (width, height) stays below.
+
+    `longer_side` of the modelled images is in pixels; `most_gaussians` is the limit that was set, if any.
+    """
+    known = list(sizes)
+    pixels = sum(longer_side**2 * min(size) / max(size) for size in known)
+    expected = round(pixels / PIXELS_A_GAUSSIAN)
+    num_gaussians = expected if most_gaussians is None else min(expected, most_gaussians)
+    return estimate_result_bytes(num_gaussians, len(known))
+
+
+def estimate_result_bytes(num_gaussians: int, num_photographs: int = 0) -> int:
+    """Bytes of a result folder with so many Gaussians, and with what is kept of so many photographs, rounded up."""
+    return BYTES_A_GAUSSIAN * num_gaussians + (LANDMARK_BYTES + DEPTH_BYTES) * num_photographs + OTHER_BYTES
+
+
+# The result folder of a snapshot, with its report and a preview.
+
+
+def write_result_folder(
+    snapshot: Snapshot,
+    out: Path,
+    *,
+    seed: int,
+    preset_name: str,
+    photographs: Mapping[str, bytes] = MappingProxyType({}),
+    told: Mapping[str, object] = MappingProxyType({}),
+) -> dict[str, object]:
+    """Writes the result folder and returns its report, of which `told` is a part.
+
+    `photographs` are files that a scene has beside it, by their names in the folder. Raises ResultWriteError, with what
+    was there before intact.
+    """
+    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | dict(told)
+    preview = make_contact_sheet(snapshot) if snapshot.verdict.publishable else None
+    source_frame = sanitize_gaussians(snapshot.gaussians).source_frame  # of those that scene.ply holds
+    further = {SOURCES: encode_sources(source_frame), **photographs} if snapshot.verdict.publishable else {}
+    if snapshot.verdict.publishable and snapshot.landmarks is not None:
+        further[LANDMARKS] = encode_landmarks(snapshot.landmarks)
+    if snapshot.verdict.publishable and snapshot.depths:
+        further[DEPTHS] = encode_depths(snapshot.depths)
+    write_result(snapshot, out, report, preview=preview, further=further)
+    return report

@@ -2,21 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import DroppedFrame, Intrinsics
-from splatnode.capture.stamp import Stamp
-from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.result.scale import RELATIVE, Scale
-from splatnode.recon.result.up import Up
-from splatnode.recon.result.verdict import Verdict
+from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
+from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale, Up, Verdict, find_widest
 
-Array = npt.NDArray[np.float32]
+# Landmarks: the points of a scene by which a photograph that was not in the set is placed in it.
+#
+# They are the points on which verified cameras agree, each with the descriptors of its features and its uncertainty,
+# and what is known of the cameras that saw them.
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class KnownLenses:
+    """The lenses of C cameras. Lengths in the picture count over its longer side."""
+
+    focals: Array  # (C,)
+    radials: Array  # (C, 2) radial coefficients, as recon/registration/bundle_adjustment.py has them
+    shifts: Array  # (C, 2) of the principal point from the middle of the picture
+    shapes: Array  # (C,) height over width
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """P points of a scene with D descriptors in C photographs. Lengths are in the unit of the result."""
+
+    points: Array  # (P, 3) world
+    covariances: Array  # (P, 3, 3) of the points' errors, the cameras taken as exact
+    descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/nearest_neighbours.py quantises them
+    point_of: Index  # (D,) the point that a descriptor is of
+    photograph_of: Index  # (D,) the photograph that it is from
+    names: tuple[str, ...]  # of the C photographs
+    Ts_world_camera: Array  # (C, 4, 4)
+    lenses: KnownLenses
+    rotation_bounds: Array  # (C,) 95 % bounds of the cameras' errors, degrees
+    centre_bounds: Array  # (C,) likewise of their centres
+    noise_px: float  # standard deviation of an observation's error, pixels at REFERENCE_SIDE
+    unit: float = 1.0  # the median depth of the scene's points: metres where the result is metric
+    metric: bool = False  # lengths are metres
+    focal_bounds: Array | None = None  # (C,) 95 % bounds of the focal lengths, percent; None: an earlier file has none
+
+    def transform(self, scale: float, rotation: Array, translation: Array, *, metric: bool = False) -> Landmarks:
+        """The same in the world to which x -> scale * rotation @ x + translation leads.
+
+        `metric` says whether its unit is the metre.
+        """
+        Ts_world_camera = np.tile(np.eye(4), (len(self.names), 1, 1))
+        Ts_world_camera[:, :3, :3] = rotation @ self.Ts_world_camera[:, :3, :3]
+        Ts_world_camera[:, :3, 3] = scale * self.Ts_world_camera[:, :3, 3] @ rotation.T + translation
+        return replace(
+            self,
+            points=scale * self.points @ rotation.T + translation,
+            covariances=scale**2 * rotation @ self.covariances @ rotation.T,
+            Ts_world_camera=Ts_world_camera,
+            centre_bounds=scale * self.centre_bounds,
+            unit=scale * self.unit,
+            metric=metric,
+        )
+
+
+Array32 = npt.NDArray[np.float32]
 Array64 = npt.NDArray[np.float64]
 
 
@@ -49,11 +103,11 @@ class CameraEstimate:
 class GaussianArrays:
     """N Gaussians, activated: scales are lengths, opacities are in (0, 1), quats (wxyz) have unit length."""
 
-    means: Array  # (N, 3)
-    quats: Array  # (N, 4)
-    scales: Array  # (N, 3)
-    opacities: Array  # (N,)
-    sh: Array  # (N, B, 3)
+    means: Array32  # (N, 3)
+    quats: Array32  # (N, 4)
+    scales: Array32  # (N, 3)
+    opacities: Array32  # (N,)
+    sh: Array32  # (N, B, 3)
     source_frame: npt.NDArray[np.int32]  # (N,)
 
     def __len__(self) -> int:
@@ -63,7 +117,7 @@ class GaussianArrays:
     def empty(cls) -> GaussianArrays:
         """No Gaussians."""
 
-        def zeros(*shape: int) -> Array:
+        def zeros(*shape: int) -> Array32:
             return np.zeros(shape, np.float32)
 
         return cls(zeros(0, 3), zeros(0, 4), zeros(0, 3), zeros(0), zeros(0, 1, 3), np.zeros(0, np.int32))
@@ -117,3 +171,122 @@ class Snapshot:
         shares = [camera.consistent_depth for camera in self.cameras]
         known = [share for share in shares if share is not None]
         return sum(known) / len(known) if known and len(known) == len(shares) else None
+
+
+# Bounds as a person reads them. Numbers are rounded up, because a bound that was rounded down would not hold.
+
+_DIGITS = 2  # significant ones
+_LEAST, _MOST = 1e-9, 1e9  # numbers beyond these are told as bounds: nobody's cameras are so exact, or so wrong
+_ROUNDING = 1e-9  # relative: a number that is over its digits by less is not rounded up
+_LENGTHS = ((1.0, "m"), (0.01, "cm"), (0.001, "mm"))  # metres of a unit and its sign, the largest first
+
+
+def format_camera_bounds(bounds: Bounds, scale: Scale) -> str:
+    """The bounds of one camera, with its position in metres where `scale` is metric."""
+    return _format_bounds("direction", "position", bounds, scale)
+
+
+def format_widest_bounds(cameras: Sequence[CameraEstimate], scale: Scale) -> str:
+    """The widest bounds of the cameras; empty where no camera has bounds."""
+    worst = find_widest(camera.bounds for camera in cameras if camera.bounds is not None)
+    return "" if worst is None else _format_bounds("directions", "positions", worst, scale)
+
+
+def _format_bounds(direction: str, position: str, bounds: Bounds, scale: Scale) -> str:
+    length = f" ({_format_length(bounds.centre)})" if scale.metric else ""
+    return (
+        f"{direction} to {format_rounded_up(bounds.rotation_deg)} degrees, "
+        f"{position} to {format_rounded_up(bounds.centre_percent)} % of the distance to the scene{length}, "
+        f"focal length to {format_rounded_up(bounds.focal_percent)} % (95 % bounds)"
+    )
+
+
+def _format_length(metres: float) -> str:
+    unit, sign = next((each for each in _LENGTHS if metres >= each[0]), _LENGTHS[-1])
+    return f"{format_rounded_up(metres / unit)} {sign}"
+
+
+def format_rounded_up(value: float) -> str:
+    """Returns the smallest number with two significant digits that is not below `value`; no exponent. Never raises."""
+    if not (math.isfinite(value) and value > 0):
+        return "0" if value == 0 else "an unknown number of"
+    if value > _MOST:
+        return f"more than {_MOST:.0f}"
+    value = max(value, _LEAST)
+    decimals = _DIGITS - 1 - math.floor(math.log10(value))
+    rounded = math.ceil(value * 10.0**decimals * (1.0 - _ROUNDING)) / 10.0**decimals
+    text = f"{rounded:.{max(decimals, 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+# What a camera must be that a stranger wrote: a rigid motion and a pinhole, in numbers that can be computed with.
+
+
+MAX_COORDINATE = 1e9  # of a camera's centre, in its file's unit, and of what K holds, in pixels
+MAX_SIDE = 65_535  # pixels of an image
+SHORTEST_FOCAL = 1e-3  # pixels
+_RIGID = 1e-2  # largest difference of a rotation times its transpose from the identity
+_EXACT = 1e-6  # by which what is 0 or 1 in every such matrix may differ from it
+
+
+def find_camera_problem(T_world_camera: Array, K: Array, width: int, height: int) -> str:
+    """Describes what is wrong with the camera; empty where nothing is."""
+    if T_world_camera.shape != (4, 4) or K.shape != (3, 3):
+        return f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}"
+    if not (np.abs(T_world_camera) <= MAX_COORDINATE).all() or not (np.abs(K) <= MAX_COORDINATE).all():
+        return f"T_world_camera and K must be finite, within ±{MAX_COORDINATE:g}"
+    rotation = T_world_camera[:3, :3]
+    turned = np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0
+    if turned or not np.allclose(T_world_camera[3], [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=_EXACT):
+        return "T_world_camera must be a rigid motion"
+    if min(K[0, 0], K[1, 1]) < SHORTEST_FOCAL or not np.allclose(K[2], [0.0, 0.0, 1.0], rtol=0.0, atol=_EXACT):
+        return f"K must have focal lengths of {SHORTEST_FOCAL:g} pixels or more, and 0 0 1 as its last row"
+    if not np.allclose([K[0, 1], K[1, 0]], 0.0, rtol=0.0, atol=_EXACT):
+        return "K must have no skew"
+    if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
+        return f"width and height must be 1 to {MAX_SIDE} pixels, got {width} x {height}"
+    return ""
+
+
+# What moved between the photographs, in a sentence.
+
+LEAST = 0.03  # share of a photograph: less is in the report alone
+
+
+def describe_moving(shares: Mapping[str, float]) -> str:
+    """The photographs of which so much was left out that their user should know; empty where there is none."""
+    told = [share for share in shares.values() if share >= LEAST]
+    if not told:
+        return ""
+    least, most = f"{min(told):.0%}", f"{max(told):.0%}"
+    each = least if least == most else f"{least} to {most}"
+    of = f"{len(told)} photographs" if len(told) > 1 else "a photograph"
+    return f"left out of {of}: what moved between them, {each} of each (report.json names them)"
+
+
+# Where a Gaussian comes from, in one number, and which Gaussians two photographs have seen.
+#
+# Its `source_frame` is the frame_id of the keyframe whose pixels seeded it, where another keyframe confirms their
+# depth; `filled(frame_id)` where none does; and SHELL for the far shell, which no frame's pixels seeded.
+
+SHELL = -1
+
+Source = TypeVar("Source")
+
+
+def encode_unconfirmed(frame_id: int) -> int:
+    """The source frame of Gaussians that this frame's pixels seeded at a depth that no other frame confirms."""
+    return -2 - frame_id
+
+
+def decode_frame_id(source_frame: Source) -> Source:
+    """The frame_id (N,) of the keyframe that seeded each Gaussian, confirmed or not; SHELL for the far shell.
+
+    Arrays and tensors alike.
+    """
+    return abs(source_frame + 1) - 1  # pyright: ignore
+
+
+def find_confirmed(source_frame: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+    """(N,) which Gaussians began at a depth that two photographs confirm."""
+    return source_frame >= 0

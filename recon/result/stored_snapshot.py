@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -17,24 +17,23 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.image_file import (
     UnusableImage,
+    ValueRange,
     decode_any_image,
     encode_jpeg,
     find_common_range,
     read_image_file,
 )
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.memory_shortage import outlast, raise_shortage
-from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
-from splatnode.capture.value_range import ValueRange
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.limits import read_json_file
-from splatnode.recon.result.export.sources import SOURCES
-from splatnode.recon.result.export.stored import StoredResult, read_cameras, read_gaussians
-from splatnode.recon.result.landmarks_file import LANDMARKS, read_landmarks
+from splatnode.capture.process.system import outlast, raise_shortage
+from splatnode.capture.process.text import guard_untrusted, is_printable
+from splatnode.recon.result.export.cameras import decode_cameras
+from splatnode.recon.result.export.limits import SceneFileError, read_json_file
+from splatnode.recon.result.export.stored import SOURCES, StoredResult, read_cameras, read_gaussians
+from splatnode.recon.result.npz_files import LANDMARKS, read_landmarks
+from splatnode.recon.result.placement import IDENTITY, Placement
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.recon.result.up import Up
-from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry
+from splatnode.recon.result.verdict import Code, Up, Verdict
 
 log = logging.getLogger(__name__)
 
@@ -146,7 +145,7 @@ def _read_report(path: Path) -> _Report | None:
             report = record_in(read_json_file(path), _Report)
         except msgspec.MsgspecError as error:
             raise SceneFileError(f"{path} is not a report of splatnode, or is damaged: {error}") from error
-        if not all(is_printable(text, _LONGEST_SENTENCE) for text in report.texts()):
+        if not all(is_printable(text, _LONGEST_SENTENCE) for text in report.collect_texts()):
             longest = f"at most {_LONGEST_SENTENCE} characters"
             raise SceneFileError(f"{path} is not a report of splatnode: its texts must be printable, of {longest}")
         return report
@@ -203,3 +202,88 @@ def encode_image(camera: CameraEstimate, images: Mapping[str, npt.NDArray[np.uin
         return None
     sized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     return encode_jpeg(np.asarray(sized, np.uint8), _JPEG_QUALITY)
+
+
+# The pieces of a map: what is read scene by scene, so that a part of a map can be looked at without the rest of it.
+#
+# Where the map was merged (`splatnode merge`), a piece is what the merged scene kept of a submap, beside the one of
+# all far shells. Where it was not, or where scenes came since, a piece is the scene itself.
+
+SHELL_PIECE = "far-shell"
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A file with Gaussians, and how they lie in the map."""
+
+    scene_id: str  # SHELL_PIECE: of no scene
+    path: Path
+    placement: Placement
+    cameras: tuple[CameraEstimate, ...]  # of its scene, in the map's world
+
+    def load_gaussians(self) -> GaussianArrays:
+        """In the map's world and unit. Raises SceneFileError, which names the file, and OSError."""
+        try:
+            return self.placement.transform_gaussians(read_gaussians(self.path))
+        except SceneFileError as error:
+            raise SceneFileError(f"{self.path.parent}: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """All of a map."""
+
+    pieces: tuple[Piece, ...]
+    merged: bool  # whether they are what merging kept
+
+    @property
+    def cameras(self) -> tuple[CameraEstimate, ...]:
+        """One camera for each image, in the order of the scenes."""
+        found: dict[str, CameraEstimate] = {}
+        for camera in (camera for piece in self.pieces for camera in piece.cameras):
+            found.setdefault(camera.name, camera)
+        return tuple(found.values())
+
+
+def make_merged_path(out: Path, of: JoinedMap) -> Path:
+    """Returns the path of a map's merged result."""
+    return out / f"map-{of.name}"
+
+
+def make_piece_name(scene_id: str) -> str:
+    """The name, in a merged result, of the file with what was kept of a scene."""
+    return f"pieces/{scene_id}.ply"
+
+
+def find_pieces(whole: MapSet, of: JoinedMap, out: Path) -> Pieces:
+    """The pieces of a map whose merged result may be in `out`. Raises SceneFileError, OSError."""
+    shown = {name: placement for name, placement in of.placements.items() if has_scene(whole.places[name])}
+    folder = make_merged_path(out, of)
+    if shown and (folder / make_piece_name(SHELL_PIECE)).is_file() and all(_is_merged(whole, n, folder) for n in shown):
+        cameras = {each.name: each for each in decode_cameras(read_json_file(folder / "cameras.json"), str(folder))}
+        used = {name: whole.places[name].frames_used for name in shown}
+        known = {name: tuple(cameras[each] for each in names if each in cameras) for name, names in used.items()}
+        pieces = [Piece(name, folder / make_piece_name(name), IDENTITY, known[name]) for name in shown]
+        return Pieces((*pieces, Piece(SHELL_PIECE, folder / make_piece_name(SHELL_PIECE), IDENTITY, ())), merged=True)
+    return Pieces(tuple(_make_scene_pieces(whole, shown)), merged=False)
+
+
+def _is_merged(whole: MapSet, scene_id: str, folder: Path) -> bool:
+    """Whether a merged result has the scene as it is now."""
+    piece, scene = folder / make_piece_name(scene_id), whole.places[scene_id].folder
+    return piece.is_file() and (scene is None or (scene / "scene.ply").stat().st_mtime <= piece.stat().st_mtime)
+
+
+def has_scene(place: SubmapEntry) -> bool:
+    """Whether the place has a result that may be shown."""
+    return place.folder is not None and place.publishable and (place.folder / "scene.ply").is_file()
+
+
+def _make_scene_pieces(whole: MapSet, placements: Mapping[str, Placement]) -> list[Piece]:
+    found = []
+    for scene_id, placement in placements.items():
+        folder = whole.places[scene_id].folder
+        assert folder is not None  # `has_scene` has seen to it
+        cameras = tuple(placement.transform_camera(camera) for camera in read_cameras(folder / "cameras.json"))
+        found.append(Piece(scene_id, folder / "scene.ply", placement, cameras))
+    return found

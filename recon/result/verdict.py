@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
 
 
 class Code(enum.Enum):
-    """The codes of a verdict. `recon/verification/refusals.py` has the sentences and the advice."""
+    """The codes of a verdict. `recon/verification/rejections.py` has the sentences and the advice."""
 
     OK = "OK"
     OK_PARTIAL = "OK_PARTIAL"
@@ -50,3 +57,171 @@ class Verdict:
     frames: tuple[str, ...] = ()  # the names that the code is about
     publishable: bool = False  # whether a scene may be shown as a result
     provisional: bool = False  # whether evidence is still to be looked at that may change it
+
+
+# How wrong an estimated camera may be: bounds on its errors, each of which holds for 95 % of all cameras.
+#
+# Rotations are counted after the best common rotation, centres after the best similarity: of photographs alone, the
+# world's place, direction and scale are not known.
+
+Array = npt.NDArray[np.float64]
+Vector = tuple[float, float, float]
+Axes = tuple[Vector, Vector, Vector]
+
+_CHI2_95_OF_3 = 7.815  # 95 % quantile of the chi-squared distribution with 3 degrees of freedom
+_NORMAL_95 = 1.645  # 95 % quantile of the standard normal distribution
+_NEGLIGIBLE = 1e-6  # standard deviation over bound: below, a covariance is rounding and has no shape
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """95 % bounds of one camera's errors."""
+
+    rotation_deg: float  # degrees
+    centre: float  # in the unit of the world: metres where it is metric
+    centre_percent: float  # the same, of the distance to the scene: the median depth of its points
+    focal_percent: float  # of the focal length
+    axes: Axes  # of the ellipsoid that holds the centre: semi-axes in the world's frame and unit, the longest first
+
+    def widen(self, factor: float) -> Bounds:
+        """Every bound `factor` times as wide."""
+        wider = self.rescale(factor)
+        return replace(
+            wider,
+            rotation_deg=factor * self.rotation_deg,
+            centre_percent=factor * self.centre_percent,
+            focal_percent=factor * self.focal_percent,
+        )
+
+    def rescale(self, factor: float) -> Bounds:
+        """The same in a world whose unit is `factor` times smaller."""
+        return replace(self, centre=self.centre * factor, axes=make_axes(factor * np.array(self.axes)))
+
+
+def find_widest(bounds: Iterable[Bounds]) -> Bounds | None:
+    """The widest bound of each kind, with the ellipsoid of the widest centre; None without any."""
+    every = list(bounds)
+    if not every:
+        return None
+    return Bounds(
+        rotation_deg=max(each.rotation_deg for each in every),
+        centre=max(each.centre for each in every),
+        centre_percent=max(each.centre_percent for each in every),
+        focal_percent=max(each.focal_percent for each in every),
+        axes=max(every, key=lambda each: each.centre).axes,
+    )
+
+
+def make_ball(radius: float) -> Axes:
+    """The semi-axes of a ball."""
+    return ((radius, 0.0, 0.0), (0.0, radius, 0.0), (0.0, 0.0, radius))
+
+
+def compute_axes(covariance: Array, centre: float) -> Axes:
+    """The semi-axes of the ellipsoid of 95 % for a centre whose errors are shorter than `centre` with 95 %.
+
+    `covariance` (3, 3) gives its shape, `centre` its size: the ellipsoid is that of a normal distribution with a
+    multiple of the covariance under which 95 % of the errors are shorter than `centre`. A ball where all directions
+    are alike; in a needle's direction it is longer than `centre`, by 1.4 times at most, for an ellipsoid of three
+    dimensions must be wider to hold as much. A ball, too, where `covariance` is not finite or has no size.
+    """
+    if not (np.isfinite(covariance).all() and np.isfinite(centre)):
+        return make_ball(centre)
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    variances = values[::-1].clip(0.0)
+    if variances[0] <= (_NEGLIGIBLE * centre) ** 2:
+        return make_ball(centre)
+    lengths = centre * np.sqrt(_CHI2_95_OF_3 * variances / _compute_squared_length_95(variances))
+    directions = vectors.T[::-1]
+    largest = directions[np.arange(3), np.abs(directions).argmax(1)]
+    return make_axes(lengths[:, None] * directions * np.sign(largest)[:, None])
+
+
+def compute_covariance(axes: Axes) -> Array:
+    """(3, 3) of the normal distribution whose 95 % ellipsoid has these semi-axes."""
+    rows = np.array(axes)
+    return rows.T @ rows / _CHI2_95_OF_3
+
+
+def compute_length_95(covariance: Array) -> float:
+    """The length that an error with `covariance` (3, 3) keeps below with 95 %; infinite where that is not finite."""
+    if not np.isfinite(covariance).all():
+        return math.inf
+    variances = np.linalg.eigvalsh((covariance + covariance.T) / 2.0).clip(0.0)
+    return math.sqrt(_compute_squared_length_95(variances)) if variances.any() else 0.0
+
+
+def make_axes(rows: Array) -> Axes:
+    """The rows (3, 3) as axes."""
+    first, second, third = ((float(x), float(y), float(z)) for x, y, z in rows)
+    return first, second, third
+
+
+def _compute_squared_length_95(variances: Array) -> float:
+    """The 95 % quantile of the squared length of a normal vector with `variances` (3,) along its axes.
+
+    As of the scaled chi-squared variable with the same mean and variance (Satterthwaite, 1946), whose quantile is
+    Wilson and Hilferty's (1931): within 3 %.
+    """
+    mean, square = float(variances.sum()), float((variances**2).sum())
+    spread = 2.0 * square / (9.0 * mean**2)  # 2 / (9 degrees of freedom)
+    return mean * (1.0 - spread + _NORMAL_95 * spread**0.5) ** 3
+
+
+# The unit of a result's lengths, which every file that is written states.
+
+TWO_SIDED_95 = 1.96  # standard deviations to either side that hold 95 % of a normal distribution
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Whether lengths are metres, and how that is known."""
+
+    metric: bool = False  # lengths are metres
+    source: str | None = None  # of the metres, or why there are none although they were asked for
+    # Of metres: a true length is at least and at most so many times the stated one, with a probability of 95 %
+    interval_95: tuple[float, float] | None = None
+
+    @property
+    def word(self) -> str:
+        return "metric" if self.metric else "relative"
+
+    @property
+    def sentence(self) -> str:
+        meaning = "metres" if self.metric else "no metric unit"
+        return f"{self.word} ({meaning}{f': {self.source}' if self.source else ''})"
+
+    def record(self) -> dict[str, object]:
+        """As JSON files state it."""
+        return {"scale": self.word, "scale_source": self.source, "scale_interval_95": self.interval_95}
+
+
+RELATIVE = Scale()
+
+
+def join_sentences(said: Sequence[str], longest: int = LONGEST_TEXT) -> str:
+    """Joins `said` into one text of at most `longest` characters: what fits, and how many more there are."""
+    for kept in range(len(said), 0, -1):
+        left_out = [f"and {len(said) - kept} more"] if kept < len(said) else []
+        text = "; ".join([*said[:kept], *left_out])
+        if len(text) <= longest:
+            return text
+    return sanitize_text("; ".join(said), longest)
+
+
+# Where up is in the world of a result, by an IMU.
+
+_UNIT = 1e-3  # by which the length of a direction may differ from 1
+
+
+@dataclass(frozen=True)
+class Up:
+    """The direction against gravity. Raises ValueError where it is none."""
+
+    direction: tuple[float, float, float]  # of length 1, in the world
+    sigma_deg: float  # standard deviation in each direction
+    source: str  # in words
+
+    def __post_init__(self) -> None:
+        if not abs(math.hypot(*self.direction) - 1.0) <= _UNIT or not 0 < self.sigma_deg <= 180:
+            raise ValueError(f"up must be a direction of length 1 with a sigma in degrees, got {self}")

@@ -6,39 +6,564 @@ refuses gives the reason. A further check is a file with a function of a `Verifi
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from splatnode.capture import quality
+from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.register import Registration
-from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.verification import causes, checks
-from splatnode.recon.verification.acceptances import accept
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.result.verdict import Bounds, Code, Verdict, find_widest
+from splatnode.recon.verification import rejections
 from splatnode.recon.verification.before_registration import refuse_before_registration, refuse_unplaced
-from splatnode.recon.verification.checks import VerificationCase
 from splatnode.recon.verification.config import DecisionConfig
-from splatnode.recon.verification.evidence import Evidence
+from splatnode.recon.verification.error_model import (
+    VerdictModel,
+    VerdictModels,
+    compute_log_odds,
+    compute_travel_percent,
+    predict_bounds,
+)
+from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.models import VerdictModels
-from splatnode.recon.verification.odds_check import check_odds
-from splatnode.recon.verification.strong_lens import check_strong_distortion
-from splatnode.recon.verification.undetermined import check_finite
+from splatnode.recon.verification.refit import FreedLens
+from splatnode.recon.verification.rejections import Refusal, refuse
+
+# Checks of registered poses, each of one piece of evidence: a refusal, or None where nothing speaks against them.
+#
+# A limit is asked so that NaN refuses: "not (value <= limit)", never "value > limit".
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceCase:
+    """The evidence of registered poses, and the numbers to judge it by."""
+
+    evidence: Evidence
+    config: DecisionConfig
+    numbers: VerdictModel
+
+    @cached_property
+    def bounds(self) -> Mapping[str, Bounds]:
+        """Returns the bounds of each camera's errors, by its name."""
+        return predict_bounds(self.evidence, self.numbers.claims)
+
+    @property
+    def widest_bounds(self) -> Bounds:
+        """The widest bound of each kind. Raises ValueError where there is no camera."""
+        found = find_widest(self.bounds.values())
+        if found is None:
+            raise ValueError("there must be a camera to be judged")
+        return found
+
+    @property
+    def travel_percent(self) -> float:
+        """The widest bound of a centre, of how far the camera moved."""
+        return compute_travel_percent(self.bounds, self.evidence)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether what is known is as good as a right answer; else it is rough."""
+        worst, config = self.widest_bounds, self.config
+        return (
+            worst.rotation_deg <= config.exact_rotation_deg
+            and worst.focal_percent <= config.exact_focal_percent
+            and self.travel_percent <= config.exact_travel_percent
+        )
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the bounds are narrow enough for anything to be done with the cameras."""
+        worst, config = self.widest_bounds, self.config
+        return (
+            worst.rotation_deg <= config.max_rotation_deg
+            and worst.centre_percent <= config.max_centre_percent
+            and self.travel_percent <= config.max_travel_percent
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Returns the names of the frames that were placed."""
+        return [camera.name for camera in self.evidence.cameras]
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationCase(EvidenceCase):
+    """Registered poses, and where they come from."""
+
+    graph: ViewGraph
+    registration: Registration
+
+
+def check_given_lens(case: EvidenceCase) -> Verdict | None:
+    """Most images refute the lens that was given for them: it is wrong, not they."""
+    changes = [camera.refuted_focal for camera in case.evidence.cameras if camera.refuted_focal > 0]
+    refuted = [change for change in changes if change != 1.0]
+    if 2 * len(refuted) <= len(changes):
+        return None
+    change = 100 * (float(np.median(refuted)) - 1.0)
+    return refuse(rejections.WRONG_LENS, case.names, refuted=len(refuted), count=len(changes), change=change)
+
+
+def check_given_focal(case: EvidenceCase) -> Verdict | None:
+    """The photographs contradict a focal length that came with them."""
+    doubted = [freed for freed in case.evidence.freed if _is_contradicted(freed, case.config)]
+    if not doubted:
+        return None
+    worst = max(doubted, key=lambda lens: abs(lens.found / lens.given - 1.0))
+    change = 100 * (worst.found / worst.given - 1.0)
+    return refuse(rejections.WRONG_FOCAL, case.names, given=worst.given, found=worst.found, change=change)
+
+
+def _is_contradicted(freed: FreedLens, config: DecisionConfig) -> bool:
+    change = abs(np.log(freed.found / freed.given))
+    if freed.trusted:
+        return not (change <= config.focal_change or freed.cost_ratio >= config.focal_gain)
+    held_back = abs(np.log(freed.found / freed.registered))
+    return not (change <= config.nominal_change or held_back <= config.held_back)
+
+
+def check_distortion(case: EvidenceCase) -> Verdict | None:
+    """The lens distorts the picture by more than registration found."""
+    found, config = case.evidence.distortion, case.config
+    if found.cost_ratio >= config.focal_gain or found.corner_shift <= config.corner_shift:
+        return None
+    return refuse(rejections.DISTORTED, case.names, further=100 * found.corner_shift)
+
+
+def check_moving_plane(case: EvidenceCase) -> Verdict | None:
+    """All that fits is one plane, and much does not fit with it: a flat thing that moves before what stands still."""
+    evidence, config = case.evidence, case.config
+    explained = evidence.inlier_ratio > config.moving_inlier_ratio
+    if evidence.flatness < config.moving_flatness or (explained and np.isfinite(evidence.flatness)):
+        return None
+    return refuse(rejections.MOVING, case.names, inliers=100 * evidence.inlier_ratio)
+
+
+def check_weakest_link(case: EvidenceCase) -> Verdict | None:
+    """Two groups of frames share almost no points."""
+    link = case.evidence.weakest_link
+    if link.shared_points >= case.config.min_link_points:
+        return None
+    return _refuse_split(link.smaller_part)
+
+
+def check_connectivity(case: EvidenceCase) -> Verdict | None:
+    """Only contradicted matches join some frames to most of the others."""
+    return _refuse_split(case.evidence.disconnected) if case.evidence.disconnected else None
+
+
+def _refuse_split(frames: Sequence[str]) -> Verdict:
+    return refuse(rejections.APART, frames, count=len(frames))
+
+
+def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
+    """Some photographs match the others better when they are turned left to right."""
+    found = case.evidence.reflection
+    if found.gain <= case.config.max_reflection:
+        return None
+    return refuse(rejections.MIRRORED_PHOTOGRAPHS, found.frames, count=len(found.frames))
+
+
+def check_required_precision(case: EvidenceCase) -> Verdict | None:
+    """The centres are known less well than the user requires."""
+    needed = case.config.require_percent
+    if needed is None or case.widest_bounds.centre_percent <= needed:
+        return None
+    return refuse(rejections.ROUGHER, case.names, found=case.widest_bounds.centre_percent, needed=needed)
+
+
+# Why bounds are wide: which of parallax, depth, focal length and shared points was missing, and between which frames.
+#
+# The causes are asked one after the other, those first that bring the others about: a camera that only turned leaves
+# the focal length open, too. Each looks at its own evidence, so that no remedy is advised for something that is fine.
+
+FEW_CONFIRMED = 30  # points of a camera that two others see; with fewer a pose hangs on single ones
+SMALL_ANGLE_DEG = 5.0  # of the points' viewing angles, in the median, below which more parallax helps
+
+
+def check_bounds(case: VerificationCase) -> Verdict | None:
+    """The bounds of the cameras are so wide that nothing is known that could be used."""
+    return None if case.is_usable else explain_wide_bounds(case)
+
+
+def explain_wide_bounds(case: VerificationCase) -> Verdict:
+    """The refusal that names the cause."""
+    return (
+        _check_pure_rotation(case)
+        or _check_planarity(case)
+        or _check_focal(case)
+        or _check_shared_points(case)
+        or _check_viewing_angle(case)
+        or _refuse_scattered(case)
+    )
+
+
+def _check_pure_rotation(case: VerificationCase) -> Verdict | None:
+    pairs = case.graph.pairs.values()
+    matches = sum(len(view.matches) for view in pairs)
+    share = sum(view.num_rotation for view in pairs) / max(1, matches)
+    if share <= case.config.explained_by_turning:
+        return None
+    return refuse(rejections.NO_PARALLAX, case.names, found=f"a turn explains {100 * share:.0f} % of all matches")
+
+
+def _check_planarity(case: VerificationCase) -> Verdict | None:
+    """Views of one plane fix neither the focal length nor which way it leans."""
+    pairs = case.graph.pairs.values()
+    on_plane = sum(view.num_homography for view in pairs)
+    if on_plane <= case.config.explained_by_plane * sum(len(view.matches) for view in pairs):
+        return None
+    return (
+        None
+        if case.widest_bounds.focal_percent <= case.config.exact_focal_percent
+        else refuse(rejections.PLANAR, case.names)
+    )
+
+
+def _check_focal(case: VerificationCase) -> Verdict | None:
+    worst = case.widest_bounds
+    if worst.focal_percent <= case.config.exact_focal_percent:
+        return None
+    centre, rotation = worst.centre_percent, worst.rotation_deg
+    return refuse(rejections.UNCERTAIN_FOCAL, case.names, focal=worst.focal_percent, centre=centre, rotation=rotation)
+
+
+def _check_shared_points(case: VerificationCase) -> Verdict | None:
+    """Refuses the camera with the widest bound among those that share few points."""
+    weak = [camera for camera in case.evidence.cameras if camera.confirmed < FEW_CONFIRMED]
+    if not weak or len(case.evidence.cameras) == 2:  # nobody else sees the points of two
+        return None
+    weakest = max(weak, key=lambda camera: case.bounds[camera.name].centre_percent)
+    partners = case.graph.partners(case.graph.names.index(weakest.name))
+    nearest = case.graph.names[max(partners, key=lambda index: (partners[index], -index))]
+    return refuse(
+        rejections.FEW_SHARED_POINTS,
+        (weakest.name, nearest),
+        name=weakest.name,
+        points=weakest.confirmed,
+        partner=nearest,
+        centre=case.bounds[weakest.name].centre_percent,
+        rotation=case.bounds[weakest.name].rotation_deg,
+    )
+
+
+def _check_viewing_angle(case: VerificationCase) -> Verdict | None:
+    angle = case.evidence.median_angle_deg
+    if angle >= SMALL_ANGLE_DEG:
+        return None
+    rotation = case.widest_bounds.rotation_deg
+    return refuse(rejections.TOO_CLOSE, case.names, angle=angle, travel=case.travel_percent, rotation=rotation)
+
+
+def _refuse_scattered(case: VerificationCase) -> Verdict:
+    """None of these: the parts of the photographs disagree, most about one camera."""
+    config = case.config
+
+    def width(name: str) -> float:
+        found = case.bounds[name]
+        return max(found.rotation_deg / config.max_rotation_deg, found.centre_percent / config.max_centre_percent)
+
+    worst = max(case.bounds, key=width)
+    bounds = case.bounds[worst]
+    return refuse(
+        rejections.SCATTERED, (worst,), name=worst, centre=bounds.centre_percent, rotation=bounds.rotation_deg
+    )
+
+
+# The verdicts with which a scene is published, in words: which frames it has, and what is to be said of them.
+
+
+def accept(case: VerificationCase) -> Verdict:
+    """OK where all photographs were placed, exactly; else what the others show, or how roughly they are placed."""
+    left_out = _find_unplaced_frames(case)
+    rough = _describe_roughness(case)
+    if rough:
+        message = f"{_summarize_placement(case)}, roughly: {rough}."
+        found = Verdict(Code.OK_ROUGH, message, _advise_remedy(case), left_out, publishable=True)
+    else:
+        found = _accept_partial(case, left_out) if left_out else _accept_all(case)
+    lenses = _describe_own_lenses(case)
+    return replace(found, message=f"{found.message} {lenses}") if lenses else found
+
+
+def _describe_own_lenses(case: VerificationCase) -> str:
+    """A sentence about images whose lens is not the one that they were taken to share, or that was given."""
+    names = case.graph.names
+    own = {names[camera.index]: camera.focal for camera in case.registration.cameras if camera.own_lens}
+    if not own:
+        return ""
+    others = [camera.focal for camera in case.registration.cameras if not camera.own_lens]
+    beside = f"; the others have {np.median(others):.0f}" if others else ""
+    if len(own) == 1:
+        ((name, focal),) = own.items()
+        return f"{name} has a lens of its own, with a focal length of {focal:.0f} pixels{beside}."
+    least, most = min(own.values()), max(own.values())
+    return (
+        f"{len(own)} images have lenses of their own, with focal lengths of {least:.0f} to {most:.0f} pixels{beside}."
+    )
+
+
+def _find_unplaced_frames(case: VerificationCase) -> tuple[str, ...]:
+    placed = {camera.index for camera in case.registration.cameras}
+    return tuple(name for index, name in enumerate(case.graph.names) if index not in placed)
+
+
+def _summarize_placement(case: VerificationCase) -> str:
+    placed, count = len(case.registration.cameras), len(case.graph.keyframes)
+    return f"{'All' if placed == count else f'{placed} of'} {count} photographs were placed"
+
+
+def _describe_roughness(case: VerificationCase) -> str:
+    """Describes what is known less well than in an exact scene; empty where nothing is."""
+    if case.is_exact:
+        return ""
+    worst = case.widest_bounds
+    return (
+        f"positions are known to {worst.centre_percent:.2g} % of the distance to the scene "
+        f"({case.travel_percent:.2g} % of how far the camera moved), directions to {worst.rotation_deg:.2g} degrees, "
+        f"the focal length to {worst.focal_percent:.2g} %"
+    )
+
+
+def _advise_remedy(case: VerificationCase) -> str:
+    """Returns the remedy for the cause that made the scene rough."""
+    return explain_wide_bounds(case).advice
+
+
+def _accept_partial(case: VerificationCase, left_out: tuple[str, ...]) -> Verdict:
+    graph, summary = case.graph, _summarize_placement(case)
+    names, placed = graph.names, {camera.index for camera in case.registration.cameras}
+    apart = [part for part in graph.components() if not placed & set(part)]
+    if any(len(part) > 1 for part in apart):
+        return Verdict(
+            Code.SPLIT,
+            f"{summary}; others show a place of their own: "
+            + "; ".join(", ".join(names[i] for i in part) for part in apart)
+            + ".",
+            "Add photographs that connect the places, or take them one after the other.",
+            left_out,
+            publishable=True,
+        )
+    if len(apart) == len(left_out) == 1 and len(placed) > 3:
+        return Verdict(
+            Code.OUTLIER_VIEW,
+            f"{summary}; {left_out[0]} shows nothing of what the others show.",
+            "Leave it out, or add a photograph between it and the others.",
+            left_out,
+            publishable=True,
+        )
+    return Verdict(
+        Code.OK_PARTIAL,
+        f"{summary}; {len(left_out)} share too little with them.",
+        f"Add a photograph between the others and {left_out[0]}.",
+        left_out,
+        publishable=True,
+    )
+
+
+def _accept_all(case: VerificationCase) -> Verdict:
+    exposure_ratio, cameras = case.config.exposure_ratio, case.evidence.cameras
+    gains = {camera.name: camera.gain for camera in cameras}  # finite, for `check_finite` let them pass
+    ratio = max(gains.values()) / min(gains.values())
+    if ratio <= exposure_ratio:
+        return Verdict(Code.OK, f"{_summarize_placement(case)}.", "", (), publishable=True)
+    limit = exposure_ratio**0.5
+    return Verdict(
+        Code.EXPOSURE_SHIFT,
+        f"{_summarize_placement(case)}; the brightest is exposed {ratio:.1f} times as much as the darkest.",
+        "Lock exposure and white balance.",
+        tuple(name for name, gain in gains.items() if not 1 / limit < gain < limit),
+        publishable=True,
+    )
+
+
+def make_overfit_verdict(names: Sequence[str], iterations: int, kept: int, before: float, after: float) -> Verdict:
+    """OVERFIT: the scene after `kept` iterations is published in place of the one after `iterations`.
+
+    `before` and `after` are their misfits between the photographs.
+    """
+    return Verdict(
+        Code.OVERFIT,
+        f"The refinement overfitted the photographs: between them the scene misses what stereo shows by {after:.2g} "
+        f"after {iterations} iterations, and by {before:.2g} after {kept}, which is the scene that is given.",
+        "Take smaller steps (optimize.rates) or fewer (optimize.iterations), or a preset as it is.",
+        tuple(names),
+        publishable=True,
+    )
+
+
+# The check of all evidence together: are the poses more likely right than wrong? If not, why?
+
+
+def check_odds(case: VerificationCase) -> Verdict | None:
+    """The evidence speaks against the poses."""
+    found = compute_log_odds(case.evidence, case.numbers.claims, case.numbers.odds)
+    if found.total >= case.config.min_log_odds:
+        return None
+    return _refuse_wrong_frames(case) or _refuse_wrong_poses(case, found.strongest_rejection)
+
+
+def _refuse_wrong_frames(case: VerificationCase) -> Verdict | None:
+    """Refuses the images that explain why their poses are unlikely; None where none do."""
+    names, limit = case.names, case.config.blurred_px
+    foreign = _find_other_lens_frames(case)
+    if foreign:
+        return refuse(rejections.MIXED_CAMERAS, foreign, others=len(foreign), count=len(names))
+    widths = {
+        keyframe.name: quality.blur_width(keyframe.image) or 0.0
+        for keyframe in case.graph.keyframes
+        if keyframe.name in names
+    }
+    widest = max(widths.values())
+    if widest > limit:
+        return refuse(rejections.BLURRED, [name for name in names if widths[name] > limit], width_px=widest)
+    return None
+
+
+def _refuse_wrong_poses(case: VerificationCase, against: str) -> Verdict:
+    """Refuses for the reason that speaks most against the poses."""
+    cameras = case.evidence.cameras
+    if against == "mirrored_cost":
+        return refuse(rejections.MIRRORED_IN_DEPTH, case.names)
+    if against == "reflection":
+        mirrored = case.evidence.reflection.frames
+        return refuse(rejections.MIRRORED_PHOTOGRAPHS, mirrored, count=len(mirrored))
+    if against == "flat_patch":
+        smallest = min(cameras, key=lambda camera: camera.coverage)
+        percent = 100 * smallest.coverage
+        return refuse(rejections.FLAT_PATCH, (smallest.name,), name=smallest.name, percent=percent)
+    if against == "coverage":
+        smallest = min(cameras, key=lambda camera: camera.coverage)
+        percent = 100 * smallest.coverage
+        return refuse(rejections.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
+    if against in ("rotation_bound", "travel_bound"):
+        return explain_wide_bounds(case)
+    return _refuse_contradictions(case, against)
+
+
+def _refuse_contradictions(case: VerificationCase, against: str) -> Verdict:
+    """Photographs, pairs of them, or two parts do not fit together. It is about the photograph that fits least."""
+    weakest = min(case.evidence.cameras, key=lambda camera: camera.inlier_ratio)
+    if against == "directions":
+        return refuse(rejections.DISAGREEING, (weakest.name,), degrees=case.evidence.cycles.direction_deg)
+    if against == "link_inlier_ratio":
+        link, inliers = case.evidence.weakest_link, 100 * case.evidence.weakest_link.inlier_ratio
+        count, points = len(link.smaller_part), link.shared_points
+        return refuse(rejections.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
+    if against == "camera_inlier_ratio":
+        return refuse(rejections.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
+    return refuse(rejections.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
+
+
+def _find_other_lens_frames(case: VerificationCase) -> list[str]:
+    """Frames whose size says that another lens took them than most; none where the camera was calibrated."""
+    keyframes = [case.graph.keyframes[camera.index] for camera in case.registration.cameras]
+    sizes = [tuple(sorted((keyframe.frame.width, keyframe.frame.height))) for keyframe in keyframes]
+    common = max(sorted(set(sizes)), key=sizes.count)
+    others = [keyframe for keyframe, size in zip(keyframes, sizes, strict=True) if size != common]
+    return [keyframe.name for keyframe in others if keyframe.frame.intrinsics is None]
+
+
+# The check of lenses that bend lines by more than two radial coefficients can tell, as a fisheye's do.
+#
+# Beyond, the coefficients fit the middle of the picture and not its corners, and may fold the picture over.
+
+STRONG = 0.25  # by which a corner moves at most, of its distance from the middle: of 25 % it is 9 pixels of 1024 off
+_RADII = 100  # at which the lens is looked at
+
+BENDS_STRONGLY = Refusal(
+    Code.FOCAL_SUSPECT,
+    "The lens bends lines strongly: it moves the corners of the picture by more than {moved:.0f} % of their distance "
+    "from the middle, and what it does there cannot be told from the photographs.",
+    "Calibrate the camera (splatnode calibrate) and give its lens by --intrinsics.",
+)
+
+
+def check_strong_distortion(case: VerificationCase) -> Verdict | None:
+    """An estimated lens moves the corners of its pictures too far, or folds them over."""
+    for camera in case.registration.cameras:
+        frame = case.graph.keyframes[camera.index].frame
+        if not _is_well_modelled(camera, frame.width, frame.height):
+            return refuse(BENDS_STRONGLY, case.names, moved=100 * STRONG)
+    return None
+
+
+def _is_well_modelled(camera: RegisteredCamera, width: int, height: int) -> bool:
+    """Whether the lens shows each pixel as far as its farthest corner one ray, and that corner's within STRONG."""
+    if not camera.radial.any():
+        return True
+    across, down = camera.principal
+    corner = float(np.hypot(max(across, width - across), max(down, height - down)) / camera.focal)
+    radii = np.linspace(0.0, 1.0 + STRONG, _RADII) * corner
+    seen = radii * distortion(radii**2, camera.radial)
+    nearer = (1.0 - STRONG) * corner
+    least = nearer * float(distortion(np.square(nearer), camera.radial))
+    return bool((np.diff(seen) > 0).all() and least <= corner <= seen[-1])
+
+
+# The check that comes before all others: was everything computed that the verdict rests on?
+#
+# A comparison with NaN is false whatever it asks, and infinity lies beyond every limit on one side. Therefore no limit
+# is asked about such a number: poses of which something could not be computed are not published.
+
+UNDETERMINED = Refusal(
+    Code.UNDETERMINED,
+    "The poses cannot be verified: these could not be computed: {missing}.",
+    "Leave out the photographs named, or add photographs from further to the side between them and the others.",
+)
+
+WORDS = {  # what each field of the evidence says, for the user
+    "cameras": "how certain each pose is",
+    "inlier_ratio": "how many matches the poses explain",
+    "weakest_link": "what connects the photographs",
+    "disconnected": "which photographs belong together",
+    "reflection": "whether photographs are mirrored",
+    "flatness": "whether everything lies in one plane",
+    "mirrored_cost": "how much worse the scene mirrored in depth fits",
+    "cycles": "whether pairs of photographs agree with each other",
+    "median_angle_deg": "the angle under which points are seen",
+    "rms_px": "the reprojection error",
+    "focal": "how certain the focal length is",
+    "travel": "how far the camera moved",
+    "freed": "whether the given focal length is right",
+    "distortion": "whether the lens bends the picture",
+}
+
+
+def check_finite(case: VerificationCase) -> Verdict | None:
+    """A number of the registration or of its evidence is NaN or infinite."""
+    paths = list(find_non_finite(case.evidence))
+    of_cameras = [case.names[int(path[1])] for path in paths if path[0] == "cameras"]
+    found = [WORDS[path[0]] for path in paths]
+    if any(find_non_finite(case.registration)):
+        found.append("the poses themselves")
+    if not found:
+        return None
+    frames = tuple(dict.fromkeys(of_cameras)) or case.names
+    return refuse(UNDETERMINED, frames, missing="; ".join(dict.fromkeys(found)))
+
 
 __all__ = ["DecisionConfig", "decide", "refuse_before_registration"]
 
 LIMITS = (  # each asks one piece of the evidence, and decides by itself
-    checks.check_given_lens,
-    checks.check_given_focal,
-    checks.check_distortion,
-    checks.check_moving_plane,
-    checks.check_weakest_link,
-    checks.check_connectivity,
-    checks.check_mirrored_images,
+    check_given_lens,
+    check_given_focal,
+    check_distortion,
+    check_moving_plane,
+    check_weakest_link,
+    check_connectivity,
+    check_mirrored_images,
 )
 CHECKS = (  # what is surer about the reason comes first; those after the first may take all numbers for finite
     check_finite,
     *LIMITS,
     check_strong_distortion,
     check_odds,
-    causes.check_bounds,
-    checks.check_required_precision,
+    check_bounds,
+    check_required_precision,
 )
 
 

@@ -2,13 +2,104 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 
-from splatnode.recon.verification.cycles import CycleConsistency
-from splatnode.recon.verification.errors import Errors, PoseErrors
-from splatnode.recon.verification.lens import Distortion, FreedLens
-from splatnode.recon.verification.reflection import Reflection
-from splatnode.recon.verification.weakest_link import WeakestLink
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.candidates import find_components
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.registration.resection import compute_pooled_ratio
+from splatnode.recon.verification import consistency, refit
+from splatnode.recon.verification.consistency import CycleConsistency, Reflection
+from splatnode.recon.verification.refit import Distortion, Errors, FreedLens, PoseErrors
+
+# The weakest link: the last edge of the maximum spanning tree of the cameras, over the points that pairs share.
+
+MIN_CONSISTENT_SHARE = 0.6  # of a pair's matches that the poses explain, for it to connect its frames
+MIN_CONSISTENT_MATCHES = 20  # that the poses explain, for a pair to connect its frames
+
+
+@dataclass(frozen=True)
+class WeakestLink:
+    """Two places that a few chance matches connect are each right by themselves: only what connects them tells."""
+
+    smaller_part: tuple[str, ...]  # its keyframes, by name
+    shared_points: int  # of the pairs of frames across the link, summed
+    matches: int  # of the verified pairs across it
+    inliers: float  # of these, how many the poses explain
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Returns the share of the matches across the link that the poses explain; 0 without any."""
+        return float(self.inliers / np.maximum(1, self.matches))  # NaN where one of them is
+
+
+def measure_weakest_link(
+    registration: Registration,
+    names: Sequence[str],
+    pairs: Mapping[tuple[int, int], TwoView],
+) -> WeakestLink:
+    """Measures the link between the two parts that the last edge of the maximum spanning tree joins.
+
+    `names` are those of all keyframes.
+    """
+    indices = [camera.index for camera in registration.cameras]
+    shared = count_shared_points(registration)
+    one, other = _split_at_weakest_link(indices, shared)
+    across = [(i, j) for i in one for j in other]
+    verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.inlier_ratios]
+    return WeakestLink(
+        smaller_part=tuple(names[index] for index in sorted(min(one, other, key=len))),
+        shared_points=int(sum(shared[pair] for pair in across)),
+        matches=sum(len(pairs[key].matches) for key in verified),
+        inliers=sum(registration.inlier_ratios[key] * len(pairs[key].matches) for key in verified),
+    )
+
+
+def find_disconnected_frames(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) -> tuple[int, ...]:
+    """Keyframes, by position, outside the largest component of geometrically consistent pairs.
+
+    Frames that pose as others, as mirror images of a symmetric place do, fit well with each other, and with the rest
+    only where the place repeats.
+    """
+    consistent = [
+        key
+        for key, share in registration.inlier_ratios.items()
+        if share >= MIN_CONSISTENT_SHARE and share * len(pairs[key].matches) >= MIN_CONSISTENT_MATCHES
+    ]
+    _, *rest = find_components([camera.index for camera in registration.cameras], consistent)
+    return tuple(sorted(index for part in rest for index in part))
+
+
+def count_shared_points(registration: Registration) -> npt.NDArray[np.int64]:
+    """(M, M) how many points each two frames both observe."""
+    size = max(camera.index for camera in registration.cameras) + 1
+    seen = np.zeros((size, len(registration.points)), np.int64)
+    seen[registration.observed_by, registration.observed_point] = 1
+    return seen @ seen.T
+
+
+def _split_at_weakest_link(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
+    """The parts without the edge that Kruskal's algorithm adds last, most shared points first: the larger, the rest."""
+    links = sorted(
+        ((i, j) for place, i in enumerate(indices) for j in indices[:place]),
+        key=lambda pair: (-shared[pair], pair),
+    )
+    taken: list[tuple[int, int]] = []
+    for link in links:
+        parts = find_components(indices, [*taken, link])
+        if len(parts) == 1:
+            break
+        taken.append(link)
+    first, *rest = find_components(indices, taken)
+    return first, [index for part in rest for index in part]
 
 
 @dataclass(frozen=True)
@@ -46,3 +137,291 @@ class Evidence:
     travel: float  # RMS distance of the centres from their mean; the distance to the scene is 1
     freed: tuple[FreedLens, ...]  # lenses that came with the frames
     distortion: Distortion
+
+
+# How differently the frames are exposed: the brightness of the same points in all of them.
+
+DARK, BRIGHT = 12.0, 243.0  # grey levels of 255; what is near black or white says nothing about a gain
+ROUNDS = 3  # each compares a frame with the mean of the others as it is known so far
+
+
+def estimate_gains(
+    greys: Mapping[int, npt.NDArray[np.float32]], registration: Registration, scales: Mapping[int, tuple[float, float]]
+) -> dict[int, float]:
+    """Each frame's gain: its points' grey levels over those of the same points in the other frames, 1 on average.
+
+    `greys` are the pictures at modelled size by frame, `scales` their size over the frame's.
+    """
+    values = np.full(len(registration.observed_by), np.nan)
+    for index, grey in greys.items():
+        mine = registration.observed_by == index
+        at = (registration.observed_pixels[mine] * scales[index]).astype(int)
+        values[mine] = grey[np.clip(at[:, 1], 0, grey.shape[0] - 1), np.clip(at[:, 0], 0, grey.shape[1] - 1)]
+    logs = np.where((values > DARK) & (values < BRIGHT), np.log(np.maximum(values, 1.0)), np.nan)
+    found = dict.fromkeys(greys, 0.0)
+    for _ in range(ROUNDS):
+        corrected = logs - np.array([found.get(int(index), 0.0) for index in registration.observed_by])
+        known = np.isfinite(corrected)
+        total = np.bincount(registration.observed_point[known], corrected[known], minlength=len(registration.points))
+        count = np.bincount(registration.observed_point[known], minlength=len(registration.points))
+        mean = (total / np.maximum(count, 1))[registration.observed_point]
+        found = {
+            index: found[index] + _median((corrected - mean)[known & (registration.observed_by == index)])
+            for index in greys
+        }
+    middle = _median(np.array(list(found.values())))
+    return {index: float(np.exp(value - middle)) for index, value in found.items()}
+
+
+def _median(values: npt.NDArray[np.float64]) -> float:
+    return float(np.median(values)) if len(values) else 0.0
+
+
+# Which numbers could not be computed: NaN and infinity in a record, found by walking all of its fields.
+
+
+def find_non_finite(record: object, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The path of every number in `record` that is NaN or infinite: field names, positions and keys, outermost first.
+
+    Walks dataclasses, mappings, tuples, lists and numeric arrays; an array counts as one number. A field that is added
+    to a record is walked without a change here.
+    """
+    if is_dataclass(record) and not isinstance(record, type):
+        parts = ((field.name, getattr(record, field.name)) for field in fields(record))
+    elif isinstance(record, Mapping):
+        parts = ((str(key), value) for key, value in record.items())
+    elif isinstance(record, tuple | list):
+        parts = ((str(position), value) for position, value in enumerate(record))
+    else:
+        if isinstance(record, int | float | np.number | np.ndarray) and not np.isfinite(record).all():
+            yield path
+        return
+    for name, value in parts:
+        yield from find_non_finite(value, (*path, name))
+
+
+# Is all that was reconstructed one plane? Then a flat thing that moves may have been taken for the scene.
+
+Array = npt.NDArray[np.float64]
+
+NEAR = 0.01  # distance from a plane that counts as on it, in median depths
+_SAMPLE = 400  # points that are looked at: the share is known to 2.5 % (one standard error)
+_PLANES = 300  # tried, each through three of them
+_SLIVER = 1e-4  # twice the area of a triangle that defines no plane
+
+
+def compute_share_on_plane(points: Array, seed: int = 0) -> float:
+    """The largest share of `points` (P, 3), whose median depth is 1, that lies on one plane (RANSAC); 0 without any.
+
+    NaN where a point is not finite."""
+    if not np.isfinite(points).all():
+        return np.nan
+    if len(points) < 3:
+        return 0.0
+    rng = np.random.default_rng(seed)
+    sample = points[rng.permutation(len(points))[:_SAMPLE]]
+    corners = sample[np.stack([rng.permutation(len(sample))[:3] for _ in range(_PLANES)])]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    wide = lengths > _SLIVER
+    if not wide.any():
+        return 0.0
+    normals = normals[wide] / lengths[wide, None]
+    offsets = (normals * corners[wide, 0]).sum(1)
+    return float((np.abs(sample @ normals.T - offsets) < NEAR).mean(0).max())
+
+
+# The verification of a registration: evidence from sources that the fit did not use, or used otherwise.
+
+
+OUTSIDE = 0.03  # share of a camera's points on each side that the box of its coverage leaves out: wrong matches
+MIN_MATCHES = 60  # of a pair whose homography says something: fewer are explained by chance
+
+
+class VerificationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    tracks_per_camera: int = 300  # tracks of a camera in the bundle that is adjusted again
+    cycles: consistency.CycleConfig = consistency.CycleConfig()
+    reflection: consistency.ReflectionConfig = consistency.ReflectionConfig()
+
+
+def verify(
+    graph: ViewGraph,
+    registration: Registration | None,
+    config: VerificationConfig,
+    pause: Callable[[], None] = lambda: None,
+) -> Evidence | None:
+    """Numbers for and against `registration`; None where it has fewer than two cameras.
+
+    `pause` is called between the sources of evidence; it may raise to abandon the work.
+    """
+    if registration is None or len(registration.cameras) < 2:
+        return None
+    fit = refit.build_fit(graph.keyframes, registration, config.tracks_per_camera)
+    sizes = refit.measure_errors(fit, registration)
+    pause()
+    cameras = _collect_camera_evidence(graph, registration, sizes.cameras, sizes.focals)
+    pause()
+    return Evidence(
+        cameras=cameras,
+        inlier_ratio=compute_inlier_ratio(graph, registration, None),
+        weakest_link=measure_weakest_link(registration, graph.names, graph.pairs),
+        disconnected=_name_disconnected_frames(graph, registration),
+        reflection=_measure_reflection(graph, registration, config.reflection),
+        flatness=compute_share_on_plane(registration.points),
+        mirrored_cost=refit.compute_reversal_cost_ratio(fit),
+        cycles=consistency.measure_cycle_consistency(graph.keyframes, registration, graph.pairs, config.cycles),
+        median_angle_deg=registration.median_angle_deg,
+        rms_px=registration.rms_px,
+        focal=sizes.focal,
+        travel=refit.compute_travel(registration),
+        freed=refit.free_lenses(fit),
+        distortion=refit.measure_distortion(fit),
+    )
+
+
+def verify_further(
+    graph: ViewGraph, registration: Registration, known: Evidence, config: VerificationConfig
+) -> Evidence | None:
+    """Evidence for `registration`, which continues the one that `known` is about: provisional, and quick.
+
+    None where a further photograph may be mirrored: a few partners cannot tell that for certain, all evidence must.
+
+    Measured anew: the cameras that `known` does not have, with their exposure and whether their photographs are
+    mirrored; and of all cameras the matches, the weakest link, the plane, angles, errors and the focal length, of which
+    the larger uncertainty counts. Reused from `known`, because it says little about one camera more: the known cameras'
+    exposures and that they are not mirrored, the jackknife, the scene mirrored in depth, cycles, freed lenses and
+    distortion. The pose sigmas of a continuation, which aligns no patches, are too large: they are reduced by as much
+    as those of the known cameras are.
+    """
+    before = {camera.name: camera for camera in known.cameras}
+    names = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
+    further = {index for index, name in names.items() if name not in before}
+    reflections = _measure_further_reflections(graph, registration, names.keys() - further, further, config.reflection)
+    if not all(each.gain <= config.reflection.max_further_gain for each in reflections):
+        return None
+    known_errors = {index: before[name].errors for index, name in names.items() if name in before}
+    sizes = refit.extrapolate_pose_errors(registration, known_errors)
+    known_focals = {index: before[name].focal for index, name in names.items() if name in before}
+    focals = refit.extrapolate_focal_errors(registration, known_focals)
+    of_further = {index: sizes[index] for index in further}
+    measured = {camera.name: camera for camera in _collect_camera_evidence(graph, registration, of_further, focals)}
+    return replace(
+        known,
+        cameras=tuple(
+            replace(
+                measured.get(names[camera.index]) or before[names[camera.index]],
+                inlier_ratio=compute_inlier_ratio(graph, registration, camera.index),
+                errors=sizes[camera.index],
+                focal=focals[camera.index],
+            )
+            for camera in registration.cameras
+        ),
+        inlier_ratio=compute_inlier_ratio(graph, registration, None),
+        weakest_link=measure_weakest_link(registration, graph.names, graph.pairs),
+        disconnected=_name_disconnected_frames(graph, registration),
+        reflection=consistency.select_strongest_reflection([known.reflection, *reflections]),
+        flatness=compute_share_on_plane(registration.points),
+        median_angle_deg=registration.median_angle_deg,
+        rms_px=registration.rms_px,
+        focal=refit.combine_worst(focals.values()),
+        travel=refit.compute_travel(registration),
+    )
+
+
+def _collect_camera_evidence(
+    graph: ViewGraph,
+    registration: Registration,
+    sizes: Mapping[int, PoseErrors],
+    focals: Mapping[int, Errors],
+) -> tuple[CameraEvidence, ...]:
+    """Collects the evidence of the cameras that `sizes` has, by keyframe."""
+    by = registration.observed_by
+    times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
+    by_third = times_seen[registration.observed_point] >= 3
+    confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
+    keyframes = {camera.index: graph.keyframes[camera.index] for camera in registration.cameras}
+    greys = {index: cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY) for index, keyframe in keyframes.items()}
+    gains = estimate_gains(
+        {index: grey.astype(np.float32) for index, grey in greys.items()},
+        registration,
+        {index: keyframe.scale for index, keyframe in keyframes.items()},
+    )
+    return tuple(
+        CameraEvidence(
+            name=keyframes[camera.index].name,
+            inlier_ratio=compute_inlier_ratio(graph, registration, camera.index),
+            confirmed=int(confirmed[camera.index]),
+            coverage=compute_coverage(keyframes[camera.index], registration.observed_pixels[by == camera.index]),
+            flat_share=compute_flat_share(graph, camera.index),
+            gain=gains[camera.index],
+            errors=sizes[camera.index],
+            focal=focals[camera.index],
+            own_lens=camera.own_lens or camera.displaced or abs(camera.aspect - 1.0) > refit.SQUARE,
+            refuted_focal=_compute_refuted_focal(camera, keyframes[camera.index]),
+        )
+        for camera in registration.cameras
+        if camera.index in sizes
+    )
+
+
+def _compute_refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float:
+    given = keyframe.frame.intrinsics
+    if given is None or given.source not in ("given", "calibration"):
+        return 0.0
+    return camera.focal / given.fx if camera.own_lens else 1.0
+
+
+def compute_coverage(keyframe: Keyframe, pixels: Array) -> float:
+    """The share of the picture in the box that holds all of `pixels` (M, 2), but for a few on each side."""
+    if len(pixels) == 0:
+        return 0.0
+    least, most = np.quantile(pixels, (OUTSIDE, 1.0 - OUTSIDE), axis=0)
+    return float(np.prod((most - least) / (keyframe.frame.width, keyframe.frame.height)))
+
+
+def compute_flat_share(graph: ViewGraph, index: int) -> float:
+    """The largest share of a pair's matches that one homography explains, of the pairs of the keyframe `index`."""
+    of_camera = (pair for key, pair in graph.pairs.items() if index in key and len(pair.matches) >= MIN_MATCHES)
+    return max((pair.num_homography / len(pair.matches) for pair in of_camera), default=0.0)
+
+
+def _measure_reflection(
+    graph: ViewGraph, registration: Registration, config: consistency.ReflectionConfig
+) -> Reflection:
+    """Measures the registered pairs that are worth matching: each keyframe has enough of them."""
+    place = {camera.index: position for position, camera in enumerate(registration.cameras)}
+    worth = {(place[i], place[j]) for i, j in graph.select_pairs_worth_matching() if i in place and j in place}
+    pairs = {(min(pair), max(pair)) for pair in worth}
+    return consistency.measure_reflection([graph.keyframes[index] for index in place], pairs, config)
+
+
+def _measure_further_reflections(
+    graph: ViewGraph,
+    registration: Registration,
+    known: Collection[int],
+    further: Collection[int],
+    config: consistency.ReflectionConfig,
+) -> list[Reflection]:
+    """Measures each further camera beside the known ones that share most points with it."""
+    found = []
+    for index in sorted(further):
+        others = find_partners(index, known, registration, config.partners)
+        beside = [graph.keyframes[other] for other in others]
+        found.append(consistency.measure_further(graph.keyframes[index], beside, config))
+    return found
+
+
+def _name_disconnected_frames(graph: ViewGraph, registration: Registration) -> tuple[str, ...]:
+    return tuple(graph.keyframes[index].name for index in find_disconnected_frames(registration, graph.pairs))
+
+
+def compute_inlier_ratio(graph: ViewGraph, registration: Registration, index: int | None) -> float:
+    """The share of matches that the cameras explain, of all verified pairs or of those of the keyframe `index`."""
+    return compute_pooled_ratio(registration.inlier_ratios, graph.pairs, index)
+
+
+def find_partners(index: int, among: Collection[int], registration: Registration, count: int) -> list[int]:
+    """The `count` views of `among` that share most points with the view `index`."""
+    mine = registration.observed_point[registration.observed_by == index]
+    shared = np.bincount(registration.observed_by[np.isin(registration.observed_point, mine)], minlength=max(among) + 1)
+    return sorted((other for other in among if other != index), key=lambda other: (-shared[other], other))[:count]

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from splatnode.recon.verification.claims import BoundModel, ErrorModel
-from splatnode.recon.verification.likelihood import OddsModel, Term
-from splatnode.recon.verification.models import VerdictModel, VerdictModels
+from splatnode.recon.verification.error_model import (
+    BoundModel,
+    ErrorModel,
+    OddsModel,
+    Term,
+    VerdictModel,
+    VerdictModels,
+)
 
 FITTED = VerdictModels(
     many=VerdictModel(

@@ -15,10 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe, longer_side
-from splatnode.recon.matching import nearest_neighbours, two_view
+from splatnode.recon.matching import features, two_view
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.refusals import Refusal, refuse
+from splatnode.recon.verification.rejections import Refusal, refuse
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -95,9 +95,7 @@ def measure_stereo(keyframe: Keyframe, layout: StereoLayout) -> tuple[int, float
     second = points[:, layout.axis] >= half[layout.axis]
     (firsts,), (seconds,) = np.nonzero(~second), np.nonzero(second)
     firsts, seconds = firsts[:STEREO_FEATURES], seconds[:STEREO_FEATURES]
-    found = nearest_neighbours.match(
-        plain.descriptors[firsts], plain.descriptors[seconds], nearest_neighbours.NearestNeighbourConfig()
-    )
+    found = features.match(plain.descriptors[firsts], plain.descriptors[seconds], features.NearestNeighbourConfig())
     if not len(found):
         return 0, 0.0, 0.0
     first, other = points[firsts[found[:, 0]]], points[seconds[found[:, 1]]]

@@ -9,16 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.known_poses import Deviation, GivenWorld
-from splatnode.recon.registration.register import Registration
-from splatnode.recon.result.bounds import Bounds, compute_axes, compute_length_95, find_widest
-from splatnode.recon.result.bounds_in_words import format_rounded_up
-from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification import refusals
+from splatnode.recon.registration.registration import Registration
+from splatnode.recon.result.snapshot import format_rounded_up
+from splatnode.recon.result.verdict import Bounds, Code, Verdict, compute_axes, compute_length_95, find_widest
+from splatnode.recon.verification import rejections
 from splatnode.recon.verification.config import DecisionConfig
-from splatnode.recon.verification.refusals import refuse
+from splatnode.recon.verification.rejections import refuse
 
 _TWO_SIDED_95 = 1.96
 _MOST_NAMED = 5  # poses whose residuals a sentence tells
@@ -49,7 +48,7 @@ def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld
         raise ValueError("there must be a camera to be judged")
     if config.require_percent is not None and worst.centre_percent > config.require_percent:
         found = worst.centre_percent
-        return refuse(refusals.ROUGHER, sorted(bounds), found=found, needed=config.require_percent)
+        return refuse(rejections.ROUGHER, sorted(bounds), found=found, needed=config.require_percent)
     placed = {camera.index for camera in registration.cameras}
     left_out = tuple(name for index, name in enumerate(graph.names) if index not in placed)
     count = f"{'All' if not left_out else f'{len(placed)} of'} {len(graph.names)} photographs were placed"
@@ -79,7 +78,8 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
     sentences, advice = [verdict.message], [verdict.advice]
     if given.offset is not None:
         off = f"{given.offset.degrees:.2g} degrees and {given.offset.metres:.2g} m"
-        known = f"{_format_sigma(float(np.degrees(given.offset.turn_sigma)))} degrees and {_format_sigma(given.offset.shift_sigma)} m"
+        turn = _format_sigma(float(np.degrees(given.offset.turn_sigma)))
+        known = f"{turn} degrees and {_format_sigma(given.offset.shift_sigma)} m"
         sentences.append(
             f"All given poses are off alike, by {off} in the camera's frame (known to {known}), which was taken out."
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,15 +11,25 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, umeyama
-from splatnode.recon.registration import bundle, finishing, lenses, own_lenses, tracks
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import (
+    bundle_adjustment,
+    incremental_mapper,
+    own_lenses,
+    self_calibration,
+    triangulation,
+)
+from splatnode.recon.registration.registration import Registration
+from splatnode.recon.registration.self_calibration import CORNER
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-NOMINAL_SIGMA = lenses.LensGroupingConfig().exif_sigma
+NOMINAL_SIGMA = self_calibration.LensGroupingConfig().exif_sigma
 FREE_SIGMA = 0.3  # of log focal where nothing is known: one sigma is a factor of 1.35
-FREE_SHIFT = lenses.LensGroupingConfig().free_shift_sigma  # of the longer side, of a principal point that was displaced
+FREE_SHIFT = (
+    self_calibration.LensGroupingConfig().free_shift_sigma
+)  # of the longer side, of a principal point that was displaced
 FREE_ASPECT = 0.1  # of log aspect, where pixels are not square
 SQUARE = 1e-3  # difference of an aspect from 1 from which on they are not
 ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
@@ -33,9 +43,9 @@ MIN_SPREAD = 1e-12  # of centres, as MIN_COST: all in one place
 class BundleFit:
     """A bundle that holds C registered cameras, numbered in their order, with what is known of their lenses."""
 
-    problem: bundle.Problem
-    prior: bundle.LensPrior
-    loss: bundle.BundleAdjustmentConfig
+    problem: bundle_adjustment.Problem
+    prior: bundle_adjustment.LensPrior
+    loss: bundle_adjustment.BundleAdjustmentConfig
     scale: float  # longer side of the largest frame, whose pixels these are, over REFERENCE_SIDE
     told: Array  # (G,) focal length that came with the frames; NaN where none did
     nominal_sigmas: Array  # (G,) of its logarithm where it is nominal, as EXIF's is; infinite for any other lens
@@ -50,7 +60,7 @@ class BundleFit:
     @cached_property
     def minimum(self) -> BundleFit:
         """This fit adjusted: found once, for several sources of evidence begin there."""
-        return replace(self, problem=bundle.adjust(self.problem, self.prior, self.loss))
+        return replace(self, problem=bundle_adjustment.adjust(self.problem, self.prior, self.loss))
 
     @property
     def cost(self) -> float:
@@ -61,7 +71,7 @@ class BundleFit:
         lenses = (self.problem.log_focals, self.problem.radials, self.problem.shifts)
         if not all(np.isfinite(known).all() for known in (self.Ts_world_camera, *lenses)):
             return np.nan
-        return bundle.robust_cost(self.problem, self.loss) / max(1, len(self.problem.pixels))
+        return bundle_adjustment.robust_cost(self.problem, self.loss) / max(1, len(self.problem.pixels))
 
 
 def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> BundleFit:
@@ -73,7 +83,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     position = np.full(len(keyframes), -1)
     position[[camera.index for camera in cameras]] = np.arange(len(cameras))
     camera_of = position[registration.observed_by]
-    chosen = tracks.longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
+    chosen = triangulation.longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
     observed = chosen[registration.observed_point]
     sides = np.array([longer_side(keyframes[c.index].frame) for c in cameras])
     numbers, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
@@ -97,7 +107,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     principal = np.stack([camera.principal for camera in cameras])
     Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)
     (kept,) = np.nonzero(chosen)
-    problem = bundle.Problem(
+    problem = bundle_adjustment.Problem(
         rotations=Ts_camera_world[:, :3, :3],
         translations=Ts_camera_world[:, :3, 3],
         lens_of_camera=lens_of_camera,
@@ -113,7 +123,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     scale = float(largest) / REFERENCE_SIDE
     is_nominal = np.isfinite(nominal)
     means = np.where(is_nominal, np.log(np.where(is_nominal, told, 1.0)), problem.log_focals)
-    prior = bundle.LensPrior(
+    prior = bundle_adjustment.LensPrior(
         log_focals=means,
         sigmas=np.minimum(sigmas, nominal),
         radial_sigmas=np.zeros((count, 2)),
@@ -121,17 +131,18 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
         aspect_sigmas=aspect_sigmas,
         ties=_tie_near_lenses(numbers, near),
     )
-    errors = bundle.reprojection_errors(problem)
+    errors = bundle_adjustment.reprojection_errors(problem)
     median = float(np.median(errors))
     robust_px = float(np.clip(ROBUST_FACTOR * median, *(np.array(ROBUST_PX) * scale)))
-    noise = bundle.noise_px(len(problem.pixels), len(problem.points), median / scale)
-    loss = bundle.BundleAdjustmentConfig(
-        robust_px=robust_px, noise_px=scale * noise * float(np.sqrt(finishing.FinalAdjustmentConfig().correlated))
+    noise = bundle_adjustment.noise_px(len(problem.pixels), len(problem.points), median / scale)
+    loss = bundle_adjustment.BundleAdjustmentConfig(
+        robust_px=robust_px,
+        noise_px=scale * noise * float(np.sqrt(incremental_mapper.FinalAdjustmentConfig().correlated)),
     )
     return BundleFit(problem, prior, loss, scale, told, nominal, own, units)
 
 
-def _tie_near_lenses(numbers: Index, near: Index) -> bundle.LensTies | None:
+def _tie_near_lenses(numbers: Index, near: Index) -> bundle_adjustment.LensTies | None:
     """Ties the focal lengths of lenses that are near one lens to that one, or to the first of them."""
     to, sigmas = np.full(len(numbers), -1), np.zeros((len(numbers), 6))
     for common in np.unique(near[near >= 0]):
@@ -140,7 +151,7 @@ def _tie_near_lenses(numbers: Index, near: Index) -> bundle.LensTies | None:
         first = itself[0] if len(itself) else members[0]
         others = members[members != first]
         to[others], sigmas[others, 0] = first, own_lenses.OwnLensesConfig().focal_sigma
-    return bundle.LensTies(to, sigmas) if (to >= 0).any() else None
+    return bundle_adjustment.LensTies(to, sigmas) if (to >= 0).any() else None
 
 
 def compute_nominal_cost(of: BundleFit) -> float:
@@ -161,8 +172,8 @@ def adjust(start: BundleFit) -> BundleFit:
 
 def estimate_noise_px(of: BundleFit) -> float:
     """The standard deviation of one component of an observation's error, pixels of the largest frame; never 0."""
-    median = float(np.median(bundle.reprojection_errors(of.problem))) / of.scale
-    return of.scale * bundle.noise_px(len(of.problem.pixels), len(of.problem.points), median)
+    median = float(np.median(bundle_adjustment.reprojection_errors(of.problem))) / of.scale
+    return of.scale * bundle_adjustment.noise_px(len(of.problem.pixels), len(of.problem.points), median)
 
 
 def remove_points(start: BundleFit, left_out: npt.NDArray[np.bool_]) -> BundleFit:
@@ -180,7 +191,7 @@ def remove_points(start: BundleFit, left_out: npt.NDArray[np.bool_]) -> BundleFi
     return replace(start, problem=smaller)
 
 
-def Ts_world_camera(problem: bundle.Problem) -> Array:
+def Ts_world_camera(problem: bundle_adjustment.Problem) -> Array:
     """(C, 4, 4) of a bundle's cameras."""
     Ts = np.tile(np.eye(4), (len(problem.rotations), 1, 1))
     Ts[:, :3, :3] = problem.rotations.transpose(0, 2, 1)
@@ -243,3 +254,400 @@ def compute_shift(before: BundleFit, after: BundleFit) -> FitShift:
         ),
         focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
     )
+
+
+# What the focal length leaves open: the profile of the cost over it, and how far the cameras move along it.
+#
+# Where all cameras look the same way, or turn about what they see, depth and focal length trade against each other
+# (the bas-relief ambiguity: Belhumeur et al. 1999), and the cost is no parabola: the covariance at its minimum says
+# too little. Here the focal length is held at steps beside its best value, and all else is adjusted anew.
+
+
+PROFILE_STEPS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # of log focal, either way; the last is a factor of 1.9
+# Rise of the cost, in units of the variance of an observation, that counts as one standard error. Observations err
+# together: so many of them tell as much as one with an error of its own, as in registration's covariance. What EXIF
+# says of the focal length is one observation more.
+ONE_SIGMA = incremental_mapper.FinalAdjustmentConfig().correlated
+
+
+@dataclass(frozen=True)
+class FocalProfile:
+    """The interval of one standard error, and the most that the cameras move within it."""
+
+    # Of each lens: the wider side of the interval, of log focal; the last step where the cost never rises so far
+    focal_rel: tuple[float, ...]
+    rotation_deg: tuple[float, ...]  # of each camera, after the best common rotation
+    centre: tuple[float, ...]  # of each camera, after the best similarity, in the unit of the world
+
+
+@dataclass(frozen=True, eq=False)
+class _ProfileStep:
+    """All is relative to the best fit."""
+
+    focal_rel: float
+    sigmas: float  # the root of the rise of the cost, in standard errors
+    moved: CameraShifts
+
+
+def profile_focal(fit: BundleFit) -> FocalProfile:
+    """Profiles the lenses that are not calibrated, all changed by one factor; all 0 where every lens is.
+
+    NaN where the fit has come to nothing.
+    """
+    whole = adjust(fit)
+    count = len(whole.problem.rotations)
+    if not np.isfinite(whole.cost):
+        return FocalProfile((np.nan,) * len(whole.prior.sigmas), (np.nan,) * count, (np.nan,) * count)
+    free = (whole.prior.sigmas > 0).astype(np.float64)
+    ends = [_find_interval_end(whole, direction) for direction in (free, -free)] if free.any() else []
+    still = np.zeros(count)
+    return FocalProfile(
+        focal_rel=tuple((max((end.focal_rel for end in ends), default=0.0) * free).tolist()),
+        rotation_deg=tuple(np.max([still, *(end.moved.rotation_deg for end in ends)], axis=0).tolist()),
+        centre=tuple(np.max([still, *(end.moved.centre for end in ends)], axis=0).tolist()),
+    )
+
+
+def _find_interval_end(whole: BundleFit, direction: Array) -> _ProfileStep:
+    """One end of the interval: between the last step within it and the first beyond, both moved alike."""
+    count = len(whole.problem.rotations)
+    before = _ProfileStep(0.0, 0.0, CameraShifts(np.zeros(count), np.zeros(count), np.zeros(len(direction))))
+    for step in _compute_steps(whole, direction):
+        if step.sigmas >= 1.0:
+            share = (1.0 - before.sigmas) / max(step.sigmas - before.sigmas, MIN_COST)
+            return _interpolate_step(before, step, share)
+        before = _ProfileStep(step.focal_rel, step.sigmas, _combine_farthest(before.moved, step.moved))
+    return before
+
+
+def _compute_steps(whole: BundleFit, direction: Array) -> Iterator[_ProfileStep]:
+    noise2 = estimate_noise_px(whole) ** 2
+    held = replace(whole, prior=replace(whole.prior, sigmas=np.zeros_like(whole.prior.sigmas)))
+    for size in PROFILE_STEPS:
+        log_focals = whole.problem.log_focals + size * direction
+        held = adjust(replace(held, problem=replace(held.problem, log_focals=log_focals)))
+        rise = (held.cost - whole.cost) * len(whole.problem.pixels) / noise2 / ONE_SIGMA
+        rise += compute_nominal_cost(held) - compute_nominal_cost(whole)
+        yield _ProfileStep(size, float(np.sqrt(np.maximum(rise, 0.0))), compute_camera_shifts(whole, held))
+
+
+def _interpolate_step(before: _ProfileStep, after: _ProfileStep, share: float) -> _ProfileStep:
+    """A step that lies `share` of the way from one to the other."""
+
+    def interpolate(one: Array, other: Array) -> Array:
+        return one + share * (other - one)
+
+    moved = CameraShifts(
+        interpolate(before.moved.rotation_deg, after.moved.rotation_deg),
+        interpolate(before.moved.centre, after.moved.centre),
+        interpolate(before.moved.focals_rel, after.moved.focals_rel),
+    )
+    return _ProfileStep(before.focal_rel + share * (after.focal_rel - before.focal_rel), 1.0, moved)
+
+
+def _combine_farthest(one: CameraShifts, other: CameraShifts) -> CameraShifts:
+    return CameraShifts(
+        np.maximum(one.rotation_deg, other.rotation_deg),
+        np.maximum(one.centre, other.centre),
+        np.maximum(one.focals_rel, other.focals_rel),
+    )
+
+
+# How much the answer depends on single parts of the pictures: it is found again without each of them.
+
+
+GROUPS = 4  # in which the points are divided, each way: the quarters of a picture
+
+
+@dataclass(frozen=True)
+class JackknifeSpread:
+    """Standard errors by the delete-a-group jackknife (Efron 1982), the points grouped by where they are.
+
+    Neighbours err together: by distortion that is not modelled, by things that moved, by wrong matches of a structure
+    that repeats. The covariance takes errors for independent and is several times too small; leaving out whole regions
+    lets them show.
+    """
+
+    rotation_deg: tuple[float, ...]  # of each camera, after the best common rotation
+    centre: tuple[float, ...]  # of each camera, after the best similarity, in the unit of the world
+    focal_rel: tuple[float, ...]  # of the logarithm of each lens' focal length
+
+
+def estimate_spread(fit: BundleFit) -> JackknifeSpread:
+    """The spread when quarters of the points are left out: columns, rows, corners and depths in turn."""
+    whole = adjust(fit)
+    rotations, centres, focals = [], [], []
+    for groups in _group_points(fit.problem):
+        moved = [compute_camera_shifts(whole, adjust(remove_points(whole, groups == group))) for group in range(GROUPS)]
+        rotations.append(_compute_variance([each.rotation_deg for each in moved]))
+        centres.append(_compute_variance([each.centre for each in moved]))
+        focals.append(_compute_variance([each.focals_rel for each in moved]))
+    return JackknifeSpread(
+        rotation_deg=tuple(np.sqrt(np.mean(rotations, axis=0)).tolist()),
+        centre=tuple(np.sqrt(np.mean(centres, axis=0)).tolist()),
+        focal_rel=tuple(np.sqrt(np.mean(focals, axis=0)).tolist()),
+    )
+
+
+def _compute_variance(changes: Sequence[Array]) -> Array:
+    """(C,) of what leaving out one group after the other changes."""
+    return np.square(changes).sum(0) * (GROUPS - 1) / GROUPS
+
+
+def _group_points(problem: bundle_adjustment.Problem) -> Iterator[npt.NDArray[np.int64]]:
+    """(P,) groups, by the picture in which a point is seen first."""
+    first = np.full(len(problem.points), -1)
+    order = np.arange(len(problem.pixels))[::-1]
+    first[problem.point_of[order]] = order
+    pixels, camera = problem.pixels[first], problem.camera_of[first]
+    depths = np.einsum("pi,pi->p", problem.rotations[camera, 2], problem.points) + problem.translations[camera, 2]
+    yield _assign_quarters(pixels[:, 0])
+    yield _assign_quarters(pixels[:, 1])
+    yield 2 * (pixels[:, 0] > np.median(pixels[:, 0])) + (pixels[:, 1] > np.median(pixels[:, 1]))
+    yield _assign_quarters(depths)
+
+
+def _assign_quarters(values: Array) -> npt.NDArray[np.int64]:
+    """(P,) in which quarter of `values` (P,) each of them is."""
+    return GROUPS * np.argsort(np.argsort(values)) // max(1, len(values))
+
+
+# Given focal lengths doubted: what the pictures themselves say when the lens is set free.
+
+FREE_RADIAL = 0.3  # sigma of the first radial coefficient where it is free
+FREED_LENS_STEPS = (0.0, 0.35, -0.35)  # of log focal, from which it is set free: a wrong one can be a local minimum
+
+
+@dataclass(frozen=True)
+class FreedLens:
+    """A lens whose focal length came with the frames, after the same observations were adjusted with it free."""
+
+    given: float  # pixels of the full-size image
+    trusted: bool  # a calibration; else nominal, as from EXIF
+    registered: float  # where the registration left it: a nominal one may move a little
+    found: float
+    cost_ratio: float  # robust cost with the lens free over that with it as it was registered
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """The distortion that the observations ask for when all first radial coefficients are free, too."""
+
+    corner_shift: float  # by which a corner of the picture moves further, relative to its distance from the middle
+    cost_ratio: float  # robust cost with it free over that with it as registered
+
+
+def measure_distortion(fit: BundleFit) -> Distortion:
+    held = adjust(fit)
+    num_lenses = len(held.prior.sigmas)
+    first = np.tile([FREE_RADIAL, 0.0], (num_lenses, 1))
+    free = adjust(replace(held, prior=replace(held.prior, radial_sigmas=first)))
+    corner = CORNER * REFERENCE_SIDE * held.scale
+    further = (free.problem.radials - held.problem.radials)[:, 0] * (corner / np.exp(free.problem.log_focals)) ** 2
+    return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, MIN_COST)))
+
+
+def free_lenses(fit: BundleFit) -> tuple[FreedLens, ...]:
+    """All lenses that came with the frames, set free together. Empty where none did."""
+    told = np.isfinite(fit.told)
+    if not told.any():
+        return ()
+    held = adjust(replace(fit, prior=replace(fit.prior, sigmas=np.where(told, 0.0, fit.prior.sigmas))))
+    prior = replace(held.prior, sigmas=np.where(told, FREE_SIGMA, held.prior.sigmas))
+    starts = [held.problem.log_focals + np.where(told, step, 0.0) for step in FREED_LENS_STEPS]
+    tried = [adjust(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
+    free = tried[int(np.argmin([candidate.cost for candidate in tried]))]  # the first NaN, where there is one
+    ratio = float(free.cost / max(held.cost, MIN_COST))
+    focals = (fit.told, np.exp(held.problem.log_focals), np.exp(free.problem.log_focals))
+    given, registered, found = ((fit.units * each).tolist() for each in focals)
+    return tuple(
+        FreedLens(given[g], bool(fit.prior.sigmas[g] == 0), registered[g], found[g], ratio) for g in np.nonzero(told)[0]
+    )
+
+
+def vote_focal(keyframes: Sequence[Keyframe], pairs: Sequence[TwoView]) -> float | None:
+    """The focal length in pixels that the pairs vote for where all frames have the same size, else None."""
+    sides = {longer_side(keyframe.frame) for keyframe in keyframes}
+    if len(sides) != 1 or not pairs:
+        return None
+    return self_calibration.vote(pairs, num_candidates=1)[0] * sides.pop()
+
+
+# What unknown principal points leave open: pictures of another size may be crops, with the lens beside their middle.
+#
+# A picture that was cut out of a larger one fits nearly as well with its lens behind the middle, from a wrong pose.
+# Among pictures of one size and one lens that would show; of one that differs from the others it would not. There the
+# principal point is set free, and how far that moves the cameras is how wrong they may be.
+
+FREE_PRINCIPAL_SHIFT = (
+    self_calibration.LensGroupingConfig().free_shift_sigma
+)  # of the longer side, as where frames of several sizes are told apart
+
+
+def free_principal_points(fit: BundleFit) -> CameraShifts | None:
+    """How far the cameras move when the lenses of fewer cameras than the commonest one are set free.
+
+    None where all pictures came through one lens, or every other one came calibrated. Lenses of single images that
+    refuted the common one are left out: where their principal points are was asked when they were found.
+    """
+    count = len(fit.prior.sigmas)
+    seen_through = np.bincount(fit.problem.lens_of_camera, minlength=count)
+    free = (fit.prior.sigmas > 0) & ~fit.own & (np.arange(count) != seen_through.argmax())
+    if not free.any():
+        return None
+    whole = adjust(fit)
+    sigmas = np.where(free, FREE_PRINCIPAL_SHIFT * REFERENCE_SIDE * max(fit.scale, 1.0), whole.prior.shift_sigmas)
+    return compute_camera_shifts(whole, adjust(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas))))
+
+
+# The mirrored answer: seen from afar, a scene and its mirror image in depth look the same from mirrored cameras.
+
+# Shifts below which the mirrored start has found its way back to the same answer:
+SAME_DEG = 1.0  # of rotations
+SAME_REL = 0.03  # of centres, relative to their spread
+NO_RIVAL = 100.0  # ratio of costs that stands for the lack of a mirrored answer; far beyond all that counts
+
+
+def compute_reversal_cost_ratio(fit: BundleFit) -> float:
+    """How much worse the mirrored answer is than this one: the ratio of their costs, both adjusted; near 1 nothing
+    tells them apart, and 100 at most. NaN where one of the two could not be computed.
+
+    Under an affine camera, points mirrored in a plane that faces the camera and cameras turned the other way give the
+    same pictures (Necker's reversal; Shapiro et al. 1995). Perspective breaks the tie, if there is enough of it.
+    """
+    whole = adjust(fit)
+    other = adjust(replace(whole, problem=_reverse_depth(whole.problem)))
+    between = compute_shift(whole, other)
+    if between.rotation_deg < SAME_DEG and between.centre_rel < SAME_REL:
+        return NO_RIVAL
+    return float(np.minimum(NO_RIVAL, other.cost / np.maximum(whole.cost, MIN_COST)))
+
+
+def _reverse_depth(problem: bundle_adjustment.Problem) -> bundle_adjustment.Problem:
+    """The problem with its points mirrored in the plane through their middle that faces the first camera."""
+    rotation0, translation0 = problem.rotations[0], problem.translations[0]
+    points = problem.points @ rotation0.T + translation0
+    rotations = problem.rotations @ rotation0.T
+    translations = problem.translations - rotations @ translation0
+    middle = np.median(points, axis=0)
+    mirror = np.diag([1.0, 1.0, -1.0])
+    turned = mirror @ rotations @ mirror
+    return replace(
+        problem,
+        rotations=turned,
+        translations=rotations @ middle + translations - turned @ middle,
+        points=(points - middle) @ mirror + middle,
+    )
+
+
+# How large the errors of cameras may be: what three sources say, each of which is blind to something.
+
+# Aligned patches make sigmas smaller, but not the part that is of lenses, which may differ from image to image
+LEAST_SHARPER = 0.5
+MIN_SIGMA = 1e-9  # a smaller one counts as this where ratios are taken
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The size of one error as each source says it, as one standard error."""
+
+    sigma: float  # the covariance of the bundle adjustment, which takes errors for independent
+    regions: float  # what leaving out regions of the pictures changes (see jackknife.py)
+    profile: float  # what unknown lenses leave open (see focal_profile.py and principal_point.py)
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """The errors of the pose of one camera."""
+
+    rotation: Errors  # degrees, after the best common rotation
+    centre: Errors  # after the best similarity; the distance to the scene is 1
+
+
+@dataclass(frozen=True)
+class AllErrors:
+    cameras: Mapping[int, PoseErrors]  # by their keyframes' positions
+    focals: Mapping[int, Errors]  # of the logarithms of their focal lengths, likewise
+
+    @property
+    def focal(self) -> Errors:
+        """Returns the errors of the least certain focal length, by each source."""
+        return combine_worst(self.focals.values())
+
+
+def combine_worst(errors: Iterable[Errors]) -> Errors:
+    """The largest of each source; NaN where one is."""
+    found = np.array([(of.sigma, of.regions, of.profile) for of in errors])
+    return Errors(*found.max(0).tolist())
+
+
+def measure_errors(fit: BundleFit, registration: Registration) -> AllErrors:
+    """Measures the errors of the cameras of `registration`; `fit` has a part of its points."""
+    regions, profile, freed = (
+        estimate_spread(fit),
+        profile_focal(fit),
+        free_principal_points(fit),
+    )
+    turned, shifted = (profile.rotation_deg, profile.centre)
+    if freed is not None:
+        turned, shifted = np.maximum(turned, freed.rotation_deg), np.maximum(shifted, freed.centre)
+    unit = compute_travel(registration)
+    cameras = {
+        camera.index: PoseErrors(
+            rotation=Errors(camera.rotation_sigma_deg, regions.rotation_deg[i], float(turned[i])),
+            centre=Errors(unit * camera.centre_sigma_rel, regions.centre[i], float(shifted[i])),
+        )
+        for i, camera in enumerate(registration.cameras)
+    }
+    lens_of = fit.problem.lens_of_camera
+    focals = {
+        camera.index: Errors(camera.focal_sigma, regions.focal_rel[lens_of[i]], profile.focal_rel[lens_of[i]])
+        for i, camera in enumerate(registration.cameras)
+    }
+    return AllErrors(cameras, focals)
+
+
+def compute_travel(registration: Registration) -> float:
+    """RMS distance of the centres from their mean; the distance to the scene is 1."""
+    centres = np.stack([camera.T_world_camera[:3, 3] for camera in registration.cameras])
+    return compute_rms_radius(centres)
+
+
+def extrapolate_pose_errors(registration: Registration, known: Mapping[int, PoseErrors]) -> dict[int, PoseErrors]:
+    """Extrapolates the errors of a continuation's cameras, by keyframe, from the `known` ones of some.
+
+    A continuation aligns no patches, so that its sigmas are too large: they shrink as much as those of the known
+    cameras do. What is known of a camera besides stays. A further camera is taken for the worst of the known ones, and
+    as much worse as its sigma is larger.
+    """
+    unit = compute_travel(registration)
+    rotations = {camera.index: camera.rotation_sigma_deg for camera in registration.cameras}
+    centres = {camera.index: unit * camera.centre_sigma_rel for camera in registration.cameras}
+    of_rotations = _extrapolate_errors(rotations, {index: of.rotation for index, of in known.items()})
+    of_centres = _extrapolate_errors(centres, {index: of.centre for index, of in known.items()})
+    return {index: PoseErrors(of_rotations[index], of_centres[index]) for index in rotations}
+
+
+def extrapolate_focal_errors(registration: Registration, known: Mapping[int, Errors]) -> dict[int, Errors]:
+    """Extrapolates the focal errors of a continuation from the `known` ones; the larger sigma counts.
+
+    A further camera has what is known of the least certain focal length.
+    """
+    least_certain = combine_worst(known.values())
+    found = {}
+    for camera in registration.cameras:
+        was = known.get(camera.index, least_certain)
+        found[camera.index] = replace(was, sigma=float(np.maximum(was.sigma, camera.focal_sigma)))
+    return found
+
+
+def _extrapolate_errors(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:
+    ratios = [of.sigma / max(sigmas[index], MIN_SIGMA) for index, of in known.items()]
+    sharper = float(np.clip(np.median(ratios), LEAST_SHARPER, 1.0))
+    largest = Errors(*(max(getattr(of, part) for of in known.values()) for part in ("sigma", "regions", "profile")))
+    found = {}
+    for index, sigma in sigmas.items():
+        worse = max(1.0, sharper * sigma / max(largest.sigma, MIN_SIGMA))
+        was = known.get(index) or Errors(sharper * sigma, worse * largest.regions, worse * largest.profile)
+        found[index] = replace(was, sigma=sharper * sigma)
+    return found

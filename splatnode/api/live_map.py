@@ -6,13 +6,12 @@ import logging
 import threading
 from dataclasses import dataclass
 
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_MAP
-from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.network import RECON_MAP, Network
+from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.messaging.wire import WireError
-from splatnode.capture.process.problems import Problems, is_logged
+from splatnode.capture.process.logs import Problems, is_logged
+from splatnode.recon.occupancy.grid import OccupancyMap
 from splatnode.recon.occupancy.message import MapHeader, decode_map
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap
 
 log = logging.getLogger(__name__)
 

@@ -11,12 +11,11 @@ import numpy.typing as npt
 
 from splatnode.api.photographs import Lens, Picture, apply_lens, load_frames
 from splatnode.capture.frame import Frame
-from splatnode.capture.given_pose import rigid_problem
-from splatnode.capture.process.progress import ignore_progress
-from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.locate import localize_image
+from splatnode.capture.odometry import rigid_problem
+from splatnode.capture.process.terminal import ignore_progress
+from splatnode.recon.locating.localize import follow, localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.result.landmarks import Landmarks
+from splatnode.recon.result.snapshot import Landmarks
 
 Near: TypeAlias = "Located | NotLocated | npt.ArrayLike | None"
 

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from splatnode.api.camera import Camera, camera_of
 from splatnode.api.live_map import LiveMap, NodeMap
-from splatnode.api.result import Result, result_of
+from splatnode.api.result import Camera, Result, camera_of, result_of
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config, read_yaml
+from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.write import write_result_folder
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.sources import LiveSource
+from splatnode.viewer.state import Moment
 
 FIRST_PORT = Network().first_port
 OUTDATED = "the scene has changed since its map was made"

@@ -11,15 +11,20 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
-from splatnode.capture.exif import exif_exposure, exif_intrinsics, read_tags
-from splatnode.capture.exif_time import exif_time
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_lens import ALL, Lenses, find_key
-from splatnode.capture.masks import apply_mask
-from splatnode.capture.orientation import ORIENTATION, upright
-from splatnode.capture.process.progress import Tell
-from splatnode.capture.stamp import Stamp
-from splatnode.capture.value_range import Extent, ValueRange, convert_to_eight_bits, find_range, measure_extent
+from splatnode.capture.exif import exif_exposure, exif_intrinsics, exif_time, read_tags
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
+from splatnode.capture.image_file import (
+    ORIENTATION,
+    Extent,
+    ValueRange,
+    convert_to_eight_bits,
+    find_range,
+    measure_extent,
+    upright,
+)
+from splatnode.capture.lens_file import ALL, Lenses, find_key
+from splatnode.capture.masks import Find, Mask, apply_mask, open_masks, parse_mask, read_mask
+from splatnode.capture.process.terminal import Tell
 from splatnode.recon.replay_source import Request, Source, apply_lenses, load_source, parse_paths, select_frames
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
@@ -216,3 +221,32 @@ def _exif_bytes(picture: Any) -> bytes:
     """The TIFF structure of a PIL image's EXIF; empty where it has none."""
     known = picture.info.get("exif", b"") if _is_pil(picture) else b""
     return known.removeprefix(_EXIF) if isinstance(known, bytes) else b""
+
+
+# Masks as a program has them: a folder, a file, or one for each photograph of a list.
+
+# In a list one for each photograph, in the order of the photographs; None: that one is used whole.
+MaskOf: TypeAlias = "str | PathLike[str] | npt.NDArray[Any] | None"
+Masks: TypeAlias = "str | PathLike[str] | npt.NDArray[Any] | Sequence[MaskOf]"
+
+
+def make_mask_finder(masks: Masks, images: Images) -> Find:
+    """Finds the mask of a frame of `images`. Raises TypeError, ValueError, FileNotFoundError."""
+    if isinstance(masks, (str, PathLike)):
+        return open_masks(Path(masks))
+    given, of = list_images(images), list(masks)
+    if len(given) == 1 and isinstance(given[0], (str, PathLike)) and Path(given[0]).is_dir():
+        raise TypeError("masks must be a folder of masks where images is a folder, got a list")
+    if len(of) != len(given):
+        raise ValueError(
+            f"masks must be one for each of the {len(given)} photographs (None: all is used), got {len(of)}"
+        )
+    names = [frame_name(Path(fspath(each))) if isinstance(each, (str, PathLike)) else None for each in given]
+    by_name = {name or picture_name(index): mask for index, (name, mask) in enumerate(zip(names, of, strict=True))}
+    return lambda frame: _mask(by_name.get(frame.name), frame)
+
+
+def _mask(given: MaskOf, frame: Frame) -> Mask | None:
+    if given is None:
+        return None
+    return read_mask(Path(given), frame) if isinstance(given, (str, PathLike)) else parse_mask(given)

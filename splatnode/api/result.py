@@ -12,21 +12,142 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.api.camera import Camera, camera_of
-from splatnode.api.view import View, view
-from splatnode.capture.frame import DroppedFrame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
+from splatnode.recon import core
 from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.sources import find_confirmed
-from splatnode.recon.result.spherical_harmonics import compute_mean_colours
-from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.result.npz_files import LANDMARKS, read_depths, read_landmarks
+from splatnode.recon.result.rendering import render_arrays
+from splatnode.recon.result.snapshot import (
+    CameraEstimate,
+    GaussianArrays,
+    Snapshot,
+    find_camera_problem,
+    find_confirmed,
+)
+from splatnode.recon.result.spherical_harmonics import compute_mean_colours, make_flat_sh
+from splatnode.recon.result.stored_snapshot import read_result
+from splatnode.recon.result.submap_index import is_map_set
+from splatnode.recon.result.verdict import Bounds, Verdict, compute_covariance
+
+# A camera as a program sees it.
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera of the result: its pose, its lens, and how well they are known.
+
+    Axes are OpenCV's: x right, y down, z forward. The world is the frame of the first camera that was placed; its unit
+    is the metre where `Result.metric` is set, and none otherwise.
+    """
+
+    name: str  # of the photograph: its file's, or 0000.png, 0001.png, ... where it came as an array
+    T_world_camera: Array  # (4, 4) p_world = T_world_camera @ p_camera
+    K: Array  # (3, 3) of the photograph at `width` x `height`, without distortion; the top-left pixel is at (0.5, 0.5)
+    width: int  # of the photograph as the scene was fitted to it, pixels
+    height: int  # likewise, pixels
+    # As it was given; or estimated with a distortion that was taken out of the photograph. None: estimated, without any
+    lens: Intrinsics | None = None
+    bounds: Bounds | None = None  # the claim: its errors are smaller with 95 %; None: nothing is claimed
+    captured_at: Stamp | None = None  # nanoseconds, and of which clock; None: nobody knows
+    # Share of the photograph's pixels, 0 to 1, whose depth is multi-view consistent: another view has the same point.
+    # None: not known, as of a coarse preview
+    consistent_depth: float | None = None
+
+    @property
+    def T_camera_world(self) -> Array:
+        """(4, 4) p_camera = T_camera_world @ p_world."""
+        R, t = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        inverse = np.eye(4)
+        inverse[:3, :3], inverse[:3, 3] = R.T, -R.T @ t
+        return inverse
+
+    @property
+    def centre(self) -> Array:
+        """(3,) where it stood, in the world."""
+        return self.T_world_camera[:3, 3].copy()
+
+    @property
+    def covariance(self) -> Array | None:
+        """(3, 3) of its centre, in the world's axes and squared unit, whose 95 % ellipsoid is that of the claim."""
+        return None if self.bounds is None else compute_covariance(self.bounds.axes)
+
+
+def camera_of(estimate: CameraEstimate, lens: Intrinsics | None = None) -> Camera:
+    """A camera of a result or a node, with the lens that was given for its photograph."""
+    return Camera(
+        name=estimate.name,
+        T_world_camera=estimate.T_world_camera.copy(),
+        K=estimate.K.copy(),
+        width=estimate.width,
+        height=estimate.height,
+        lens=lens or estimate.lens,
+        bounds=estimate.bounds,
+        captured_at=estimate.captured_at,
+        consistent_depth=estimate.consistent_depth,
+    )
+
+
+# What a camera that never was would see of a scene.
+
+MOSTLY = 0.5  # of the light that reaches a pixel
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A picture of the scene. H is its height, W its width."""
+
+    rgb: npt.NDArray[np.uint8]  # (H, W, 3) RGB; black where there is nothing
+    depth: npt.NDArray[np.float32]  # (H, W) along the camera's z axis, in the world's unit; 0 where there is nothing
+    seen: npt.NDArray[np.bool_]  # (H, W) whether most of a pixel's light is of surfaces that two photographs confirm
+
+
+def view(
+    gaussians: GaussianArrays,
+    T_world_camera: npt.ArrayLike,
+    K: npt.ArrayLike,
+    size: tuple[int, int],
+    threads: int | None,
+) -> View:
+    """The Gaussians from a camera of `size` (width, height). Raises ValueError where it is none."""
+    (width, height), pose, lens = _size(size), _matrix("T_world_camera", T_world_camera), _matrix("K", K)
+    problem = find_camera_problem(pose, lens, width, height)
+    if problem:
+        raise ValueError(f"{problem}. Give a camera's own: camera.T_world_camera, camera.K, (camera.width, ...)")
+    with core.apply_thread_limit(threads):
+        shown = render_arrays(gaussians, pose, lens, width, height, channels=("rgb", "depth"))
+        confirmed = find_confirmed(gaussians.source_frame).astype(np.float32)
+        white = replace(gaussians, sh=make_flat_sh(np.repeat(confirmed[:, None], 3, 1)))  # and all else black
+        light = render_arrays(white, pose, lens, width, height).rgb[..., 0]
+    rgb = np.rint(255 * np.clip(shown.rgb, 0.0, 1.0)).astype(np.uint8)
+    return View(rgb, shown.depth, light > MOSTLY)
+
+
+def _matrix(name: str, given: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    try:
+        return np.asarray(given, np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a matrix of numbers, got {type(given).__name__}") from error
+
+
+def _size(size: tuple[int, int]) -> tuple[int, int]:
+    try:
+        width, height = size
+        if int(width) == width and int(height) == height:
+            return int(width), int(height)
+    except (TypeError, ValueError):
+        pass
+    raise TypeError(f"size must be (width, height) in whole pixels, got {size!r}")
+
 
 if TYPE_CHECKING:
     from splatnode.api.photographs import Lens, Picture
     from splatnode.api.window import Viewer
     from splatnode.recon.locating.outcome import Located, NotLocated
-    from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+    from splatnode.recon.occupancy.grid import OccupancyMap
 
 
 class Files(Protocol):
@@ -151,7 +272,7 @@ class Result:
         direction of up in the world; None: the floor tells it, or the cameras, as `upright.source` says. Raises
         ValueError where no map can be made of the result, with the reason, or these are no size and no direction.
         """
-        from splatnode.recon.occupancy.build import occupancy_map  # brings what carves
+        from splatnode.recon.occupancy.grid import occupancy_map  # brings what carves
 
         return occupancy_map(self._snapshot, voxel, None if up is None else np.asarray(up, np.float64))
 
@@ -200,3 +321,35 @@ class Result:
 def result_of(snapshot: Snapshot, files: Files, lenses: Mapping[str, Intrinsics] = MappingProxyType({})) -> Result:
     """A snapshot as a program sees it: with the Gaussians that its files would have."""
     return Result(replace(snapshot, gaussians=sanitize_gaussians(snapshot.gaussians)), files, dict(lenses))
+
+
+# A result that was written, read again.
+
+
+@dataclass(frozen=True)
+class StoredFiles:
+    """The files of a result, where they were read."""
+
+    folder: Path
+
+    def write(self, out: Path) -> None:
+        copy_result(self.folder, out)
+
+
+def load(folder: str | PathLike[str]) -> Result:
+    """The result in a folder that `Result.save`, `splatnode replay` or a node wrote; a refusal, too.
+
+    Which lenses were given is not in the files. Saving it again copies the files. Raises FileNotFoundError where there
+    is no result, ValueError where the files are something else or damaged.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise FileNotFoundError(f"{place} is no folder; give one that Result.save or splatnode replay --out wrote")
+    if is_map_set(place):
+        scenes = ", ".join(sorted(path.parent.name for path in place.glob("*/report.json")))
+        raise ValueError(f"{place} holds several results; give one of its folders: {scenes}")
+    snapshot = read_result(place)[0]
+    if (place / LANDMARKS).exists():
+        snapshot = replace(snapshot, landmarks=read_landmarks(place))
+    snapshot = replace(snapshot, depths=read_depths(place))
+    return result_of(snapshot, StoredFiles(place.resolve()))

@@ -9,27 +9,31 @@ from dataclasses import dataclass, replace
 import numpy.typing as npt
 
 from splatnode.api.photographs import Lens, Picture, intrinsics_of, lenses, make_frame
-from splatnode.api.poses import gravity_of, next_motion, pose_of
-from splatnode.api.reconstruction import Changes, build_config, check_count
+from splatnode.api.reconstruct import (
+    Changes,
+    Scale,
+    build_config,
+    check_count,
+    gravity_of,
+    is_stereo,
+    next_motion,
+    pose_of,
+)
 from splatnode.api.result import Result, result_of
-from splatnode.api.scale import Scale, is_stereo
-from splatnode.capture.frame import Frame
-from splatnode.capture.given_lens import assign_lens, check_fits
-from splatnode.capture.motion import Motion
-from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
-from splatnode.capture.process.progress import Tell, ignore_progress
+from splatnode.capture.frame import Baseline, Frame, RightImage, Stamp, grey
+from splatnode.capture.keyframe_selection import Config as Selection
+from splatnode.capture.keyframe_selection import Selector
+from splatnode.capture.lens_file import assign_lens, check_fits
+from splatnode.capture.odometry import Motion
+from splatnode.capture.process.terminal import Tell, ignore_progress
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.quality import Limits
-from splatnode.capture.right_image import Baseline, RightImage, grey
-from splatnode.capture.selection import Config as Selection
-from splatnode.capture.selection import Selector
-from splatnode.capture.stamp import Stamp
 from splatnode.recon import threads as limits
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric.evidence import NOTHING, gather_evidence
 from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.offline import OfflineResult
-from splatnode.recon.pipeline import rebuild_from_scratch
+from splatnode.recon.pipeline import OfflineResult, rebuild_from_scratch
 from splatnode.recon.replay_source import Source
 from splatnode.recon.result.snapshot import Snapshot
 

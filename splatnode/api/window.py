@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from splatnode.capture.process import python
-from splatnode.capture.process.packages import remedy
+from splatnode.capture.process.system import remedy
 from splatnode.viewer.probe import open3d_installed, probe_window
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.api.camera import camera_of
+from splatnode.api.result import camera_of
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.result.snapshot import CameraEstimate
 

@@ -45,7 +45,7 @@ def test_a_known_lens_is_taken(result, between):
 
 def test_near_to_where_it_was_taken_it_is_placed_without_looking_everywhere(result, between, monkeypatch):
     found = result.localise(between)
-    monkeypatch.setattr("splatnode.recon.locating.follow.localize_image", None)
+    monkeypatch.setattr("splatnode.recon.locating.localize.localize_image", None)
     for near in (found, found.T_world_camera, result.cameras[1].T_world_camera.tolist()):
         again = result.localise(between, near=near)
         assert isinstance(again, splatnode.Located)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.api.photographs import load_frames, make_frame, make_rgb_image
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import ExposureSettings, Frame
 from splatnode.capture.image_file import decode_image
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 4)).astype(np.uint8)

@@ -5,7 +5,7 @@ import pytest
 
 import splatnode
 from splatnode.api.photographs import make_frame as frame_of
-from splatnode.api.poses import poses_given, sigmas_of
+from splatnode.api.reconstruct import poses_given, sigmas_of
 from splatnode.capture.cameras import synthetic
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import photographs

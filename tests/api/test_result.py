@@ -10,8 +10,8 @@ import pytest
 
 import splatnode
 from splatnode.api.result import result_of
-from splatnode.recon.result.bounds import compute_axes
 from splatnode.recon.result.rendering import render_arrays
+from splatnode.recon.result.verdict import compute_axes
 from tests.support.exported import make_snapshot
 
 

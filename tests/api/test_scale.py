@@ -4,7 +4,7 @@ import pytest
 
 import splatnode
 from splatnode.api.photographs import load_frames
-from splatnode.api.scale import is_stereo, metric_changes, pairs_given
+from splatnode.api.reconstruct import is_stereo, metric_changes, pairs_given
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.choosing import THINNED, choose
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.keyframe_selection import THINNED, Config, choose
 from splatnode.capture.quality import Limits
-from splatnode.capture.selection import Config
 
 WALK = synthetic.Config(views=8, width=160, height=120)
 FRAMES = 40

@@ -18,22 +18,18 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture import selection
+from splatnode.capture import keyframe_selection
 from splatnode.capture.cameras import folder
-from splatnode.capture.config import Camera, CaptureConfig
-from splatnode.capture.daemon import _Session, capture
+from splatnode.capture.config import Camera, CaptureConfig, PreviewHeader, decode_preview
+from splatnode.capture.daemon import _Session, capture, last_run
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.last_run import last_run
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.keyframe_messages import FrameHeader
-from splatnode.capture.messaging.keyframes import KeyframeClient
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Key, Spool
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient
+from splatnode.capture.messaging.messages import FrameHeader
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
+from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig
 from splatnode.capture.messaging.wire import encode
-from splatnode.capture.preview import PreviewHeader, decode_preview
-from splatnode.capture.process.after_ready import FailedAfterReady
+from splatnode.capture.process.system import FailedAfterReady
 from splatnode.capture.status import CaptureStatus, heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
@@ -243,14 +239,14 @@ def test_one_frame_that_fails_costs_that_frame_alone(tmp_path, photographs, monk
 
     target, error = {
         "offer": ("splatnode.capture.messaging.spool.write_message", OSError(5, "Input/output error")),
-        "examine": ("splatnode.capture.selection.assess", ArithmeticError("for the test")),
+        "examine": ("splatnode.capture.keyframe_selection.assess", ArithmeticError("for the test")),
         "preview": ("splatnode.capture.daemon.encode_preview", ArithmeticError("for the test")),
     }[what]
     module, name = target.rsplit(".", 1)
     monkeypatch.setattr(target, failing(getattr(import_module(module), name), error))
     config = CaptureConfig(
         camera=Camera("folder", folder.Config(folder=photographs)),
-        selection=selection.Config(every_frame=True),
+        selection=keyframe_selection.Config(every_frame=True),
         spool=SpoolConfig(directory=tmp_path / "state"),
         network=network(tmp_path),
     )

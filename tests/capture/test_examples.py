@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.capture import examples
+from splatnode.capture import cli
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.process.config import load_config
 from splatnode.command_line import main
@@ -22,7 +22,7 @@ def content_of(folder: Path) -> dict[str, bytes]:
 def test_each_is_listed_with_one_line(capsys):
     assert main(["config"]) == 0
     *lines, advice = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == list(examples.examples())
+    assert [line.split()[0] for line in lines] == list(cli.examples())
     assert all(len(line) < 130 and line.endswith(".") for line in lines)
     assert "splatnode config --write" in advice
 
@@ -34,7 +34,7 @@ def test_all_are_written_into_a_new_or_empty_folder(tmp_path, there, capsys):
         folder.mkdir(parents=True)
     assert main(["config", "--write", str(folder)]) == 0
     assert content_of(folder) == content_of(ROOT / "configs") and len(content_of(folder)) >= 10
-    assert capsys.readouterr().out.splitlines() == [str(folder / name) for name in examples.examples()]
+    assert capsys.readouterr().out.splitlines() == [str(folder / name) for name in cli.examples()]
     assert os.listdir(tmp_path) == ["above"] and os.listdir(tmp_path / "above") == ["mine"]
     assert load_config(folder / "replay.yaml", CaptureConfig, ["camera.folder=photos"]).camera.kind == "folder"
 
@@ -43,7 +43,7 @@ def test_others_may_read_them_as_far_as_the_umask_allows(tmp_path):
     """A service that runs as another user reads its configuration."""
     before = os.umask(0o022)
     try:
-        examples.write(tmp_path / "mine", {"udev/a.rules": b"rule"})
+        cli.write(tmp_path / "mine", {"udev/a.rules": b"rule"})
     finally:
         os.umask(before)
     modes = [stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "mine", tmp_path / "mine" / "udev" / "a.rules")]
@@ -75,7 +75,7 @@ def test_a_failure_leaves_nothing(tmp_path, monkeypatch, failing, capsys):
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device", "somewhere")
 
-    monkeypatch.setattr(examples.os, failing, full)
+    monkeypatch.setattr(cli.os, failing, full)
     assert main(["config", "--write", str(tmp_path / "above" / "mine")]) == 74
     assert f"No space left on device: {tmp_path / 'above' / 'mine'}" in capsys.readouterr().err
     assert os.listdir(tmp_path) == []

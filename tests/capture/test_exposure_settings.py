@@ -12,15 +12,14 @@ import zmq
 
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.exif import exif_exposure, read_tags
-from splatnode.capture.exposure_settings import ExposureSettings, parse_exposure
-from splatnode.capture.frame import Frame, Intrinsics, rename_frame
+from splatnode.capture.frame import ExposureSettings, Frame, Intrinsics, parse_exposure, rename_frame
 from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.masks import apply_mask
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, decode_frame, encode_frame
+from splatnode.capture.messaging.messages import FrameHeader, decode_frame, encode_frame
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Limits, Numbering, WireError, decode, encode
 from splatnode.capture.recording import INDEX, Recorder, read
-from splatnode.recon.daemon.checkpoint.stored_frame import file_name, read_frame, write_frame
+from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
 from tests.capture.cameras.test_folder import encoded, tiff, with_exif
 
 TOLD = ExposureSettings(0.008, 400.0, 2.0)

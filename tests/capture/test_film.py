@@ -9,8 +9,8 @@ import pytest
 
 from splatnode.capture import film
 from splatnode.recon.auditing.stations import Film, find_recordings
-from splatnode.recon.batch import sources
-from splatnode.recon.batch.answer import Outcome
+from splatnode.recon.batch import batch
+from splatnode.recon.batch.batch import Outcome
 from splatnode.recon.batch.write_back import write_back
 from tests.support.clips import level_images, write_clip
 
@@ -50,7 +50,7 @@ def test_a_part_without_a_frame_says_so(video):
 
 def test_a_batch_and_an_audit_take_parts_of_a_video(video, tmp_path):
     part = Path(f"{video}#t=1,3")
-    (one,) = sources.recordings([part], tmp_path / "out")
+    (one,) = batch.recordings([part], tmp_path / "out")
     assert (one.name, one.source) == ("film_t=1,3", str(part.resolve()))
     (visit,) = find_recordings([part])
     assert visit.problem == "" and list(visit.cameras.values()) == [Film(part)]

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, rename_frame
-from splatnode.capture.given_pose import LARGEST_M, make_given_pose
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, encode_frame
+from splatnode.capture.messaging.messages import FrameHeader, encode_frame
 from splatnode.capture.messaging.wire import Numbering, decode
+from splatnode.capture.odometry import LARGEST_M, make_given_pose
 from splatnode.capture.recording import INDEX, Recorder, read
-from splatnode.recon.daemon.checkpoint.stored_frame import file_name, read_frame, write_frame
+from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
 
 MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 POSE = make_given_pose(MOVED, 0.02, 1.5)

@@ -16,11 +16,9 @@ import pytest
 
 from splatnode.capture import heif_file, image_file
 from splatnode.capture.cameras import folder, watched
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import Clock, DroppedFrame, ExposureSettings, Frame, Stamp
 from splatnode.capture.image_file import UnusableImage, check_whole, decode_any_image, decode_image
 from splatnode.capture.pi_heif import BASE_BYTES, BYTES_A_PIXEL
-from splatnode.capture.stamp import Clock, Stamp
 from tests.conftest import ROOT
 from tests.support.crafted.bounded import MARGIN
 

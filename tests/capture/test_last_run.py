@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from splatnode.capture.last_run import begin_run, end_run, last_run
+from splatnode.capture.daemon import begin_run, end_run, last_run
 from splatnode.capture.messaging.network import Network
 
 

@@ -11,14 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.capture import poses_file
-from splatnode.capture.colmap_images import each_line
-from splatnode.capture.frame import Frame
-from splatnode.capture.given_pose import are_rigid, rigid_problem
-from splatnode.capture.poses_file import PosesFileError, Trajectory, poses_of, read_poses
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture import pose_files
+from splatnode.capture.frame import Clock, Frame, Stamp
+from splatnode.capture.odometry import are_rigid, rigid_problem
+from splatnode.capture.pose_files import PosesFileError, Trajectory, each_line, poses_of, read_poses
 from splatnode.recon.result.export import export_scene
-from splatnode.recon.result.write import write_result_folder
+from splatnode.recon.result.report import write_result_folder
 from tests.recon.metric.test_poses import NAMES, TRUE, scene
 
 SEEN = np.zeros((8, 8, 3), np.uint8)
@@ -179,7 +177,7 @@ def test_a_time_is_looked_up_without_a_look_at_all_others(tmp_path):
 
 @pytest.mark.parametrize("kind", ["tum", "names", "text", "binary", "json"])
 def test_more_poses_than_are_read_are_refused(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(poses_file, "MOST_POSES", 100)
+    monkeypatch.setattr(pose_files, "MOST_POSES", 100)
     name, content = many(kind)
     (tmp_path / name).write_bytes(content)
     with pytest.raises(PosesFileError, match="at most 100 poses are read, and there are more"):

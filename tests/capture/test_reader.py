@@ -12,10 +12,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.nothing_new import KeepAlive
+from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, KeepAlive
 from splatnode.capture.reader import Config, Reader, ReaderState
-from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.messaging.test_sockets import wait_for
 
 QUICK = Config(silence_s=0.2, first_pause_s=0.01, longest_pause_s=0.05, give_up_s=1.0)

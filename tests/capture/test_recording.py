@@ -12,10 +12,9 @@ import pytest
 
 from splatnode.capture import recording
 from splatnode.capture.cameras import folder
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.recording import INDEX, Recorder, RecordingError
-from splatnode.capture.stamp import Clock, Stamp
 from tests.support.crafted import recordings
 
 LENS = Intrinsics(16, 12, 20.5, 20.25, 8.0, 6.1, "calibration", (0.1, -0.02, 0.001, 0.0, 1e-17))

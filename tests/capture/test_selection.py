@@ -10,8 +10,7 @@ import pytest
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
-from splatnode.capture.quality import Limits
-from splatnode.capture.selection import (
+from splatnode.capture.keyframe_selection import (
     REMEMBERED_BLURS,
     REMEMBERED_VIEWS,
     Config,
@@ -21,6 +20,7 @@ from splatnode.capture.selection import (
     measure,
     track,
 )
+from splatnode.capture.quality import Limits
 from tests.support import synthetic
 
 EVERY = Config(per_second=1000.0, patience_s=0.0)

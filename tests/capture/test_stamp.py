@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp, nearest_stamp, wall_clock
+from splatnode.capture.frame import LARGEST_NS, Clock, Stamp, nearest_stamp, wall_clock
 
 
 @pytest.mark.parametrize(
@@ -42,5 +42,5 @@ def test_a_reading_of_the_clocks_that_was_disturbed_does_not_count(monkeypatch):
 
 @pytest.mark.parametrize(("shown", "told"), [(-(10**20), 0), (LARGEST_NS + 10**18, LARGEST_NS)])
 def test_a_clock_that_is_set_to_any_year_ends_no_camera(monkeypatch, shown, told):
-    monkeypatch.setattr("splatnode.capture.stamp.time", SimpleNamespace(monotonic_ns=lambda: 0, time_ns=lambda: shown))
+    monkeypatch.setattr("splatnode.capture.frame.time", SimpleNamespace(monotonic_ns=lambda: 0, time_ns=lambda: shown))
     assert wall_clock(1000) == nearest_stamp(shown, Clock.UTC) == Stamp(told, Clock.UTC)

@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from splatnode.capture.process.config_text import ConfigError
-from splatnode.capture.process.printable import LONGEST_LINE, sanitize_lines
+from splatnode.capture.process.config import ConfigError
+from splatnode.capture.process.text import LONGEST_LINE, sanitize_lines
 from splatnode.command_line import exit_code, explain
 
 MOST_SECONDS = 1.0  # of processor time, for one case

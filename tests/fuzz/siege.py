@@ -27,11 +27,9 @@ import cv2
 import numpy as np
 import zmq
 
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.keyframes import KeyframeClient
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.keys import create_keys
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import (
+from splatnode.capture.messaging.network import (
     CAPTURE_CONTROL,
     CAPTURE_KEYFRAMES,
     CAPTURE_PREVIEW,
@@ -39,7 +37,9 @@ from splatnode.capture.messaging.services import (
     RECON_CONTROL,
     RECON_SCENE,
     RECON_STATUS,
+    Network,
 )
+from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.status import ReconStatus
 from tests.capture.messaging.test_sockets import free_ports

@@ -11,15 +11,14 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Spool
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.config import parse_config
 from splatnode.command_line import main
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.daemon import Daemon
+from splatnode.recon.daemon.node import Daemon
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.result.folder import hold_result_folder
 from tests.bench.node.trial import RECON

@@ -18,14 +18,14 @@ from splatnode.capture.cameras import synthetic
 from splatnode.recon.cli import evaluate_held_out_views
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.evaluate.demo import write_capture
-from splatnode.recon.offline import run
-from splatnode.recon.optimize.adam import Adam
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-from splatnode.recon.optimize.refinement import RefinementConfig, refine
+from splatnode.recon.optimize.optimizer import Adam
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss
+from splatnode.recon.optimize.training import RefinementConfig, refine
+from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize import dispatch, reference
-from splatnode.recon.rasterize.device import Device
+from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.scene.scene import Scene
 from tests.support.known_scene import disturbed, photographed, render, turned
 from tests.support.rasterize_cases import HEIGHT, NAMES, WIDTH, Case, images, moderate, relative_error

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.start import extract_start_config, find_start
+from splatnode.recon.evaluate.methods import extract_start_config, find_start
 from splatnode.recon.modelling import create_initial_scene
-from splatnode.recon.optimize.adam import Adam
-from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-from splatnode.recon.optimize.refinement import RefinementConfig, refine
+from splatnode.recon.optimize.optimizer import Adam
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss
+from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.scene.scene import Scene
 from tests.bench.speed.rasterize import CASES, LRS, Case, bumpy_surface

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from splatnode.recon.optimize.fit import Trainer
-from splatnode.recon.optimize.refinement import RefinementConfig
+from splatnode.recon.optimize.training import RefinementConfig
 from tests.support import gsplat_by_torch
 from tests.support.known_scene import photographed
 

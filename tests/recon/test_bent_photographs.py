@@ -12,8 +12,8 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.undistort import undistort_image
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.offline import run
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.pipeline import run
+from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support.synthetic import photographs
 

@@ -8,10 +8,9 @@ import torch
 
 from splatnode.recon.budget import STAYS, find_budget_hits, loss_fall
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import training
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene.scene import Gaussians, Scene
 
 SECONDS = {"poses": 1.0, "points": 2.0, "optimise": 4.0, "total": 7.0}
 
@@ -75,7 +74,7 @@ def test_of_two_limits_the_one_that_bound_is_named():
 
 
 def test_without_a_control_all_that_begin_stay():
-    config = ReconstructionConfig(max_gaussians=1000, optimize=refinement.RefinementConfig(control=None))
+    config = ReconstructionConfig(max_gaussians=1000, optimize=training.RefinementConfig(control=None))
     assert find_budget_hits(config, begun(), refined(1000), SECONDS)[0].would_take == 10_000
 
 

@@ -17,8 +17,8 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.recording import Recorder
-from splatnode.recon import cli, offline, replay_source
-from splatnode.recon.result.scale import Scale
+from splatnode.recon import cli, pipeline, replay_source
+from splatnode.recon.result.verdict import Scale
 from tests.support.exported import make_snapshot
 
 
@@ -52,7 +52,7 @@ def photographs(tmp_path):
 )
 def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arguments, code, said):
     monkeypatch.chdir(photographs.parent)
-    monkeypatch.setattr(offline, "reconstruct", lambda *_: pytest.fail("was begun"))
+    monkeypatch.setattr(pipeline, "reconstruct", lambda *_: pytest.fail("was begun"))
     assert command_line.main(["replay", "photographs", *arguments]) == code
     assert said in capsys.readouterr().err
     assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
@@ -60,7 +60,7 @@ def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arg
 
 
 def test_a_folder_with_the_scenes_of_a_map_is_not_written_into(photographs, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(offline, "reconstruct", lambda *_: pytest.fail("was begun"))
+    monkeypatch.setattr(pipeline, "reconstruct", lambda *_: pytest.fail("was begun"))
     out = tmp_path / "walk"
     out.mkdir()
     (out / "places.json").write_text("{}")
@@ -75,7 +75,7 @@ def test_the_picture_that_an_earlier_run_showed_is_removed_and_others_stay(tmp_p
     for name in ("live.png", "mine.png"):
         (pictures / name).write_bytes(b"a picture")
     with cli._viewer(argparse.Namespace(out=tmp_path, view=False)) as show:
-        assert show is offline.ignore_snapshot
+        assert show is pipeline.ignore_snapshot
     assert [path.name for path in pictures.iterdir()] == ["mine.png"]
 
 
@@ -111,7 +111,7 @@ def replayed(photographs, monkeypatch):
 
     def replay(instead) -> int:
         monkeypatch.chdir(photographs.parent)
-        monkeypatch.setattr(offline, "reconstruct", lambda *_: instead())
+        monkeypatch.setattr(pipeline, "reconstruct", lambda *_: instead())
         return command_line.main(["replay", "photographs", "--out", "new/out"])
 
     return replay

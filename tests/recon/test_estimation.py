@@ -14,12 +14,12 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction, StreamState
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.memory import ReconstructionCache
-from splatnode.recon.registration import continuation, register
-from splatnode.recon.verification import reflection
+from splatnode.recon.registration import registration
+from splatnode.recon.verification import consistency
 from tests.support.synthetic import photographs, places, view_graph
 
 CONFIG = ReconstructionConfig()
-REGISTRATION = register.RegistrationConfig()
+REGISTRATION = registration.RegistrationConfig()
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +38,9 @@ def first(graph: ViewGraph, count: int) -> ViewGraph:
 
 
 def test_cameras_of_further_keyframes_are_those_that_a_registration_of_all_finds(graph):
-    known = register.register(*_of(first(graph, 3)), REGISTRATION)
-    extended = continuation.extend_registration(*_of(graph), known.cameras, REGISTRATION)
-    anew = register.register(*_of(graph), REGISTRATION)
+    known = registration.register(*_of(first(graph, 3)), REGISTRATION)
+    extended = registration.extend_registration(*_of(graph), known.cameras, REGISTRATION)
+    anew = registration.register(*_of(graph), REGISTRATION)
     assert [camera.index for camera in extended.cameras] == [camera.index for camera in anew.cameras] == [0, 1, 2, 3]
     Ts, expected = (np.stack([camera.T_world_camera for camera in found.cameras]) for found in (extended, anew))
     similarity = align_cameras(Ts, expected)
@@ -54,8 +54,8 @@ def test_cameras_of_further_keyframes_are_those_that_a_registration_of_all_finds
 def test_a_lens_of_which_nothing_is_known_has_to_be_registered(graph):
     other = replace(graph.keyframes[3].frame, image=np.ascontiguousarray(graph.keyframes[3].frame.image[:, :150]))
     keyframes = [*graph.keyframes[:3], replace(graph.keyframes[3], frame=other)]
-    known = register.register(*_of(first(graph, 3)), REGISTRATION)
-    assert continuation.extend_registration(keyframes, graph.pairs, known.cameras, REGISTRATION) is None
+    known = registration.register(*_of(first(graph, 3)), REGISTRATION)
+    assert registration.extend_registration(keyframes, graph.pairs, known.cameras, REGISTRATION) is None
 
 
 def test_a_further_keyframe_is_accepted_provisionally_and_then_for_good(graph):
@@ -86,7 +86,7 @@ def test_two_keyframes_are_no_start_for_a_quick_estimate(graph):
 def test_a_mirrored_photograph_is_not_accepted_provisionally(graph):
     """Where a place is symmetric, the mirror image of a photograph fits to the pixel: only its details tell."""
     photograph = graph.keyframes[3]
-    features = replace(photograph.features, descriptors=reflection.mirror_descriptors(photograph.features.descriptors))
+    features = replace(photograph.features, descriptors=consistency.mirror_descriptors(photograph.features.descriptors))
     fitting = replace(graph, keyframes=(*graph.keyframes[:3], replace(photograph, features=features)))
     before = holding(first(graph, 3))
     assert before.estimate_soon().publishable

@@ -13,11 +13,11 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.offline import run
+from splatnode.recon.pipeline import run
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.vignetting import relative_illumination
+from splatnode.recon.scene.exposure import relative_illumination
 from tests.support.synthetic import SMALL, photographs
 
 CONFIG = apply_changes(preset("preview"), {"size": 320})

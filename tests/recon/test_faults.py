@@ -17,8 +17,8 @@ from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.matching import features, pair_matching, two_view
-from splatnode.recon.matching.match import match
-from splatnode.recon.matching.moving import moving_points
+from splatnode.recon.matching.dynamic_objects import moving_points
+from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import UnusableFrame, prepare_all
 from splatnode.recon.priors import stereo
 from splatnode.recon.result.verdict import Code
@@ -139,8 +139,8 @@ def test_a_stream_goes_on_without_the_frame_that_cannot_be_prepared(monkeypatch)
 
 def test_a_photograph_that_cannot_be_tilted_keeps_its_plain_features(monkeypatch, caplog):
     keyframe = prepare_all(photographs()[:1], ReconstructionConfig())[0][0]
-    monkeypatch.setattr("splatnode.recon.matching.match._add_affine_features", failing_for(keyframe.name, None))
-    from splatnode.recon.matching.match import _try_affine_features
+    monkeypatch.setattr("splatnode.recon.matching.view_graph._add_affine_features", failing_for(keyframe.name, None))
+    from splatnode.recon.matching.view_graph import _try_affine_features
 
     assert _try_affine_features(keyframe, (1.6,), ReconstructionConfig().matching) is keyframe
     assert f"{keyframe.name} is matched without simulated tilts" in caplog.text

@@ -17,10 +17,9 @@ from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching import features
-from splatnode.recon.offline import run
+from splatnode.recon.pipeline import run
 from splatnode.recon.preparation import prepare
-from splatnode.recon.result.preview import render_rgb
-from splatnode.recon.result.report import build_report
+from splatnode.recon.result.report import build_report, render_rgb
 from tests.support.synthetic import SMALL, errors, photographs
 
 CONFIG = apply_changes(preset("preview"), {"size": 320})

@@ -11,14 +11,14 @@ from msgspec.structs import replace
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import FallbackConfig, ReconstructionConfig
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import SMALL, places
 
 CONFIG = ReconstructionConfig(
-    size=160, ladder=FallbackConfig(work=1.0), optimize=refinement.RefinementConfig(iterations=10, checkpoints=())
+    size=160, ladder=FallbackConfig(work=1.0), optimize=training.RefinementConfig(iterations=10, checkpoints=())
 )
 A_DAY_S = 86400.0
 

@@ -12,20 +12,18 @@ from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.progress import ProgressStep, Tell, ignore_progress
+from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
-from splatnode.recon.evaluate.appearance import GaussianAppearance
 from splatnode.recon.evaluate.camera_errors import compare_cameras
-from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.same_lens import average_intrinsics
-from splatnode.recon.evaluate.test_pose import find_test_pose
+from splatnode.recon.evaluate.protocol import average_intrinsics, find_test_pose, psnr
+from splatnode.recon.evaluate.regions import GaussianAppearance
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct, reconstruct_stream
 from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.result.consistent_depth import format_percent
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.npz_files import format_percent
+from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.synthetic import SMALL, errors, photographs, places, pure_rotation
@@ -33,9 +31,9 @@ from tests.support.synthetic import SMALL, errors, photographs, places, pure_rot
 CONFIG = ReconstructionConfig(
     size=320,
     preview=replace(PREVIEW, iterations=5),
-    optimize=refinement.RefinementConfig(iterations=150, checkpoints=(50,)),
+    optimize=training.RefinementConfig(iterations=150, checkpoints=(50,)),
 )
-QUICK = replace(CONFIG, size=160, optimize=refinement.RefinementConfig(iterations=10, checkpoints=()))
+QUICK = replace(CONFIG, size=160, optimize=training.RefinementConfig(iterations=10, checkpoints=()))
 MIN_PSNR = 29.2  # dB, of held-out photographs: 1 dB less than they reach with any instruction set
 MAX_GAUSSIANS = 50_000
 BLURRED = DroppedFrame("blurred.png", "blurred by 9 pixels")
@@ -220,7 +218,7 @@ def test_the_same_frames_and_seed_give_the_same_scene_to_the_bit(quick):
 
 
 def test_a_bound_on_gaussians_and_a_budget_of_seconds_are_kept(quick):
-    long = refinement.RefinementConfig(iterations=1_000_000, checkpoints=())
+    long = training.RefinementConfig(iterations=1_000_000, checkpoints=())
     final = last(three(), replace(QUICK, max_gaussians=400, budget_s=1e-3, optimize=long))
     assert final.verdict.code == Code.OK and final.final
     assert 200 <= len(final.gaussians) <= 400 < len(quick.gaussians)

@@ -9,13 +9,12 @@ import pytest
 
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.dataset import load_scene, load_split
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration import register
+from splatnode.recon.registration import registration
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification.decision import decide, refuse_before_registration
-from splatnode.recon.verification.verify import verify
+from splatnode.recon.verification.evidence import verify
 from tests.support.synthetic import view_graph
 
 CONFIG = ReconstructionConfig()
@@ -27,7 +26,7 @@ def real(shared: Path, name: str, views: int | None = None, step: int = 1) -> tu
     scene = load_scene(folder)
     names = list(scene.paths)[::step] if views is None else load_split(folder, list(scene.paths), views).train
     graph = view_graph(scene.frames(names))
-    found = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    found = registration.register(graph.keyframes, graph.pairs, registration.RegistrationConfig())
     cameras = found.cameras if found else ()
     true = [scene.cameras.get(names[camera.index]) for camera in cameras]
     pairs = [(camera, truth) for camera, truth in zip(cameras, true, strict=True) if truth]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.dataset import load_scene, load_split
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize.cpu import rasterize
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from splatnode.recon import core, threads
-from splatnode.recon.matching.nearest_neighbours import NearestNeighbourConfig, match, quantise
-from splatnode.recon.workers import map_parallel
+from splatnode.recon.matching.features import NearestNeighbourConfig, match, quantise
+from splatnode.recon.threads import map_parallel
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.capture.exposure_settings import ExposureSettings
+from splatnode.capture.frame import ExposureSettings
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.modelling import create_initial_scene

@@ -17,7 +17,7 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config, read_yaml
 from splatnode.recon.cli import LOOK_EVERY
 from splatnode.recon.config import preset
-from splatnode.recon.offline import set_preview_interval
+from splatnode.recon.pipeline import set_preview_interval
 from splatnode.recon.viewer_process import viewer
 from tests.viewer.test_cli import snapshot
 

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from splatnode.recon.core import default_threads
-from splatnode.recon.workers import map_parallel, map_parallel_lazily
+from splatnode.recon.threads import map_parallel, map_parallel_lazily
 
 
 def test_results_are_in_order_and_arguments_go_together():

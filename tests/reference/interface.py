@@ -11,13 +11,11 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import splatnode
-from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.process.progress import ProgressStep
-from splatnode.capture.stamp import Stamp
+from splatnode.capture.frame import DroppedFrame, Stamp
+from splatnode.capture.process.terminal import ProgressStep
 from splatnode.recon.locating.outcome import LocalizationBounds
-from splatnode.recon.occupancy.upright import Upright
-from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.occupancy.grid import Upright
+from splatnode.recon.result.verdict import Bounds, Verdict
 from tests.reference.comments import field_comments
 
 _INTRODUCTION = """# API

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.result.bounds import Bounds
+from splatnode.capture.frame import Clock, DroppedFrame, Stamp
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.landmarks import KnownLenses, Landmarks
 from splatnode.recon.result.report import build_report
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, KnownLenses, Landmarks, Snapshot
+from splatnode.recon.result.verdict import Bounds, Code, Verdict
 
 
 def make_gaussians(num_gaussians: int = 50, num_bases: int = 4, seed: int = 0) -> GaussianArrays:

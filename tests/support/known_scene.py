@@ -8,9 +8,8 @@ import numpy as np
 import torch
 
 from splatnode.recon.geometry import exp_se3
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 from tests.support.synthetic import tiny_scene
 
 

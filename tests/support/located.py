@@ -8,12 +8,12 @@ from functools import lru_cache
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.cast import Camera
+from splatnode.capture.diorama.render import Camera
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import Similarity, align_cameras
 from splatnode.recon.locating.outcome import Located
-from splatnode.recon.result.landmarks import Landmarks
+from splatnode.recon.result.snapshot import Landmarks
 from tests.support.synthetic import photographs, view_graph
 
 PLACE = synthetic.Config(views=6, width=480, height=360)

@@ -10,8 +10,7 @@ import numpy as np
 
 from splatnode.capture.calibration.board import DICTIONARIES
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.cast import Camera, cast
-from splatnode.capture.diorama.solids import Shape, Solid
+from splatnode.capture.diorama.render import Camera, Shape, Solid, cast
 from splatnode.capture.frame import Frame
 
 _THICK_M = 0.002

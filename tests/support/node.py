@@ -14,9 +14,8 @@ from typing import Any
 
 import yaml
 
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.network import RECON_SCENE, Network
+from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.config import parse_config
 from splatnode.recon.daemon.status import ReconState, ReconStatus

@@ -7,10 +7,8 @@ import threading
 import time
 from pathlib import Path
 
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.network import RECON_SCENE, RECON_STATUS, Network
+from splatnode.capture.messaging.pubsub import Publisher, StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.rasterize import reference
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.rasterize.reference import Render
 
 NAMES = ("means", "quats", "scales", "opacities", "sh", "T_world_camera", "K")
 WIDTH, HEIGHT = 46, 37  # more than one tile, not multiples of a block

@@ -7,15 +7,14 @@ from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import ExposureSettings, Frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.matching import config as matching
+from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.registration.register import RegisteredCamera, Registration
-from splatnode.recon.scene.initialisation import SceneInitializationConfig, initialize_scene
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.scene.initialization import SceneInitializationConfig, initialize_scene
 from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 

@@ -13,18 +13,17 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.cast import Camera, cast
-from splatnode.capture.diorama.layout import BRICK_WALL, place
+from splatnode.capture.diorama.render import Camera, cast
+from splatnode.capture.diorama.scene import BRICK_WALL, place
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
 from splatnode.recon.frames.keyframe import Keyframe, resize_image
-from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
-from splatnode.recon.matching.match import Matcher, match
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching import view_graph as matching
+from splatnode.recon.matching.view_graph import Matcher, ViewGraph, match
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Gaussians
 
 SMALL = synthetic.Config(views=6, width=320, height=240)
 

@@ -8,18 +8,15 @@ import numpy as np
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.matching import config as matching
+from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.cycles import CycleConsistency
+from splatnode.recon.verification.consistency import CycleConsistency, Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide
-from splatnode.recon.verification.errors import Errors, PoseErrors
-from splatnode.recon.verification.evidence import CameraEvidence, Evidence
-from splatnode.recon.verification.lens import Distortion
-from splatnode.recon.verification.reflection import Reflection
-from splatnode.recon.verification.weakest_link import WeakestLink
+from splatnode.recon.verification.evidence import CameraEvidence, Evidence, WeakestLink
+from splatnode.recon.verification.refit import Distortion, Errors, PoseErrors
 
 PLAIN, RICH = 20, 2000  # features
 SURE = PoseErrors(Errors(0.05, 0.05, 0.05), Errors(0.001, 0.001, 0.001))

@@ -8,9 +8,8 @@ from math import exp, log, sqrt
 from pathlib import Path
 from statistics import median
 
-from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, compute_margins
 from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.records import read_bench
+from splatnode.recon.evaluate.report import OURS, SHOWN, WHOLE, Margin, compute_margins, read_bench
 from tests.bench.quality import race_chart
 
 RAW = Path(__file__).parents[1] / "bench" / "results" / "race.json"

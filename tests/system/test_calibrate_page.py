@@ -6,7 +6,7 @@ import argparse
 import re
 
 from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.models import MODELS
+from splatnode.capture.calibration.estimate import MODELS
 from splatnode.capture.calibration.verb import CALIBRATE
 from tests.conftest import ROOT
 

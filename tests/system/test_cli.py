@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
-from splatnode.capture.process import packages
-from splatnode.capture.process.verb import Verb
+from splatnode.capture.process import system
+from splatnode.capture.process.arguments import Verb
 from splatnode.recon.result.export import ResultWriteError
 from splatnode.recon.result.export.format import list_format_names
 from splatnode.recon.result.export.formats.ply import encode_ply
@@ -52,17 +52,17 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     assert loaded.split() == [
         "splatnode.capture.calibration.verb",
         "splatnode.capture.process.arguments",
-        "splatnode.capture.process.config_text",
-        "splatnode.capture.process.foreign",
-        "splatnode.capture.process.lengths",
+        "splatnode.capture.process.config",
+        "splatnode.capture.process.text",
+        "splatnode.capture.process.text",
         "splatnode.capture.process.logs",
-        "splatnode.capture.process.memory_shortage",
-        "splatnode.capture.process.packages",
-        "splatnode.capture.process.printable",
-        "splatnode.capture.process.progress",
-        "splatnode.capture.process.stop_signals",
+        "splatnode.capture.process.system",
+        "splatnode.capture.process.system",
+        "splatnode.capture.process.text",
         "splatnode.capture.process.terminal",
-        "splatnode.capture.process.verb",
+        "splatnode.capture.process.system",
+        "splatnode.capture.process.terminal",
+        "splatnode.capture.process.arguments",
         "splatnode.capture.verbs",
         "splatnode.command_line",
         "splatnode.recon.batch.verb",
@@ -117,10 +117,10 @@ def test_every_verb_can_say_what_it_takes(verb, capsys):
 
 
 def test_a_missing_module_is_told_with_what_brings_it(monkeypatch, capsys):
-    for module, brought in {**packages.EXTRAS, **packages.REQUIRED}.items():
+    for module, brought in {**system.EXTRAS, **system.REQUIRED}.items():
         error = ModuleNotFoundError(f"No module named '{module}'", name=f"{module}.part")
         assert run_verb(monkeypatch, raising(error)) == 69
-        named = f"'splatnode[{brought}]'" if module in packages.EXTRAS else brought
+        named = f"'splatnode[{brought}]'" if module in system.EXTRAS else brought
         assert f"No module named '{module}'. " in (said := capsys.readouterr().err) and f"pip install {named}" in said
     assert run_verb(monkeypatch, raising(ModuleNotFoundError("No module named 'x'", name="x"))) == 69
     assert "pip install" not in (said := capsys.readouterr().err) and "./run in place of splatnode" in said
@@ -137,10 +137,10 @@ def test_what_brings_a_module_is_what_the_project_says():
             )
     distributions = {
         module: {"PIL": "pillow", "rerun": "rerun-sdk"}.get(module, module.replace("_", "-"))
-        for module in packages.EXTRAS
+        for module in system.EXTRAS
     }
     bringing = {module: extras.get(name, set()) - {"dev"} for module, name in distributions.items()}
-    assert bringing == {module: {extra} for module, extra in packages.EXTRAS.items()}
+    assert bringing == {module: {extra} for module, extra in system.EXTRAS.items()}
     # No module of splatnode needs what makes the site of docs/.
     assert {name for name, brought in extras.items() if brought - {"dev", "docs"}} == set(distributions.values())
 
@@ -149,7 +149,7 @@ def test_what_brings_a_module_is_what_the_project_says():
 def test_when_nobody_reads_any_more_nothing_is_said(to):
     program = (
         "import sys\nfrom splatnode import command_line\nfrom splatnode.capture.process.terminal import say\n"
-        "from splatnode.capture.process.verb import Verb\n"
+        "from splatnode.capture.process.arguments import Verb\n"
         f"act = lambda args: [say('line', error={to == '2'}) for _ in range(100000)] and 0\n"
         "command_line.VERBS = (Verb('act', '', lambda parser: None, act),)\n"
         "sys.exit(command_line.main(['act']))"
@@ -188,7 +188,7 @@ def test_the_verb_decides_the_exit_code(monkeypatch, code):
 def test_signals_end_a_verb_cleanly(number, code):
     program = (
         "import signal, sys, time\nfrom splatnode import command_line\n"
-        "from splatnode.capture.process.verb import Verb\n"
+        "from splatnode.capture.process.arguments import Verb\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs inherit it ignored
         "def wait(args):\n"
         "    try:\n"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from splatnode.recon.batch.batch import BatchRecording
 from splatnode.recon.batch.command import replay
-from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.call import pack_call
 from splatnode.recon.jobs.calls import Task, engine, run_here
 from splatnode.recon.jobs.child import Child, Limits, wait_for_end

@@ -18,9 +18,9 @@ from splatnode import command_line
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.cameras.folder import Config, frame_name, stream
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.printable import sanitize_text
+from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.recording import Recorder
-from splatnode.recon.daemon import control
+from splatnode.recon.daemon import node
 from tests.support.hostile import TEXTS, unprintable
 
 KEY = "0" * 40
@@ -134,7 +134,7 @@ def test_what_a_process_says_of_itself_only_shows(monkeypatch, capsys, text):
     monkeypatch.setattr("splatnode.capture.cli.heartbeats", lambda network: {"capture": fields, "recon": None})
     assert_only_shows(said_by(["status"], capsys))
     assert ascii(json.loads(said_by(["status", "--json"], capsys))["capture"]) == ascii(fields)
-    monkeypatch.setattr(control, "ask", lambda *_: control.Answer(False, f"no keyframe {text}"))
+    monkeypatch.setattr(node, "ask", lambda *_: node.Answer(False, f"no keyframe {text}"))
     assert_only_shows(said_by(["retract", text], capsys))
     monkeypatch.setattr(v4l2, "find", lambda: [{"device": text, "description": text}])
     said = said_by(["find"], capsys)

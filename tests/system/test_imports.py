@@ -28,7 +28,7 @@ assert not [name for name in sys.modules if name.startswith("torch.")]
         "splatnode.recon.result.snapshot",
         "splatnode.recon.result.verdict",
         "splatnode.recon.result.export",
-        "splatnode.recon.result.preview",
+        "splatnode.recon.result.report",
         "splatnode.recon.result.report",
         "splatnode.recon.result.message",
         "viewer",
@@ -43,7 +43,7 @@ def test_loads_without_torch(module):
 
 def test_the_block_bites():
     result = subprocess.run(
-        [sys.executable, "-c", NO_TORCH.format(module="splatnode.recon.scene.gaussians")],
+        [sys.executable, "-c", NO_TORCH.format(module="splatnode.recon.scene.scene")],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -13,9 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_MAP, RECON_SCENE
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.network import RECON_MAP, RECON_SCENE, Network
+from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.occupancy.message import encode_map as map_message
 from splatnode.recon.result.message import encode_snapshot

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from splatnode.recon.occupancy.occupancy_map import VoxelState
-from splatnode.recon.result.write import write_result_folder
+from splatnode.recon.occupancy.grid import VoxelState
+from splatnode.recon.result.report import write_result_folder
 from tests.conftest import ROOT
 from tests.support.occupied import room_snapshot
 

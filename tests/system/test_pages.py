@@ -8,15 +8,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import Intrinsics
-from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.gravity import Gravity
-from splatnode.capture.messaging import commands, keyframe_messages, services, state, wire
-from splatnode.capture.motion import Motion
-from splatnode.capture.preview import PreviewHeader
+from splatnode.capture.config import PreviewHeader
+from splatnode.capture.frame import ExposureSettings, Intrinsics
+from splatnode.capture.messaging import messages, network, pubsub, wire
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.status import CaptureStatus
-from splatnode.recon.daemon.control import RemoveKeyframe
+from splatnode.recon.daemon.node import RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.occupancy.message import MapHeader, MapRecord
 from splatnode.recon.result.export.format import list_format_names
@@ -86,7 +83,7 @@ SECTIONS = {
     "MapRecord": MapRecord,
     "CameraRecord": CameraRecord,
     "BoundsRecord": BoundsRecord,
-    "Want": state.Want,
+    "Want": pubsub.Want,
     "PreviewHeader": PreviewHeader,
     "CaptureStatus": CaptureStatus,
     "ReconStatus": ReconStatus,
@@ -94,15 +91,15 @@ SECTIONS = {
 }
 ROWS = (
     RemoveKeyframe,
-    commands.MarkProblemsSeen,
-    commands.Answer,
-    keyframe_messages.Ready,
-    keyframe_messages.ConsumerStatus,
-    keyframe_messages.Delivery,
-    keyframe_messages.FrameHeader,
-    keyframe_messages.DroppedHeader,
-    keyframe_messages.Acknowledge,
-    keyframe_messages.Refuse,
+    pubsub.MarkProblemsSeen,
+    pubsub.Answer,
+    messages.Ready,
+    messages.ConsumerStatus,
+    messages.Delivery,
+    messages.FrameHeader,
+    messages.DroppedHeader,
+    messages.Acknowledge,
+    messages.Refuse,
 )
 
 
@@ -129,8 +126,8 @@ def test_every_small_record_is_told(record):
 
 def test_every_service_state_and_field_of_a_lens_is_told():
     page = text("docs/messages.md")
-    offered = [each for each in vars(services).values() if isinstance(each, services.Service)]
-    both = [*offered, *(each.requests for each in offered if each.pattern is services.Pattern.STATE)]
+    offered = [each for each in vars(network).values() if isinstance(each, network.Service)]
+    both = [*offered, *(each.requests for each in offered if each.pattern is network.Pattern.STATE)]
     rows = re.findall(r"^\| `([\w.]+)` \| \w+ \| (\w+) \| \+(\d+) \|", page, re.MULTILINE)
     assert {(each.name, each.pattern.name.lower(), str(each.tcp_port)) for each in both} == set(rows)
     records = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings)

@@ -22,11 +22,10 @@ STARTS = {
 UNPICKLES = {
     "recon/jobs/call.py",  # from a folder of this user alone, or from Ray
     "recon/jobs/called.py",  # from a folder of this user alone
-    "recon/evaluate/moments.py",  # from a temporary folder of this user alone
-    "recon/evaluate/one_run.py",  # arguments of a call
-    "recon/evaluate/stability/windows/rivals.py",  # arguments of a call
-    "recon/evaluate/stability/windows/store.py",  # arguments of a call
-    "recon/networks/lpips_checkpoint.py",  # arrays and nothing else
+    "recon/evaluate/runner.py",  # from a temporary folder of this user alone
+    "recon/evaluate/stability/windows/campaign.py",  # arguments of a call
+    "recon/evaluate/stability/windows/windows.py",  # arguments of a call
+    "recon/networks/lpips.py",  # arrays and nothing else
 }
 _STARTERS = {"system", "popen", "fork_exec", "posix_spawn", "posix_spawnp"}
 _POOLS = {"multiprocessing", "ProcessPoolExecutor", "runpy", "pty"}

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from splatnode.recon.result import consistent_depth
+from splatnode.recon.result import npz_files
 from tests.conftest import ROOT
 from tests.system import race_page
 
@@ -960,7 +960,7 @@ def test_consistent_depth():
     says(f"{len(every)} small sets of photographs, {len(every) - pairs} of three to twelve views and {pairs} pairs")
     shares = [100 * row["consistent_depth"] for row in found]
     says(f"{len(found)} were published; their share is {min(shares):.0f} to {max(shares):.0f} %")
-    limit = consistent_depth.ConsistentDepthConfig().min_share
+    limit = npz_files.ConsistentDepthConfig().min_share
     for words, kept in (
         ("below 45 %", [row for row in found if row["consistent_depth"] < limit]),
         ("45 % and more", [row for row in found if row["consistent_depth"] >= limit]),

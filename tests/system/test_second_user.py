@@ -13,13 +13,12 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
-from splatnode.capture.messaging.keyframes import KeyframeServer
-from splatnode.capture.messaging.network import Network, NetworkError, runtime_directory
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.spool import Config, Spool
-from splatnode.capture.messaging.state import StateServer
-from splatnode.capture.process.private import NotOwnerOnly
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.messaging.network import RECON_SCENE, Network, NetworkError, runtime_directory
+from splatnode.capture.messaging.pubsub import StateServer
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
+from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.recon.daemon.checkpoint.store import Store
 from tests.conftest import ROOT
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
@@ -97,7 +96,7 @@ def test_state_is_not_kept_in_what_another_user_prepared(shared_tmp, what, how):
     }[what]
     prepared(path, how)
     begin = {
-        "spool": lambda: Spool(Config(shared_tmp)),
+        "spool": lambda: Spool(SpoolConfig(shared_tmp)),
         "checkpoint": lambda: Store(shared_tmp / "checkpoint"),
         "frames": lambda: Store(shared_tmp / "spool"),
     }[what]
@@ -112,7 +111,7 @@ def test_nothing_of_the_first_user_can_be_read_or_changed_by_the_second(shared_t
     try:
         with contextlib.ExitStack() as resources:
             network = Network(directory=shared_tmp / "run")
-            spool = Spool(Config(shared_tmp / "state"))
+            spool = Spool(SpoolConfig(shared_tmp / "state"))
             server = resources.enter_context(KeyframeServer(network, spool))
             resources.enter_context(StateServer(RECON_SCENE, network))
             server.offer(Frame(0, "a.png", 0, image, None))
@@ -131,7 +130,7 @@ def test_nothing_of_the_first_user_can_be_read_or_changed_by_the_second(shared_t
 
 
 def test_a_file_of_another_user_is_not_taken_for_ours(tmp_path, shared_tmp, caplog):  # noqa: F811
-    spool, store = Spool(Config(tmp_path)), Store(tmp_path / "recon")
+    spool, store = Spool(SpoolConfig(tmp_path)), Store(tmp_path / "recon")
     image = np.zeros((6, 8, 3), np.uint8)
     store.add_frame(ReceivedFrame("0" * 32, 0, Frame(0, "a.png", 0, image, None)))
     spool.close()
@@ -141,6 +140,6 @@ def test_a_file_of_another_user_is_not_taken_for_ours(tmp_path, shared_tmp, capl
     theirs.write_bytes(frame.read_bytes())
     for path in (frame, theirs):
         os.chown(path, OTHER, OTHER)
-    assert len(Spool(Config(tmp_path))) == 0 and theirs.exists()
+    assert len(Spool(SpoolConfig(tmp_path))) == 0 and theirs.exists()
     assert not list(Store(tmp_path / "recon").frames()) and frame.exists()
     assert caplog.text.count("event=left_alone") == 2

@@ -14,11 +14,10 @@ from tests.conftest import ROOT
 
 ROOMS = ("capture", "recon", "viewer", "splatnode")
 _OWN = {  # templates, and widths, of the program's own that are no constants where they are filled in
-    "capture/examples.py": {"longest"},
-    "recon/evaluate/contest.py": {"digits"},
-    "recon/evaluate/tables.py": {"digits", "measure.digits"},
-    "recon/result/bounds_in_words.py": {"max(decimals, 0)"},
-    "recon/verification/refusals.py": {"refusal.message.format", "refusal.advice.format"},
+    "capture/cli.py": {"longest"},
+    "recon/evaluate/report.py": {"digits", "measure.digits"},
+    "recon/result/snapshot.py": {"max(decimals, 0)"},
+    "recon/verification/rejections.py": {"refusal.message.format", "refusal.advice.format"},
 }
 _LEVELS = {"debug", "info", "warning", "error", "exception", "critical"}
 

@@ -21,17 +21,13 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE, RECON_STATUS
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.network import RECON_DEPTH, RECON_SCENE, RECON_STATUS, Network
+from splatnode.capture.messaging.pubsub import Publisher, StateServer
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.recon.result.camera_check import find_camera_problem
-from splatnode.recon.result.depth_message import make_depth_header
 from splatnode.recon.result.export import SceneFileError, write_result
-from splatnode.recon.result.message import encode_snapshot
+from splatnode.recon.result.message import encode_snapshot, make_depth_header
 from splatnode.recon.result.report import build_report
-from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import GaussianArrays, Snapshot, find_camera_problem
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer import cli
 from splatnode.viewer.probe import Probe, probe_window

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export.selection import Box, Selection
-from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import SHELL, encode_unconfirmed
+from splatnode.recon.result.export.prepare import Box, Selection
+from splatnode.recon.result.snapshot import SHELL, GaussianArrays, encode_unconfirmed
 from splatnode.viewer.editing import (
     EditError,
     add_edit,
@@ -18,11 +17,9 @@ from splatnode.viewer.editing import (
     edit_lines,
     write_edited,
 )
-from splatnode.viewer.graph import Graph
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import FixedSource, load_result
-from splatnode.viewer.state import ViewerState
+from splatnode.viewer.state import Graph, Moment, ViewerState
 from tests.viewer.test_scene import camera, moment, together, wall
 
 LEFT_HALF = Selection(box=Box((-1.0, -1.0, 0.0), (0.0, 1.0, 2.0)))

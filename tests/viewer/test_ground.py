@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.viewer.canvas import project
-from splatnode.viewer.ground import ground, ground_lines, round_number
-from splatnode.viewer.legend import bar_length, legend
-from splatnode.viewer.lengths import format_length
-from splatnode.viewer.viewpoint import orbit
+from splatnode.recon.result.verdict import RELATIVE, Scale
+from splatnode.viewer.shapes import bar_length, format_length, ground, ground_lines, legend, round_number
+from splatnode.viewer.viewpoint import orbit, project
 from tests.viewer.test_scene import camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 

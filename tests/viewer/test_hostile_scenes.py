@@ -9,18 +9,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.network import RECON_SCENE, Network
+from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.recon.result.message import SceneHeader, decode_snapshot, encode_snapshot
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.analysis import analyse
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import FixedSource, LiveSource, _sanitize_snapshot
-from splatnode.viewer.state import BINDINGS, ViewerState
+from splatnode.viewer.state import BINDINGS, Moment, ViewerState
 from tests.capture.messaging.test_sockets import wait_for
 
 COUNT = 6

@@ -11,17 +11,25 @@ import pytest
 
 from splatnode.command_line import main
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.pieces import find_pieces
-from splatnode.recon.result.whole import read_map_set
-from splatnode.viewer import words
-from splatnode.viewer.graph import FULL, NOTHING, Graph, GraphEdge, GraphNode, edge_lines, node_marks, place_lines
-from splatnode.viewer.map_loader import MapLoader
-from splatnode.viewer.map_source import Maps, MapSource, map_moment
-from splatnode.viewer.moment import append_moment
-from splatnode.viewer.nearness import FOCAL_PX, Extent, choose_levels
+from splatnode.recon.result.stored_snapshot import find_pieces
+from splatnode.recon.result.submap_index import read_map_set
+from splatnode.viewer import text
 from splatnode.viewer.session import Session
 from splatnode.viewer.shapes import CHAIN_COLOUR, LOOP_COLOUR, RETRACTED_COLOUR, shapes
-from splatnode.viewer.state import ViewerState, press
+from splatnode.viewer.sources import FOCAL_PX, Extent, MapLoader, Maps, MapSource, choose_levels, map_moment
+from splatnode.viewer.state import (
+    FULL,
+    NOTHING,
+    Graph,
+    GraphEdge,
+    GraphNode,
+    ViewerState,
+    append_moment,
+    edge_lines,
+    node_marks,
+    place_lines,
+    press,
+)
 from splatnode.viewer.viewpoint import overview
 from tests.support.walk import place, walk, write_walk
 
@@ -123,13 +131,13 @@ def test_links_are_drawn_by_kind_and_places_are_listed(out):
     assert drawn[CHAIN_COLOUR] == 1 and drawn[LOOP_COLOUR] == 1 and drawn[RETRACTED_COLOUR] > 4  # dashes
     hidden = shapes(moment, press(ViewerState(cameras=False, path=False), (), "8"), None)
     assert not hidden.lines
-    said = "\n".join(words.place_lines(moment))
+    said = "\n".join(text.place_lines(moment))
     for phrase in (
         "map 1 of 2", "splatnode merge", "scene-0001 OK: ", "full detail", "scene-0003 NO_PARALLAX: no scene",
         "loop scene-0001 to scene-0002, taken back: the cycle does not close",
     ):  # fmt: skip
         assert phrase in said
-    assert "several scenes" in words.advice_line(None, moment)
+    assert "several scenes" in text.advice_line(None, moment)
 
 
 def test_the_list_of_places_is_bounded_and_dashes_leave_gaps():

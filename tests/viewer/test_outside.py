@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import SHELL
-from splatnode.viewer.outside import cull_far_shell
-from splatnode.viewer.paint import paint_gaussians
+from splatnode.recon.result.snapshot import SHELL, GaussianArrays
+from splatnode.viewer.paint import cull_far_shell, paint_gaussians
 from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import look_at
 from tests.viewer.test_scene import K

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.result.bounds import Bounds, make_ball
-from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import GaussianArrays
+from splatnode.recon.result.verdict import Bounds, Scale, make_ball
 from splatnode.viewer.analysis import analyse
-from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.colours import source_colour
 from splatnode.viewer.paint import add_caption, blend_image, paint, paint_gaussians
 from splatnode.viewer.shapes import (
@@ -27,7 +25,7 @@ from splatnode.viewer.shapes import (
     shapes,
 )
 from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import move_to_camera
+from splatnode.viewer.viewpoint import BACKGROUND, move_to_camera
 from tests.viewer.test_scene import K, camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 

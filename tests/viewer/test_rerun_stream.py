@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.rerun_stream import NoRerunViewer, _check_listening, follow
+from splatnode.viewer.state import Moment
 from tests.support.exported import make_camera, make_snapshot
 
 

@@ -8,18 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export.selection import Selection
-from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.export.prepare import Selection
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import Scale
 from splatnode.viewer.analysis import Analyst
-from splatnode.viewer.canvas import project
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import (
     BINDINGS,
     Colouring,
     Engine,
+    Moment,
     ViewerState,
     current_moment,
     go_to_moment,
@@ -28,7 +27,7 @@ from splatnode.viewer.state import (
     open3d_draws,
     press,
 )
-from splatnode.viewer.viewpoint import orbit
+from splatnode.viewer.viewpoint import orbit, project
 from tests.viewer.test_scene import camera, moment, wall
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.viewer.ground import ground
-from splatnode.viewer.turntable import compute_arc, turntable_views
+from splatnode.viewer.pictures import compute_arc, turntable_views
+from splatnode.viewer.shapes import ground
 from splatnode.viewer.viewpoint import Viewpoint, overview
 from tests.viewer.test_scene import UP, camera, moment, wall
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from tests.viewer.test_session import Feed
 from tests.viewer.test_cli import snapshot
 from tests.viewer.test_scene import wall
-from splatnode.viewer.moment import Moment
+from splatnode.viewer.state import Moment
 from splatnode.viewer.session import Session
 from splatnode.viewer.state import BINDINGS, ViewerState
 from splatnode.viewer.window import show
@@ -83,7 +83,7 @@ WALK = """
 import os, signal, sys, time
 from dataclasses import replace
 from pathlib import Path
-from splatnode.viewer.map_source import Maps, MapSource
+from splatnode.viewer.sources import Maps, MapSource
 from splatnode.viewer.session import Session
 from splatnode.viewer.state import ViewerState
 from splatnode.viewer.window import show

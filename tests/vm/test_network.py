@@ -18,11 +18,10 @@ import pytest
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import keys
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.keyframes import KeyframeServer
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW
-from splatnode.capture.messaging.spool import Config, Spool
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, Network
+from splatnode.capture.messaging.pubsub import Publisher
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from tests.conftest import ROOT
 
 HERE, THERE = "10.213.7.1", "10.213.7.2"
@@ -35,9 +34,9 @@ DEAD_LINK_S = 3
 RECON = f"""
 import sys, pathlib
 from splatnode.capture.messaging import network
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.keyframes import KeyframeClient
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 from splatnode.capture.messaging.wire import Header
 network._DEAD_LINK_S = {DEAD_LINK_S}
 folder = pathlib.Path(sys.argv[1])
@@ -125,7 +124,7 @@ def test_a_link_that_is_cut_loses_and_doubles_nothing(tmp_path, link, end):
     network = networks(tmp_path)
     cut = ("ip", "link", "set", cable) if end == "here" else ("ip", "-n", name, "link", "set", f"sb{os.getpid()}"[:15])
     with (
-        KeyframeServer(network, Spool(Config(tmp_path / "state"))) as server,
+        KeyframeServer(network, Spool(SpoolConfig(tmp_path / "state"))) as server,
         Publisher(CAPTURE_PREVIEW, network),
         recon(tmp_path, name) as process,
     ):
@@ -150,7 +149,7 @@ def test_a_frame_that_takes_longer_than_a_dead_link_arrives_at_once(tmp_path, li
     if made.returncode != 0:
         pytest.skip(f"needs the kernel's tbf: {made.stderr.strip()}")
     with (
-        KeyframeServer(networks(tmp_path), Spool(Config(tmp_path / "state"))) as server,
+        KeyframeServer(networks(tmp_path), Spool(SpoolConfig(tmp_path / "state"))) as server,
         recon(tmp_path, name) as process,
     ):
         server.offer(Frame(0, "0.png", 0, IMAGE, None))
@@ -170,7 +169,7 @@ def test_a_slow_and_lossy_link_loses_and_doubles_nothing(tmp_path, link):
     if made.returncode != 0:
         pytest.skip(f"needs the kernel's netem: {made.stderr.strip()}")
     with (
-        KeyframeServer(networks(tmp_path), Spool(Config(tmp_path / "state"))) as server,
+        KeyframeServer(networks(tmp_path), Spool(SpoolConfig(tmp_path / "state"))) as server,
         recon(tmp_path, name) as process,
     ):
         for index in range(FRAMES):

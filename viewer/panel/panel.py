@@ -6,11 +6,7 @@ from collections.abc import Callable
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
-from splatnode.viewer.panel.controls import Change, Words, button
-from splatnode.viewer.panel.photographs_tab import PhotographsTab
-from splatnode.viewer.panel.scene_tab import SceneTab
-from splatnode.viewer.panel.show_tab import ShowTab
-from splatnode.viewer.panel.tools_tab import ToolsTab
+from splatnode.viewer.panel.tabs import Change, PhotographsTab, SceneTab, ShowTab, ToolsTab, Words, button
 from splatnode.viewer.session import Session
 
 _BUTTONS = (("Pause", "space"), ("Follow", "f"), ("Overview", "r"), ("Picture", "s"), ("Help", "h"))

@@ -9,25 +9,298 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hmac
 import ipaddress
 import json
 import logging
+import re
+import secrets
 import socket
 import socketserver
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs
 
+import cv2
+import numpy as np
+
 from splatnode.capture.process.crowd import network_of, next_to_go
-from splatnode.viewer.web.access import Access
-from splatnode.viewer.web.board import Board, BoardState
+from splatnode.capture.process.files import NotOwnerOnly, read_own, write_atomically
+from splatnode.capture.process.text import sanitize_text
+from splatnode.recon.result.export.formats.splat import encode_splat
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import Code
+from splatnode.viewer import text as viewer_text
+from splatnode.viewer.analysis import Advice
+from splatnode.viewer.colours import source_colour
+from splatnode.viewer.session import Session
+from splatnode.viewer.shapes import Lines, frustum_depth, ground, ground_lines, image_corners, shapes
+from splatnode.viewer.state import Moment, ViewerState
+from splatnode.viewer.viewpoint import Viewpoint, overview, scene_pivot
+
+# Who may look: on this machine's own address anybody on it, over a network who has the key.
+
+LOOPBACK = "127.0.0.1"
+_KEY = re.compile(r"[A-Za-z0-9_-]{32,128}")
+_KEY_BYTES = 32  # random ones, of a key
+_LARGEST = 1000  # bytes of a file with a key
+_OTHERS = 0o077
+
+
+@dataclass(frozen=True)
+class Access:
+    """The rules of one server."""
+
+    address: str  # numeric, that it listens on
+    port: int
+    key: str | None  # None: none is needed, which is so on a loopback address alone
+
+    def __post_init__(self) -> None:
+        if self.key is None and not ipaddress.ip_address(self.address).is_loopback:
+            raise ValueError(f"a key is needed to listen on {self.address}, which other machines can reach")
+
+    @property
+    def cookie(self) -> str:
+        """The name of the cookie that keeps the key: browsers send cookies to all ports of a machine alike."""
+        return f"splatnode_{self.port}"
+
+    def url(self, machine: str | None = None, key: str | None = None) -> str:
+        """Returns the URL for a browser: with the address or the `machine`'s name, and the key or its substitute."""
+        host = machine or (f"[{self.address}]" if ":" in self.address else self.address)
+        return f"http://{host}:{self.port}/" + (f"?key={key or self.key}" if self.key else "")
+
+    def is_allowed_host(self, host: str | None) -> bool:
+        """Whether a request was meant for this server.
+
+        Without a key only a name of the loopback address is, with any port, which ssh may have changed: a foreign page
+        whose name was made to lead here (DNS rebinding) has another name.
+        """
+        return self.key is not None or _is_loopback(host or "")
+
+    def is_key(self, text: str | None) -> bool:
+        """Compared in a time that tells nothing of where they differ."""
+        return self.key is not None and hmac.compare_digest((text or "").encode(errors="replace"), self.key.encode())
+
+    def is_authorized(self, authorization: str | None, cookies: str | None) -> bool:
+        """Whether a request has the key, in its cookie or as `Authorization: Bearer KEY`; any, where none is needed.
+
+        The arguments are the headers of those names.
+        """
+        scheme, _, bearer = (authorization or "").partition(" ")
+        is_told = scheme.lower() == "bearer" and self.is_key(bearer.strip())
+        return self.key is None or is_told or self.is_key(_cookie(cookies, self.cookie))
+
+
+def new_key() -> str:
+    return secrets.token_urlsafe(_KEY_BYTES)
+
+
+def load_or_create_key(path: Path) -> str:
+    """The key in the file; a new one, which the file gets, where there is none, or where it was cut to nothing.
+
+    Raises NotPrivate where others may read the file, ValueError for one that holds something else, OSError.
+    """
+    text = _read_key_file(path)
+    if not text:
+        write_atomically(path, [f"{new_key()}\n".encode()])
+        text = _read_key_file(path)
+    key = text.decode(errors="replace").strip()
+    if not _KEY.fullmatch(key):
+        raise ValueError(f"{path} must hold 32 to 128 letters, digits, - or _; remove it to get a new key")
+    return key
+
+
+def _read_key_file(path: Path) -> bytes:
+    """Returns the content of this user's file; nothing where it is not there."""
+    try:
+        text = read_own(path, _LARGEST, only_ours=True)
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return b""
+    if mode & _OTHERS:
+        raise NotOwnerOnly(f"others may read {path}. Run: chmod 600 {path}")
+    return text
+
+
+def _cookie(header: str | None, name: str) -> str | None:
+    """Finds one cookie: browsers send those of all programs on a machine, some of which no standard allows."""
+    parts = (part.partition("=") for part in (header or "").split(";"))
+    return next((value.strip() for found, _, value in parts if found.strip() == name), None)
+
+
+def _is_loopback(host: str) -> bool:
+    """Whether a Host header names the loopback address."""
+    found = re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[^:\[\]]+)(:[0-9]{1,5})?", host)
+    name = found[1].strip("[]").lower() if found else ""
+    try:
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
+
+
+# What the page draws, as bytes: Gaussians, cameras and lines, photographs.
+
+THUMBNAIL_SIDE = 256  # pixels, at least where the photograph has as many
+_QUALITY = 85  # of JPEG
+_NOTHING = ViewerState(
+    cameras=False, photographs=False, path=False, tracked=False, advice=False, uncertainty=False, graph=False
+)
+# Groups of lines that the page shows or hides; the names are fields of State. "ground" is one more.
+_GROUPS = ("cameras", "path", "advice", "uncertainty", "graph")
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """A moment with what is known beside it. Bytes are made when somebody first asks for them."""
+
+    moment: Moment
+    advice: Advice | None
+
+    @cached_property
+    def gaussians(self) -> bytes:
+        """The Gaussians as a .splat file: 32 bytes each."""
+        return encode_splat(self.moment.snapshot.gaussians)
+
+    @cached_property
+    def shapes(self) -> bytes:
+        """Four bytes with the length of a JSON text, the text, and the lines' ends as float32, little-endian.
+
+        The text has the cameras, the viewpoints to start from, and where in the numbers each group of lines is.
+        """
+        named = [(name, _lines_of_group(self, name)) for name in _GROUPS] + [
+            ("ground", ground_lines(ground(self.moment)))
+        ]
+        parts, told, at = [], [], 0
+        for name, group in named:
+            for lines in group:
+                ends = lines.ends.astype("<f4")
+                parts.append(ends.tobytes())
+                told.append({"group": name, "at": at, "count": len(ends), "colour": lines.colour, "width": lines.width})
+                at += ends.size
+        text = json.dumps(_describe_scene(self) | {"lines": told}, allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        return b"".join([len(text).to_bytes(4, "little"), text, *parts])
+
+    def encode_image(self, index: int, *, small: bool) -> bytes | None:
+        """The JPEG of the camera at `index`, at its size or as a thumbnail; None where there is none."""
+        cameras = self.moment.snapshot.cameras
+        image = self.moment.snapshot.images.get(cameras[index].name) if 0 <= index < len(cameras) else None
+        if image is None:
+            return None
+        scale = min(1.0, THUMBNAIL_SIDE / max(image.shape[:2])) if small else 1.0
+        size = max(1, round(scale * image.shape[1])), max(1, round(scale * image.shape[0]))
+        resized = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        done, data = cv2.imencode(
+            ".jpg", cv2.cvtColor(resized, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+        )
+        return data.tobytes() if done else None
+
+
+def _lines_of_group(content: Content, name: str) -> tuple[Lines, ...]:
+    """The lines of one group; those of the cameras are one for each, in their order."""
+    state = replace(_NOTHING, **{name: True})
+    return shapes(content.moment, state, content.advice).lines
+
+
+def live_camera_ends(moment: Moment, tracked: CameraEstimate | None) -> list[float]:
+    """The ends of the live camera's lines, six numbers each; none where it is not known."""
+    lines = shapes(moment, replace(_NOTHING, tracked=True), None, tracked).lines
+    return [round(number, 6) for each in lines for number in each.ends.ravel().tolist()]
+
+
+def _describe_scene(content: Content) -> dict[str, Any]:
+    moment = content.moment
+    snapshot = moment.snapshot
+    start = overview(moment, (content.advice.arrow if content.advice else None) or ())
+    depth = frustum_depth(moment)
+    return {
+        "scene": moment.scene_id,
+        "num_gaussians": len(snapshot.gaussians),
+        "up": start.up.tolist(),
+        "pivot": scene_pivot(moment).tolist(),
+        "overview": _viewpoint(start),
+        "frustum_depth": depth,
+        "cameras": [
+            {
+                "name": sanitize_text(camera.name),
+                "colour": source_colour(index),
+                "T_world_camera": camera.T_world_camera.ravel().tolist(),
+                "K": camera.K.ravel().tolist(),
+                "size": [camera.width, camera.height],
+                "corners": image_corners(camera, camera.T_world_camera, depth).tolist(),
+                "photograph": camera.name in snapshot.images,
+            }
+            for index, camera in enumerate(snapshot.cameras)
+        ],
+    }
+
+
+def _viewpoint(view: Viewpoint) -> dict[str, Any]:
+    K, width, height = view.lens
+    return {
+        "T_world_camera": np.ravel(view.T_world_camera).tolist(),
+        "K": np.ravel(K).tolist(),
+        "size": [width, height],
+        "distance": view.distance,
+    }
+
+
+# The newest there is to see, for any number of visitors who wait for it.
+
+
+@dataclass(frozen=True, eq=False)
+class BoardState:
+    """One state of what is shown; `number` counts them. Versions tell what of it is new."""
+
+    number: int
+    said: dict[str, Any]
+    live: bool = False  # more may come
+    content: Content | None = None  # None: nothing has come yet
+    gaussians: int = 0  # version
+    shapes: int = 0  # version
+
+
+class Board:
+    """One writer replaces what is shown, whole; readers take it or wait for another."""
+
+    def __init__(self) -> None:
+        self.run = secrets.token_hex(8)  # of this server: after another start, numbers begin anew
+        self._shown = BoardState(0, {})
+        self._changed = threading.Condition()
+
+    @property
+    def current(self) -> BoardState:
+        return self._shown
+
+    def publish(self, said: dict[str, Any], content: Content | None, *, live: bool) -> None:
+        """Shows this from now on, if it is not what is shown already."""
+        before = self._shown
+        if said == before.said and content is before.content:
+            return
+        gaussians, shapes = before.gaussians, before.shapes
+        if content is not None and content is not before.content:
+            known = before.content.moment.snapshot.gaussians if before.content else None
+            gaussians += content.moment.snapshot.gaussians is not known
+            shapes += 1
+        with self._changed:
+            self._shown = BoardState(before.number + 1, said, live, content, gaussians, shapes)
+            self._changed.notify_all()
+
+    def wait(self, run: str, number: int, timeout_s: float) -> BoardState:
+        """Returns the current state once it differs from `number` of `run`, or after `timeout_s`."""
+        with self._changed:
+            self._changed.wait_for(lambda: (run, number) != (self.run, self._shown.number), timeout_s)
+            return self._shown
+
 
 log = logging.getLogger(__name__)
 
@@ -266,3 +539,39 @@ def _pages() -> dict[str, tuple[str, bytes]]:
     files = resources.files("splatnode.viewer.web").joinpath("page").iterdir()
     found = {f"/{file.name}": (_TYPES[file.name.rpartition(".")[2]], file.read_bytes()) for file in files}
     return found | {"/": found["/index.html"]}
+
+
+# What the page says beside the picture, in the words of the window's panel.
+
+_MOST_DROPPED = 200  # photographs that are listed
+_MOST_VIEWS = 100  # whose share of confirmed depth is listed
+_LONGEST = 2000  # characters of a line
+
+
+def describe_session(session: Session) -> dict[str, Any]:
+    """Headings and their lines, every one printable; `good`: whether the verdict is."""
+    moment, age = session.moment, session.source.age_s
+    if moment is None:
+        return {"good": None, "state": viewer_text.waiting_line(age), "verdict": [], "sections": []}
+    snapshot, analysis = moment.snapshot, session.analysis()
+    sections = [
+        ("Next view", [viewer_text.advice_line(analysis.advice if analysis else None, moment)]),
+        ("How well it is known", [*viewer_text.bounds_lines(moment), *viewer_text.depth_lines(moment)]),
+        ("Depth that other views confirm", viewer_text.view_depth_lines(moment, _MOST_VIEWS)),
+        ("Places", viewer_text.place_lines(moment)),
+        ("What there is", viewer_text.count_lines(moment)),
+        (f"Photographs left out: {len(snapshot.dropped)}", viewer_text.rejection_lines(moment, _MOST_DROPPED)),
+    ]
+    kind = "final" if snapshot.final else "provisional: the scene is still being made"
+    return {
+        "good": snapshot.verdict.code is Code.OK,
+        "state": f"{viewer_text.feed_line(age, snapshot.final)}; {kind}"
+        if age is not None
+        else viewer_text.feed_line(age, True),
+        "verdict": [_line(line) for line in viewer_text.verdict_lines(moment)],
+        "sections": [[heading, [_line(line) for line in lines]] for heading, lines in sections if lines],
+    }
+
+
+def _line(text: str) -> str:
+    return sanitize_text(text, _LONGEST)

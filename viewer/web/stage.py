@@ -13,11 +13,17 @@ from typing import Any, NoReturn
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import Source
 from splatnode.viewer.state import ViewerState
-from splatnode.viewer.web.access import LOOPBACK, Access, load_or_create_key, new_key
-from splatnode.viewer.web.board import Board
-from splatnode.viewer.web.content import Content, live_camera_ends
-from splatnode.viewer.web.said import describe_session
-from splatnode.viewer.web.server import Server
+from splatnode.viewer.web.server import (
+    LOOPBACK,
+    Access,
+    Board,
+    Content,
+    Server,
+    describe_session,
+    live_camera_ends,
+    load_or_create_key,
+    new_key,
+)
 
 PORT = 8347
 _TICK_S = 0.05

@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.process.memory_shortage import is_shortage
+from splatnode.capture.process.system import is_shortage
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.checkpoint import saved, saved_estimate
+from splatnode.recon.daemon.checkpoint import store as checkpoint_store
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.frames.screening import ScreeningState
@@ -33,22 +33,22 @@ class RestoredReconstruction:
 
 def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     """Keeps what `work` knows; whether its scene is `final`. Raises OSError."""
-    store.save("graph", *saved.make_graph_message(work.graph))
+    store.save("graph", *checkpoint_store.make_graph_message(work.graph))
     save_fallbacks(store, work)
     estimate = work.find_reconstruction()
     # Cameras that given poses hold have no evidence, and are estimated anew after a restart.
     if estimate is not None and estimate.publishable and estimate.evidence is not None:
-        store.save("judgement", *saved_estimate.make_reconstruction_message(estimate, work.publishable_names))
+        store.save("judgement", *checkpoint_store.make_reconstruction_message(estimate, work.publishable_names))
     if work.scene is not None:
-        store.save("pointmaps", *saved_estimate.make_pointmaps_message(work.state.pointmaps))
-        store.save("scene", *saved.make_scene_message(work.scene, final))
+        store.save("pointmaps", *checkpoint_store.make_pointmaps_message(work.state.pointmaps))
+        store.save("scene", *checkpoint_store.make_scene_message(work.scene, final))
 
 
 def save_fallbacks(store: Store, work: IncrementalReconstruction) -> None:
     """Keeps which fallbacks gained nothing. Raises OSError."""
     fruitless = work.state.memory.fruitless
     if fruitless:
-        store.save("fallbacks", saved_estimate.FallbacksRecord(list(fruitless)), [])
+        store.save("fallbacks", checkpoint_store.FallbacksRecord(list(fruitless)), [])
 
 
 def restore(store: Store, config: ReconstructionConfig) -> RestoredReconstruction:
@@ -71,10 +71,10 @@ def restore(store: Store, config: ReconstructionConfig) -> RestoredReconstructio
 
 def load_graph(store: Store, config: ReconstructionConfig) -> ViewGraph:
     """The view graph that the checkpoint holds; an empty one where it holds none. Raises OSError."""
-    record = store.load("graph", saved.GraphRecord)
+    record = store.load("graph", checkpoint_store.GraphRecord)
     if record is None:
         return ViewGraph(config.matching)
-    before = saved.parse_graph(record)
+    before = checkpoint_store.parse_graph(record)
     keyframes = _prepare_keyframes(store, [stored.frame for stored in store.frames()], config, before.features)
     return _make_graph(config, [keyframe for name, keyframe in keyframes.items() if name in before.features], before)
 
@@ -99,27 +99,29 @@ def _prepare_keyframes(
 def _restore_reconstruction(
     store: Store, frames: Sequence[Frame], config: ReconstructionConfig
 ) -> RestoredReconstruction:
-    record = store.load("graph", saved.GraphRecord)
-    before = saved.parse_graph(record) if record is not None else saved.SavedGraph({}, {}, [])
+    record = store.load("graph", checkpoint_store.GraphRecord)
+    before = checkpoint_store.parse_graph(record) if record is not None else checkpoint_store.SavedGraph({}, {}, [])
     keyframes = _prepare_keyframes(store, frames, config, before.features)
-    record = store.load("scene", saved.SceneRecord)
-    scene = saved.parse_scene(record, keyframes) if record is not None else None
+    record = store.load("scene", checkpoint_store.SceneRecord)
+    scene = checkpoint_store.parse_scene(record, keyframes) if record is not None else None
     final = record is not None and record.header.final and scene is not None
-    record = store.load("pointmaps", saved_estimate.PointmapsRecord)
+    record = store.load("pointmaps", checkpoint_store.PointmapsRecord)
     graph = _make_graph(config, [keyframes[name] for name in keyframes if name in before.features], before)
     known = StreamState(
         graph,
         beside=ViewGraph(config.matching),
         screened=_screen_keyframes(graph),
         memory=_load_memory(store, graph),
-        pointmaps=saved_estimate.parse_pointmaps(record, keyframes) if record is not None else {},
+        pointmaps=checkpoint_store.parse_pointmaps(record, keyframes) if record is not None else {},
         show=prepare_scene_for_display(scene, config),
     )
     new = [keyframe for name, keyframe in keyframes.items() if name not in before.features]
     return RestoredReconstruction(IncrementalReconstruction(config, known), len(keyframes), new, final)
 
 
-def _make_graph(config: ReconstructionConfig, keyframes: Sequence[Keyframe], before: saved.SavedGraph) -> ViewGraph:
+def _make_graph(
+    config: ReconstructionConfig, keyframes: Sequence[Keyframe], before: checkpoint_store.SavedGraph
+) -> ViewGraph:
     """The view graph of the keyframes, with what an earlier process knew of their pairs."""
     position = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
     pairs = {(position[i], position[j]): pair for (i, j), pair in before.pairs.items() if {i, j} <= position.keys()}
@@ -136,10 +138,10 @@ def _screen_keyframes(graph: ViewGraph) -> ScreeningState:
 
 def _load_memory(store: Store, graph: ViewGraph) -> ReconstructionCache:
     """Loads the estimate of exactly these keyframes, if there is one, and the fruitless fallbacks."""
-    record = store.load("fallbacks", saved_estimate.FallbacksRecord)
+    record = store.load("fallbacks", checkpoint_store.FallbacksRecord)
     memory = ReconstructionCache(fruitless=() if record is None else tuple(record.header.fruitless))
-    record = store.load("judgement", saved_estimate.ReconstructionRecord)
+    record = store.load("judgement", checkpoint_store.ReconstructionRecord)
     if record is None or record.header.names != graph.names:
         return memory
-    estimate, proven = saved_estimate.parse_reconstruction(record, graph), frozenset(record.header.proven)
+    estimate, proven = checkpoint_store.parse_reconstruction(record, graph), frozenset(record.header.proven)
     return replace(memory, recent=(((tuple(graph.names), 0), estimate),), proven=proven)

@@ -22,25 +22,53 @@ import itertools
 import logging
 import threading
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
 
-from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
-from splatnode.capture.process.durable import remove_leftovers
-from splatnode.capture.process.lock import LockHeld, exclusive
-from splatnode.capture.process.memory_shortage import raise_shortage
-from splatnode.capture.process.printable import LONGEST_NAME, sanitize_text
-from splatnode.capture.process.private import list_own_files, make_owner_only_folder
-from splatnode.recon.daemon.checkpoint import left, made_anew
-from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger, ensure_identity, write_ledger
-from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
-from splatnode.recon.daemon.checkpoint.stored_frame import FILE, StoredFrame, file_name, read_frame, write_frame
+from splatnode.capture.process.files import (
+    LockHeld,
+    exclusive,
+    list_own_files,
+    make_owner_only_folder,
+    remove_leftovers,
+)
+from splatnode.capture.process.records import record_of
+from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
+from splatnode.recon.daemon.checkpoint import records
+from splatnode.recon.daemon.checkpoint.records import (
+    FRAME_FILE,
+    MADE_ANEW,
+    CheckpointError,
+    Ledger,
+    StoredFrame,
+    ensure_identity,
+    file_name,
+    read_frame,
+    write_frame,
+    write_ledger,
+)
+from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.registration.undistortion import undistort_keyframe
+from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.scene import exposure as scene_exposure
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+from splatnode.recon.verification.evidence import Evidence
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +99,7 @@ class Store:
         remove_leftovers(directory)
         remove_leftovers(self._frames)
         self.ledger = ensure_identity(directory)
-        left.remove_incomplete(directory, self.ledger.place)
+        records.remove_incomplete(directory, self.ledger.place)
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
         self._next = self.ledger.next
@@ -120,7 +148,7 @@ class Store:
 
     def _read_frames(self) -> Iterator[StoredFrame]:
         """The stored frames; a damaged one is renamed and logged, one that is there already left alone."""
-        for path in list_own_files(self._frames, FILE, ".frame"):
+        for path in list_own_files(self._frames, FRAME_FILE, ".frame"):
             number = int(path.stem)
             try:
                 self._next = max(self._next, number + 1)
@@ -186,7 +214,7 @@ class Store:
             frames = [f"frames/{file_name(number)}" for number in own]
             made = [name for name in MADE_ANEW if (self.directory / name).exists()]
             ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None, retracted=())
-            left.link_left_checkpoint(self.directory, ledger, [*frames, *made], _INSTEAD)
+            records.link_left_checkpoint(self.directory, ledger, [*frames, *made], _INSTEAD)
             self.begin_submap(first, shared)
 
     def split_off(self, names: Collection[str], present: bool = False) -> str:
@@ -206,7 +234,7 @@ class Store:
             }
             ledger = msgspec.structs.replace(self.ledger, next=self._next, identity=None, retracted=(), **began)
             frames = [f"frames/{file_name(number)}" for number in numbers]
-            left.link_split_checkpoint(self.directory, ledger, frames, _INSTEAD, present)
+            records.link_split_checkpoint(self.directory, ledger, frames, _INSTEAD, present)
             for name in names:
                 self.forget(name, f"it shows another place: {ledger.scene_id}")
             return ledger.scene_id
@@ -218,7 +246,7 @@ class Store:
         """
         with self._writing:
             # First: what a death leaves of the place before can be made anew, of this one not.
-            made_anew.remove(self.directory, *MADE_ANEW)
+            records.remove_rebuild_requests(self.directory, *MADE_ANEW)
             before = {number: name for name, number in self._names.items() if number < first}
             gone = (*self.ledger.gone, *(self._keys[number] for number in before))
             place = self.ledger.place + 1
@@ -229,22 +257,22 @@ class Store:
 
     def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:
         """Writes one of the files that can be made anew. Raises OSError."""
-        made_anew.save(self.directory, name, header, arrays)
+        records.save(self.directory, name, header, arrays)
 
     def load(self, name: str, schema: Any) -> Message[Any] | None:
         """Loads what `save` wrote under this name; None where it is missing or damaged."""
-        return made_anew.load(self.directory, name, schema)
+        return records.load(self.directory, name, schema)
 
     def remove_scene_files(self) -> None:
         """Removes what only a scene that grows has need of. Raises OSError."""
-        made_anew.remove(self.directory, *made_anew.SHOWN)
+        records.remove_rebuild_requests(self.directory, *records.SHOWN)
 
     def finalize(self) -> None:
         """Takes a place that was left among the finished ones. Nothing is read or written here afterwards.
 
         Raises OSError.
         """
-        left.move_to_finished(self.directory, _INSTEAD)
+        records.move_to_finished(self.directory, _INSTEAD)
 
     def _drop_frame(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
         ledger = self.ledger
@@ -286,3 +314,248 @@ class Store:
     def _write(self, ledger: Ledger) -> None:
         write_ledger(self.directory, ledger)
         self.ledger = ledger
+
+
+# The view graph and the scene as messages for the checkpoint.
+
+T = TypeVar("T")
+Numbers = dict[str, bool | int | float | None]
+
+
+class GraphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: those of each keyframe's features, then those of each pair, in the order of their fields."""
+
+    names: list[str]
+    features: list[Numbers]
+    pairs: list[tuple[int, int, Numbers]]
+    pending: list[tuple[int, int]]  # that have not been compared
+
+
+class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: Ts_world_camera (C, 4, 4), Ks (C, 3, 3), then those of the Gaussians in the order of their fields."""
+
+    views: list[str]  # their names
+    iterations: int
+    final: bool
+    lenses: list[Intrinsics | None] = []  # estimated, of each view; empty: of none
+    gains: list[tuple[float, float, float] | None] = []  # of each view's photograph over its image; empty: of none
+    falloffs: list[float] = []  # of each view's lens; empty: none dims its corners
+    headroom: float = 1.0
+    consistent_depth: list[float | None] = []  # share of each view's pixels; empty: not known of any
+
+
+def make_graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
+    """Header and arrays of the message that holds `graph`."""
+    features = [flatten_dataclass(keyframe.features) for keyframe in graph.keyframes]
+    pairs = {key: flatten_dataclass(pair) for key, pair in graph.pairs.items()}
+    header = GraphRecord(
+        names=[keyframe.name for keyframe in graph.keyframes],
+        features=[numbers for numbers, _ in features],
+        pairs=[(*key, numbers) for key, (numbers, _) in pairs.items()],
+        pending=sorted(graph.pending),
+    )
+    return header, [array for _, arrays in (*features, *pairs.values()) for array in arrays]
+
+
+@dataclass(frozen=True, eq=False)
+class SavedGraph:
+    """Features and pairs by the names of their keyframes."""
+
+    features: dict[str, Features]
+    pairs: dict[tuple[str, str], TwoView]
+    pending: list[tuple[str, str]]
+
+
+def parse_graph(message: Message[GraphRecord]) -> SavedGraph:
+    """Parses the message of `make_graph_message`. Raises ValueError where another version wrote it."""
+    names, arrays = message.header.names, iter(message.arrays)
+    features = [unflatten_dataclass(Features, numbers, arrays) for numbers in message.header.features]
+    pairs = {
+        (names[i], names[j]): unflatten_dataclass(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs
+    }
+    pending = [(names[i], names[j]) for i, j in message.header.pending]
+    return SavedGraph(dict(zip(names, features, strict=True)), pairs, pending)
+
+
+def make_scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:
+    """Header and arrays of the message that holds `scene`; `final`: it is finished."""
+    views = [view.name for view in scene.views]
+    cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
+    gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
+    lenses = [view.lens for view in scene.views]
+    gains = [view.exposure and view.exposure.gains for view in scene.views]
+    falloffs = [view.exposure.falloff if view.exposure else 0.0 for view in scene.views]
+    shares = [view.consistent_depth for view in scene.views]
+    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs, scene.headroom, shares)
+    return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
+
+
+def parse_scene(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
+    """The scene that was saved; None where a frame of it is gone. Raises ValueError as `parse_graph`."""
+    header = message.header
+    if any(name not in keyframes for name in header.views):
+        return None
+    if len(message.arrays) != 2 + len(fields(Gaussians)):
+        raise ValueError(f"a scene of {len(message.arrays)} arrays is of another version")
+    Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
+    lenses = header.lenses or [None] * len(header.views)
+    gains = header.gains or [None] * len(header.views)
+    falloffs = header.falloffs or [0.0] * len(header.views)
+    views = tuple(
+        _make_view(
+            keyframes[name] if lens is None else undistort_keyframe(keyframes[name], lens), own, T_world_camera, K
+        )
+        for name, lens, own, T_world_camera, K in zip(
+            header.views, lenses, zip(gains, falloffs, strict=True), Ts_world_camera, Ks, strict=True
+        )
+    )
+    shares = header.consistent_depth or [None] * len(views)
+    views = tuple(replace(view, consistent_depth=share) for view, share in zip(views, shares, strict=True))
+    return Scene(views, Gaussians(*gaussians), header.iterations, headroom=header.headroom)
+
+
+def _make_view(
+    keyframe: Keyframe,
+    told: tuple[tuple[float, float, float] | None, float],
+    T_world_camera: torch.Tensor,
+    K: torch.Tensor,
+) -> TrainingView:
+    """`told`: the photograph's gains, and its lens's falloff."""
+    image, exposure = scene_exposure.compensate_image(keyframe.image, *told)
+    shown = keyframe.name, keyframe.frame.frame_id, image
+    return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, exposure=exposure, lens=keyframe.lens)
+
+
+def flatten_dataclass(value: Any) -> tuple[Numbers, list[npt.NDArray]]:
+    """A flat dataclass as its numbers and its arrays."""
+    content = {field.name: getattr(value, field.name) for field in fields(value)}
+    arrays = [part for part in content.values() if isinstance(part, np.ndarray)]
+    return {name: _convert_number(part) for name, part in content.items() if not isinstance(part, np.ndarray)}, arrays
+
+
+def _convert_number(number: Any) -> bool | int | float | None:
+    return number.item() if isinstance(number, np.generic) else number
+
+
+def unflatten_dataclass(kind: type[T], numbers: Numbers, arrays: Any) -> T:
+    """Inverse of `flatten_dataclass`; takes from `arrays` as many as it needs.
+
+    Raises ValueError where they do not fit.
+    """
+    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
+    if not set(numbers) <= set(names):
+        raise ValueError(f"a {kind.__name__} with {', '.join(sorted(numbers))} is of another version")
+    try:
+        return kind(**numbers, **{name: next(arrays) for name in names if name not in numbers})
+    except (StopIteration, RuntimeError) as error:
+        raise ValueError(f"arrays of a {kind.__name__} are missing") from error
+
+
+# What is known of a scene's cameras and depths, as messages for the checkpoint: a restart need not find it again.
+
+OF_REGISTRATION = ("points", "observed_by", "observed_point", "observed_pixels")
+OF_POINTMAP = ("depth", "confidence", "normal", "T_world_camera", "K", "unchecked")
+
+
+class ReconstructionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: those of each camera in the order of their fields, then OF_REGISTRATION."""
+
+    names: list[str]  # of the keyframes, as the cameras number them
+    proven: list[str]
+    verdict: Verdict
+    evidence: Evidence
+    cameras: list[Numbers]
+    inlier_ratios: list[tuple[int, int, float]]
+    numbers: Numbers  # of the registration
+
+
+class FallbacksRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Fallbacks that gained nothing, as recon.memory.Memory has them."""
+
+    fruitless: list[tuple[str, str]]
+
+
+class PointmapsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: OF_POINTMAP for each; depths as half floats, confidence and normals in 256 steps.
+
+    `unchecked` is empty where there is none.
+    """
+
+    names: list[str]
+
+
+def make_reconstruction_message(
+    estimate: Reconstruction, proven: Collection[str]
+) -> tuple[ReconstructionRecord, list[npt.NDArray]]:
+    """Makes the message, without depth. Raises ValueError where cameras or evidence are missing."""
+    registration, evidence = estimate.registration, estimate.evidence
+    if registration is None or evidence is None:
+        raise ValueError("only an estimate with cameras and evidence is kept")
+    cameras = [flatten_dataclass(camera) for camera in registration.cameras]
+    kept = {field.name: getattr(registration, field.name) for field in fields(registration)}
+    record = ReconstructionRecord(
+        names=estimate.graph.names,
+        proven=sorted(proven),
+        verdict=estimate.verdict,
+        evidence=record_of(msgspec.to_builtins(evidence, enc_hook=lambda number: number.item()), Evidence),
+        cameras=[numbers for numbers, _ in cameras],
+        inlier_ratios=[(int(i), int(j), float(ratio)) for (i, j), ratio in registration.inlier_ratios.items()],
+        numbers={name: float(value) for name, value in kept.items() if isinstance(value, (int, float))},
+    )
+    arrays = [array for _, of_camera in cameras for array in of_camera]
+    return record, [*arrays, *(kept[name] for name in OF_REGISTRATION)]
+
+
+def parse_reconstruction(message: Message[ReconstructionRecord], graph: ViewGraph) -> Reconstruction:
+    """Parses a message of `make_reconstruction_message`. Raises ValueError where another version wrote it."""
+    header, arrays = message.header, iter(message.arrays)
+    cameras = tuple(_parse_camera(numbers, arrays) for numbers in header.cameras)
+    inlier_ratios = {(i, j): ratio for i, j, ratio in header.inlier_ratios}
+    content: dict[str, Any] = {"cameras": cameras, "inlier_ratios": inlier_ratios, **header.numbers}
+    try:
+        registration = Registration(**content, **dict(zip(OF_REGISTRATION, arrays, strict=True)))
+    except TypeError as error:
+        raise ValueError("an estimate of another version") from error
+    return Reconstruction(graph, registration, header.evidence, header.verdict)
+
+
+def _parse_camera(numbers: Numbers, arrays: Iterator[npt.NDArray]) -> RegisteredCamera:
+    """Parses a camera; up to version 6 a lens had one radial coefficient, a number."""
+    camera = unflatten_dataclass(RegisteredCamera, numbers, arrays)
+    if "radial" not in numbers:
+        return camera
+    return replace(camera, radial=np.array([numbers["radial"], 0.0], np.float64))
+
+
+def make_pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecord, list[npt.NDArray]]:
+    arrays = []
+    for pointmap in pointmaps.values():
+        depth = pointmap.depth.astype(np.float16).view(np.uint16)
+        confidence = np.rint(255 * pointmap.confidence).astype(np.uint8)
+        normal = np.rint(127 * pointmap.normal + 128).astype(np.uint8)
+        unchecked = np.zeros((0, 0), np.float16) if pointmap.unchecked is None else pointmap.unchecked
+        arrays += [depth, confidence, normal, pointmap.T_world_camera, pointmap.K, unchecked.view(np.uint16)]
+    return PointmapsRecord(list(pointmaps)), arrays
+
+
+def parse_pointmaps(message: Message[PointmapsRecord], keyframes: Mapping[str, Keyframe]) -> dict[str, Pointmap]:
+    """The point maps of those keyframes that there are. Raises ValueError as `parse_reconstruction`."""
+    names, arrays = message.header.names, message.arrays
+    if len(arrays) != len(OF_POINTMAP) * len(names):
+        raise ValueError(f"{len(names)} point maps with {len(arrays)} arrays are of another version")
+    found = {}
+    for index, name in enumerate(names):
+        if name not in keyframes:
+            continue
+        depth, confidence, normal, T_world_camera, K, unchecked = arrays[len(OF_POINTMAP) * index :][: len(OF_POINTMAP)]
+        found[name] = Pointmap(
+            name=name,
+            frame_id=keyframes[name].frame.frame_id,
+            depth=np.asarray(depth.view(np.float16), np.float32),
+            confidence=np.asarray(confidence / 255, np.float32),
+            normal=np.asarray((normal - 128.0) / 127, np.float32),
+            T_world_camera=np.array(T_world_camera),
+            K=np.array(K),
+            unchecked=np.array(unchecked).view(np.float16) if unchecked.size else None,
+        )
+    return found

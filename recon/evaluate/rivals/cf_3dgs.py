@@ -23,19 +23,18 @@ from torch import Tensor
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
-from splatnode.recon.evaluate.appearance import GaussianAppearance
-from splatnode.recon.evaluate.rivals import colmap_3dgs, known_depth, outcome
-from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
-from splatnode.recon.evaluate.test_pose import find_test_pose
-from splatnode.recon.optimize import refinement
+from splatnode.recon.evaluate.protocol import find_test_pose
+from splatnode.recon.evaluate.regions import GaussianAppearance
+from splatnode.recon.evaluate.rivals import colmap_3dgs, outcome
+from splatnode.recon.evaluate.rivals.outcome import FrameWithDepth
+from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors.pointmap import compute_world_points
 from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.points import gaussians_at
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.scene.initialization import gaussians_at
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -60,7 +59,7 @@ _TOGETHER = msgspec.structs.replace(
 def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None) -> Iterator[Snapshot]:
     """Snapshots of the scene while all frames refine it; one refusal where fewer than three have a depth."""
     settings = config or Config()
-    return known_depth.optimize_with_depth(
+    return outcome.optimize_with_depth(
         frames, seed, lambda known, clock: _reconstruct_frame_by_frame(frames, known, seed, settings, clock)
     )
 
@@ -75,7 +74,7 @@ def _reconstruct_frame_by_frame(
         scene = _refine_scene(scene, _TOGETHER, config.growing, seed)
     clock.lap("poses")
     together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
-    refined = refinement.refine(scene, colmap_3dgs.scale_rates_to_extent(together, scene), seed=seed)
+    refined = training.refine(scene, colmap_3dgs.scale_rates_to_extent(together, scene), seed=seed)
     yield from (outcome.make_snapshot(frames, each) for each in refined)
 
 
@@ -114,12 +113,12 @@ class _SingleFrameAppearance(GaussianAppearance):
         return ((render.rgb - image).abs() * covered).sum() / (3 * covered.sum().clamp_min(1))
 
 
-def _refine_scene(scene: Scene, config: refinement.RefinementConfig, iterations: int, seed: int) -> Scene:
+def _refine_scene(scene: Scene, config: training.RefinementConfig, iterations: int, seed: int) -> Scene:
     """One view has no extent: lengths are then in parts of its depth, which is about 1."""
     config = msgspec.structs.replace(config, iterations=iterations)
     if len(scene.views) > 1:
         config = colmap_3dgs.scale_rates_to_extent(config, scene)
-    (last,) = deque(refinement.refine(scene, config, seed=seed), maxlen=1)
+    (last,) = deque(training.refine(scene, config, seed=seed), maxlen=1)
     return last
 
 

@@ -21,17 +21,17 @@ from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.colmap import RegisteredFrame, SparseModel, reconstruct_sparse_model
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
-from splatnode.recon.optimize import dropout, refinement
+from splatnode.recon.optimize import ensemble, training
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.points import gaussians_at
+from splatnode.recon.scene.initialization import gaussians_at
 from splatnode.recon.scene.scene import Scene, TrainingView
 
 SIZE = 512  # longer side of the photographs, pixels
 _OPACITY = 0.1  # of a Gaussian that starts from a point
 
-RATES = refinement.LearningRates(
+RATES = training.LearningRates(
     means=1.6e-4,  # times the extent of the scene
     means_unit="depth",
     quats=1e-3,
@@ -41,11 +41,11 @@ RATES = refinement.LearningRates(
     final_means=0.01,
     final=1.0,
 )
-OPTIMIZE = refinement.RefinementConfig(
+OPTIMIZE = training.RefinementConfig(
     iterations=1500,
     checkpoints=(250, 900),
     dssim=0.2,
-    dropout=dropout.DropoutConfig(share=0.0),
+    dropout=ensemble.DropoutConfig(share=0.0),
     refine_poses=False,
     rates=RATES,
     control=ControlChoice("adaptive", adaptive.Config()),
@@ -64,9 +64,7 @@ PUBLISHED = msgspec.structs.replace(
 )
 
 
-def reconstruct(
-    frames: Sequence[Frame], seed: int, config: refinement.RefinementConfig = OPTIMIZE
-) -> Iterator[Snapshot]:
+def reconstruct(frames: Sequence[Frame], seed: int, config: training.RefinementConfig = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the scene while it is optimised; one refusal where COLMAP places fewer than three frames."""
     yield from optimize_sparse_model(frames, seed, config, initialize_scene)
 
@@ -74,7 +72,7 @@ def reconstruct(
 def optimize_sparse_model(
     frames: Sequence[Frame],
     seed: int,
-    config: refinement.RefinementConfig,
+    config: training.RefinementConfig,
     beginning: Callable[[SparseModel, int], Scene],
 ) -> Iterator[Snapshot]:
     """The same from what `beginning` makes of COLMAP's model and the seed."""
@@ -86,7 +84,7 @@ def optimize_sparse_model(
         return
     scene = beginning(model, seed)
     clock.lap("points")
-    refined = refinement.refine(scene, scale_rates_to_extent(config, scene), seed=seed)
+    refined = training.refine(scene, scale_rates_to_extent(config, scene), seed=seed)
     yield from outcome.number_snapshots((outcome.make_snapshot(frames, each) for each in refined), clock)
 
 
@@ -119,7 +117,7 @@ def make_training_view(registered: RegisteredFrame) -> TrainingView:
     )
 
 
-def scale_rates_to_extent(config: refinement.RefinementConfig, scene: Scene) -> refinement.RefinementConfig:
+def scale_rates_to_extent(config: training.RefinementConfig, scene: Scene) -> training.RefinementConfig:
     """The configuration with the means' step size in parts of the extent of the scene."""
     means = config.rates.means * adaptive.extent([view.T_world_camera for view in scene.views])
     return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, means=means))

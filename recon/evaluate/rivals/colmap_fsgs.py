@@ -17,7 +17,7 @@ import msgspec
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.rivals import colmap_3dgs
 from splatnode.recon.evaluate.rivals.colmap import SparseModel
-from splatnode.recon.optimize import refinement, regularise
+from splatnode.recon.optimize import regularizers, training
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.optimize.losses import depth
@@ -28,7 +28,7 @@ from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene
 
 _WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correlates it
-_DEPTH = regularise.RegularizerConfig(
+_DEPTH = regularizers.RegularizerConfig(
     {"depth": LossChoice("depth", depth.Config(0.05, 0.2, 0.95, patch=_WHOLE, share=1.0))}, min_confidence=0.1
 )
 _ADAPTIVE = adaptive.Config(min_gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER)
@@ -41,9 +41,7 @@ PUBLISHED = msgspec.structs.replace(  # as long as in the publication
 )
 
 
-def reconstruct(
-    frames: Sequence[Frame], seed: int, config: refinement.RefinementConfig = OPTIMIZE
-) -> Iterator[Snapshot]:
+def reconstruct(frames: Sequence[Frame], seed: int, config: training.RefinementConfig = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the scene while it is optimised; one refusal where COLMAP places fewer than three frames."""
     yield from colmap_3dgs.optimize_sparse_model(frames, seed, config, initialize_scene_with_depth)
 

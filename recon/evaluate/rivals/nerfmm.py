@@ -16,17 +16,16 @@ import torch
 from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
-from splatnode.recon.evaluate.rivals.nerf import fit
-from splatnode.recon.evaluate.rivals.nerf.appearance import make_field_snapshot
-from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
+from splatnode.recon.evaluate.rivals.nerf import radiance_field
+from splatnode.recon.evaluate.rivals.nerf.radiance_field import Focal, make_field_snapshot
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 SIZE = 256  # longer side of the photographs, pixels
-OPTIMIZE = fit.FitConfig()
+OPTIMIZE = radiance_field.FitConfig()
 
 
-def reconstruct(frames: Sequence[Frame], seed: int, config: fit.FitConfig = OPTIMIZE) -> Iterator[Snapshot]:
+def reconstruct(frames: Sequence[Frame], seed: int, config: radiance_field.FitConfig = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the field while it is learnt."""
     clock = Clock()
     if len(frames) < outcome.MIN_CAMERAS:
@@ -37,5 +36,5 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: fit.FitConfig = OPTI
         None if frame.mask is None else torch.from_numpy(resize_mask(frame.mask, *image.shape[:2]))
         for frame, image in zip(frames, images, strict=True)
     ]
-    learnt = fit.fit_field(images, used, Focal(1.0), config, seed=seed)
+    learnt = radiance_field.fit_field(images, used, Focal(1.0), config, seed=seed)
     yield from outcome.number_snapshots((make_field_snapshot(frames, frames, each) for each in learnt), clock)

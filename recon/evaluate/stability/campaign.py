@@ -11,14 +11,13 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.recon.evaluate.json_file import read_json
-from splatnode.recon.evaluate.kept import Journal
-from splatnode.recon.evaluate.records import describe_machine
+from splatnode.recon.evaluate.colmap_model import read_json
+from splatnode.recon.evaluate.report import check_same_cores, describe_machine
+from splatnode.recon.evaluate.runner import Journal
 from splatnode.recon.evaluate.stability.case import MatrixRow, TrialCase
-from splatnode.recon.evaluate.stability.places import Sampler, ScenesByMotion
-from splatnode.recon.evaluate.stability.summary import make_report
+from splatnode.recon.evaluate.stability.perturbations import Sampler, ScenesByMotion
+from splatnode.recon.evaluate.stability.report import make_report
 from splatnode.recon.evaluate.stability.trial import FAILED, Trial, judge_trial, run_trial
-from splatnode.recon.evaluate.timing import check_same_cores
 from splatnode.recon.jobs.call import pack_call
 from splatnode.recon.jobs.calls import Engine, Task, work_folder
 from splatnode.recon.jobs.child import Limits

@@ -8,13 +8,13 @@ import shlex
 import sys
 
 from splatnode.capture.process.terminal import say
+from splatnode.recon.evaluate.report import explain_missing_seconds
 from splatnode.recon.evaluate.stability.campaign import Plan, run_campaign
 from splatnode.recon.evaluate.stability.matrix import select_rows
-from splatnode.recon.evaluate.stability.methods import find_method
-from splatnode.recon.evaluate.stability.places import load_scenes_by_motion
-from splatnode.recon.evaluate.stability.summary import Rate, summarise
-from splatnode.recon.evaluate.stability.windows.command import run_windows_verb
-from splatnode.recon.evaluate.timing import explain_missing_seconds
+from splatnode.recon.evaluate.stability.perturbations import load_scenes_by_motion
+from splatnode.recon.evaluate.stability.report import Rate, summarise
+from splatnode.recon.evaluate.stability.trial import find_method
+from splatnode.recon.evaluate.stability.windows.campaign import run_windows_verb
 from splatnode.recon.jobs.calls import engine as opened
 
 logger = logging.getLogger(__name__)
@@ -37,11 +37,11 @@ def stability(args: argparse.Namespace) -> int:
     with opened(args.cores, args.ray) as engine:
         trials = run_campaign(plan, load_scenes_by_motion(args.scenes, args.out), args.out, command, engine)
     try:
-        from splatnode.recon.evaluate.stability import chart
+        from splatnode.recon.evaluate.stability import report
     except ImportError:
         logger.warning("no chart: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
     else:
-        chart.draw(args.out / "stability.json", args.out)
+        report.draw(args.out / "stability.json", args.out)
     for trial in trials:
         if trial["outcome"] in ("false_accept", "false_refuse", "failed"):
             which = f"row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}"

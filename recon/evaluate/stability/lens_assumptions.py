@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.evaluate.stability import warps
+from splatnode.recon.evaluate.dataset import TrueCamera
+from splatnode.recon.evaluate.stability import perturbations
 from splatnode.recon.evaluate.stability.case import MatrixRow, TrialCase, make_either_case
-from splatnode.recon.evaluate.stability.places import Sampler, TrialImage
-from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.evaluate.stability.perturbations import Sampler, TrialImage
 
 Array = npt.NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def apply_homography(
     """
     height, width = photo.image.shape[:2]
     camera = _require_camera(photo)
-    image = warps.warp_image(photo.image, homography, width, height)
+    image = perturbations.warp_image(photo.image, homography, width, height)
     K, T_world_camera = camera.K_for(width, height), camera.T_world_camera.copy()
     if T_camera_turned is None:
         K = homography @ K
@@ -175,7 +175,9 @@ def _crop_all_off_centre(photos: Sequence[TrialImage], rng: np.random.Generator)
 
 
 def _distort_one(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:
-    return _change_one(photos, rng, lambda photo: replace(warps.distort_image(photo, -0.15), name=f"bent_{photo.name}"))
+    return _change_one(
+        photos, rng, lambda photo: replace(perturbations.distort_image(photo, -0.15), name=f"bent_{photo.name}")
+    )
 
 
 def _squeeze_all(photos: Sequence[TrialImage], rng: np.random.Generator) -> list[TrialImage]:

@@ -8,18 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from splatnode.recon.evaluate.stability import (
-    cameras,
-    degenerate,
-    imaging,
-    lens_assumptions,
-    lenses,
-    mixtures,
-    streams,
-)
+from splatnode.recon.evaluate.stability import cases, degradations, lens_assumptions
 from splatnode.recon.evaluate.stability.case import MatrixRow
 
-_FAMILIES = (cameras, degenerate, imaging, lenses, mixtures, streams)
+_FAMILIES = (cases, degradations)
 
 ROWS: tuple[MatrixRow, ...] = tuple(
     sorted(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
+from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState
 
 # What map_saver writes. 205 is not seen only with a threshold of .196; of nav2's default, .25, it would be free.
 _GREY = {VoxelState.NOT_SEEN: 205, VoxelState.FREE: 254, VoxelState.OCCUPIED: 0}

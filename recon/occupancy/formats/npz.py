@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
+from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState
 
 AXES = "states[i, j, k] along x, y, z of the map: x forward of the first camera, y to its left, z up"
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+from splatnode.recon.occupancy.grid import OccupancyMap
 
 LEVELS = 16
 _MIDDLE = 1 << (LEVELS - 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatnode.recon.occupancy.mesh import Mesh
-from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.verdict import Scale
 
 
 def encode_ply_mesh(mesh: Mesh, scale: Scale) -> bytes:

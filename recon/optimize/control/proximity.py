@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
-from splatnode.recon.scene.gaussians import Gaussians, concatenate
+from splatnode.recon.scene.scene import Gaussians, concatenate
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.scene.background import SHELL
-from splatnode.recon.scene.contrast_masking import visibility
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.seeding import REFERENCE_PX
+from splatnode.recon.scene.initialization import REFERENCE_PX, visibility
+from splatnode.recon.scene.scene import Gaussians
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

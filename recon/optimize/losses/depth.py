@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
-from splatnode.recon.optimize.supervision import Supervision, SurfaceTarget, resample_target
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.optimize.regularizers import Supervision, SurfaceTarget, resample_target
+from splatnode.recon.rasterize.reference import Render
 
 _MIN_KNOWN = 0.5  # share of a patch's pixels whose depth is known
 _MIN_RELATIVE_SPREAD = 1e-3  # standard deviation over mean of a patch's known depth: rounding has no shape to follow

@@ -8,9 +8,9 @@ from pathlib import Path
 from torch import Tensor
 from torch.nn import functional
 
-from splatnode.recon.networks import weight_loading
-from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalize_image
-from splatnode.recon.networks.weight_folder import locate_weights
+from splatnode.recon.networks import weights
+from splatnode.recon.networks.vit import PATCH, Dinov2, normalize_image
+from splatnode.recon.networks.weights import locate_weights
 
 WEIGHTS = "dinov2/dinov2_vits14_pretrain.pth"
 
@@ -42,4 +42,4 @@ def load_dino() -> DinoFeatures | None:
 
 def load_network(path: Path) -> Dinov2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
-    return weight_loading.load_network(Dinov2, weight_loading.read_weights(path), path, "DINOv2 ViT-S/14")
+    return weights.load_network(Dinov2, weights.read_weights(path), path, "DINOv2 ViT-S/14")

@@ -13,7 +13,7 @@ import msgspec
 from torch import Tensor
 
 from splatnode.capture.process.config import Plugin
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.rasterize.reference import Render
 
 
 class LossChoice(Plugin):

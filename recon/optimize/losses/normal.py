@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
-from splatnode.recon.optimize.supervision import Supervision, SurfaceTarget, resample_target
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.optimize.regularizers import Supervision, SurfaceTarget, resample_target
+from splatnode.recon.rasterize.reference import Render
 
 _MIN_SQUARED_LENGTH = 1e-6  # of a rendered normal: thinner coverage has no direction
 _MIN_WEIGHT = 1e-12  # least divisor, where nothing is known

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from splatnode.recon.optimize.losses.dino import load_dino
 from splatnode.recon.optimize.losses.loss import Loss, Schedule
-from splatnode.recon.optimize.supervision import Supervision
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.optimize.regularizers import Supervision
+from splatnode.recon.rasterize.reference import Render
 
 
 class Config(Schedule, frozen=True, forbid_unknown_fields=True):

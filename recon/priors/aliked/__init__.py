@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.recon.networks.weight_folder import find
+from splatnode.recon.networks.weights import find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.aliked.matcher import AlikedMatcher
 from splatnode.recon.priors.aliked.network import load_aliked

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.networks.crop import crop, crop_image
+from splatnode.recon.networks.vit import crop, crop_image
 from splatnode.recon.priors.aliked.network import STRIDE, Aliked, Keypoints
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.recon.networks import weight_loading
-from splatnode.recon.networks.weight_folder import find
+from splatnode.recon.networks import weights as networks_weights
+from splatnode.recon.networks.weights import find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior
 from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
@@ -25,4 +25,4 @@ def load(config: Config) -> ClassicalPrior:
 
 def load_network(path: Path) -> PatchmatchNet:
     """Raises ValueError where the file is damaged or another network's, and FileNotFoundError."""
-    return weight_loading.load_network(PatchmatchNet, weight_loading.read_weights(path), path, "PatchmatchNet")
+    return networks_weights.load_network(PatchmatchNet, networks_weights.read_weights(path), path, "PatchmatchNet")

@@ -16,15 +16,221 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from splatnode.recon.priors.patchmatchnet.pyramid import FeaturePyramid, Refinement
-from splatnode.recon.priors.patchmatchnet.sampling import (
-    Source,
-    compute_warp,
-    make_sampling_grid,
-    make_square_steps,
-    sample_neighbours,
-)
-from splatnode.recon.priors.patchmatchnet.scoring import Evaluation, SimilarityNet
+# PatchmatchNet's image networks: a pyramid of features, and depth made twice as fine along a photograph's edges.
+
+
+class _ConvNormRelu(nn.Module):
+    """Convolution, batch norm and ReLU."""
+
+    def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, out, size, stride, size // 2, bias=False)
+        self.bn = nn.BatchNorm2d(out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.relu(self.bn(self.conv(x)))
+
+
+class FeaturePyramid(nn.Module):
+    """A feature pyramid: channels 64, 32 and 16 at 1/8, 1/4 and 1/2 of the image's size."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv0, self.conv1 = _ConvNormRelu(3, 8), _ConvNormRelu(8, 8)
+        self.conv2, self.conv3, self.conv4 = _make_halving_layers(8, 16)
+        self.conv5, self.conv6, self.conv7 = _make_halving_layers(16, 32)
+        self.conv8, self.conv9, self.conv10 = _make_halving_layers(32, 64)
+        self.output1 = nn.Conv2d(64, 64, 1, bias=False)
+        self.inner1, self.inner2 = nn.Conv2d(32, 64, 1), nn.Conv2d(16, 64, 1)
+        self.output2, self.output3 = nn.Conv2d(64, 32, 1, bias=False), nn.Conv2d(64, 16, 1, bias=False)
+
+    def forward(self, image: Tensor) -> dict[int, Tensor]:
+        """(C, H / 2^level, W / 2^level) by level, of an image (3, H, W)."""
+        half = self.conv4(self.conv3(self.conv2(self.conv1(self.conv0(image[None])))))
+        quarter = self.conv7(self.conv6(self.conv5(half)))
+        eighth = self.conv10(self.conv9(self.conv8(quarter)))
+        quarter = _upsample(eighth) + self.inner1(quarter)
+        half = _upsample(quarter) + self.inner2(half)
+        return {3: self.output1(eighth)[0], 2: self.output2(quarter)[0], 1: self.output3(half)[0]}
+
+
+def _make_halving_layers(channels: int, out: int) -> tuple[_ConvNormRelu, _ConvNormRelu, _ConvNormRelu]:
+    return _ConvNormRelu(channels, out, size=5, stride=2), _ConvNormRelu(out, out), _ConvNormRelu(out, out)
+
+
+def _upsample(x: Tensor) -> Tensor:
+    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+
+class Refinement(nn.Module):
+    """Depth at twice its size, sharpened along the photograph's edges."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv0, self.conv1, self.conv2 = _ConvNormRelu(3, 8), _ConvNormRelu(1, 8), _ConvNormRelu(8, 8)
+        self.deconv = nn.ConvTranspose2d(8, 8, 3, stride=2, padding=1, output_padding=1, bias=False)
+        self.bn = nn.BatchNorm2d(8)
+        self.conv3 = _ConvNormRelu(16, 8)
+        self.res = nn.Conv2d(8, 1, 3, padding=1, bias=False)
+
+    def forward(self, image: Tensor, depth: Tensor, near_far: tuple[float, float]) -> Tensor:
+        """(H, W) depth from `depth` (H / 2, W / 2) and the photograph `image` (3, H, W)."""
+        near, far = near_far
+        place = ((depth - near) / (far - near))[None, None]
+        detail = torch.relu(self.bn(self.deconv(self.conv2(self.conv1(place)))))
+        detail = self.res(self.conv3(torch.cat([detail, self.conv0(image[None])], 1)))
+        place = functional.interpolate(place, scale_factor=2.0, mode="nearest") + detail
+        return place[0, 0] * (far - near) + near
+
+
+# Where features are looked up: at a pixel's neighbours, and where a depth puts it in another photograph.
+#
+# Pixel centres are at whole numbers.
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A photograph with its camera."""
+
+    image: Tensor  # (3, H, W) in [0, 1], sides multiples of 8
+    K: Tensor  # (3, 3), the centre of the first pixel at (0, 0)
+    T_camera_world: Tensor  # (4, 4)
+
+
+def make_square_steps(reach: int, centre: bool = False) -> list[tuple[int, int]]:
+    """(down, right) steps to the eight neighbours `reach` pixels away, row by row, with the middle or without."""
+    steps = [(down, right) for down in (-reach, 0, reach) for right in (-reach, 0, reach)]
+    return [step for step in steps if centre or step != (0, 0)]
+
+
+def make_sampling_grid(learnt: Tensor, steps: Sequence[tuple[int, int]]) -> Tensor:
+    """(M, h, w, 2) where to sample for M neighbours: a fixed step and a `learnt` one (2 M, h, w; x then y)."""
+    height, width = learnt.shape[1:]
+    rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    x = torch.stack([columns + right for _, right in steps]) + learnt[0::2]
+    y = torch.stack([rows + down for down, _ in steps]) + learnt[1::2]
+    return torch.stack([x / ((width - 1) / 2) - 1, y / ((height - 1) / 2) - 1], -1)
+
+
+def sample_neighbours(images: Tensor, grid: Tensor) -> Tensor:
+    """(C, M, h, w) of images (C, h, w) at the M neighbours of every pixel."""
+    count, height, width, _ = grid.shape
+    flat = grid.reshape(1, count * height, width, 2)
+    sampled = functional.grid_sample(images[None], flat, mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled[0].unflatten(1, (count, height))
+
+
+def compute_warp(reference: Source, source: Source, level: int) -> tuple[Tensor, Tensor]:
+    """Rotation-like (3, 3) and translation (3,) that carry (x, y, 1) * depth of the reference into the source."""
+    scale = torch.diag(torch.tensor([0.5**level, 0.5**level, 1.0], dtype=torch.float64))
+    K_reference, K_source = scale @ reference.K.double(), scale @ source.K.double()
+    motion = source.T_camera_world.double() @ torch.linalg.inv(reference.T_camera_world.double())
+    return (
+        (K_source @ motion[:3, :3] @ torch.linalg.inv(K_reference)).float(),
+        (K_source @ motion[:3, 3]).float(),
+    )
+
+
+def warp_features(features: Tensor, warp: tuple[Tensor, Tensor], depths: Tensor) -> Tensor:
+    """(C, D, h, w): the source's features (C, h', w') where the reference's pixels lie at `depths` (D, h, w)."""
+    count, height, width = depths.shape
+    rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
+    pixels = torch.stack([columns, rows, torch.ones_like(rows)])
+    rays = torch.einsum("ij,jhw->ihw", warp[0], pixels)
+    projected = rays[:, None] * depths[None] + warp[1].view(3, 1, 1, 1)
+    behind = projected[2] <= 1e-3
+    z = torch.where(behind, 1.0, projected[2])
+    x = torch.where(behind, float(width), projected[0]) / z
+    y = torch.where(behind, float(height), projected[1]) / z
+    there_height, there_width = features.shape[1:]
+    grid = torch.stack([x / ((there_width - 1) / 2) - 1, y / ((there_height - 1) / 2) - 1], -1)
+    flat = grid.reshape(1, count * height, width, 2)
+    sampled = functional.grid_sample(features[None], flat, mode="bilinear", padding_mode="zeros", align_corners=True)
+    return sampled[0].unflatten(1, (count, height))
+
+
+# PatchmatchNet's scores: how well the sources' features, warped at a depth, agree with the reference's.
+
+_MIN_WEIGHT = 1e-5  # of all sources together: a pixel that none is believed at is divided by it
+
+
+class Evaluation(nn.Module):
+    """Scores depths by the group-wise correlation of features, averaged over sources and neighbours."""
+
+    def __init__(self, groups: int) -> None:
+        super().__init__()
+        self._groups = groups
+        self.pixel_wise_net = _ViewWeight(groups)
+        self.similarity_net = SimilarityNet(groups)
+
+    def forward(
+        self,
+        own: Tensor,
+        others: Sequence[Tensor],
+        warps: Sequence[tuple[Tensor, Tensor]],
+        samples: Tensor,
+        around: Tensor,
+        support: Tensor,
+        weights: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Scores (D, h, w) of the depths `samples` (D, h, w), and the sources' weights (S, h, w).
+
+        `own` (C, h, w) are the reference's features, `others` the sources', each with its warp; `around` (9, h, w, 2)
+        are the neighbours whose scores support a pixel's, by `support` (D, 9, h, w). `weights` are those of an earlier
+        call, None at first: they are found once, then kept.
+        """
+        groups = self._groups
+        total = samples.new_full((1, 1, *samples.shape[1:]), _MIN_WEIGHT)
+        summed = samples.new_zeros((groups, *samples.shape))
+        reference = own.unflatten(0, (groups, -1))[:, :, None]
+        found = []
+        for index, (other, warp) in enumerate(zip(others, warps, strict=True)):
+            warped = warp_features(other, warp, samples).unflatten(0, (groups, -1))
+            similarity = (warped * reference).mean(1)  # (G, D, h, w)
+            weight = self.pixel_wise_net(similarity) if weights is None else weights[index]
+            found.append(weight)
+            summed = summed + similarity * weight
+            total = total + weight
+        scores = self.similarity_net(summed / total)
+        scores = (sample_neighbours(scores, around) * support).sum(1)
+        return scores, torch.stack(found)
+
+
+class SimilarityNet(nn.Module):
+    """A score from the correlations of each group of channels."""
+
+    def __init__(self, groups: int) -> None:
+        super().__init__()
+        self.conv0, self.conv1 = _PointwiseNormRelu(groups, 16), _PointwiseNormRelu(16, 8)
+        self.similarity = nn.Conv3d(8, 1, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.similarity(self.conv1(self.conv0(x[None])))[0, 0]
+
+
+class _ViewWeight(nn.Module):
+    """How far a source is to be believed at a pixel: as far as its best sample is."""
+
+    def __init__(self, groups: int) -> None:
+        super().__init__()
+        self.conv0, self.conv1 = _PointwiseNormRelu(groups, 16), _PointwiseNormRelu(16, 8)
+        self.conv2 = nn.Conv3d(8, 1, 1)
+
+    def forward(self, similarity: Tensor) -> Tensor:
+        return self.conv2(self.conv1(self.conv0(similarity[None])))[0, 0].sigmoid().amax(0)
+
+
+class _PointwiseNormRelu(nn.Module):
+    """Convolution, batch norm and ReLU of every sample and pixel by itself."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv3d(channels, out, 1, bias=False)
+        self.bn = nn.BatchNorm3d(out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.relu(self.bn(self.conv(x)))
+
 
 _FIRST_SAMPLES = 48  # depths over the whole range, before there is an estimate
 

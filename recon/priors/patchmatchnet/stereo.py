@@ -10,11 +10,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatnode.recon.priors import consistency, stereo
-from splatnode.recon.priors.consistency import DepthMap
+from splatnode.recon.priors import multi_view_consistency, stereo
+from splatnode.recon.priors.multi_view_consistency import DepthMap
 from splatnode.recon.priors.patchmatch import Planes, make_level
-from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
-from splatnode.recon.priors.patchmatchnet.sampling import Source
+from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet, Source
 from splatnode.recon.priors.stereo import SparsePoints, StereoView
 
 Float32 = npt.NDArray[np.float32]
@@ -60,7 +59,7 @@ class NetworkStereo:
                 found = _resize_depth(depth.clamp(*view.depth_range).numpy(), view.image)
                 inverse_depth = np.reciprocal(found, dtype=np.float32)
             planes.append(_make_planes(inverse_depth))
-        return consistency.cross_check(levels, planes, checked, config.matching, config.consistency)
+        return multi_view_consistency.cross_check(levels, planes, checked, config.matching, config.consistency)
 
 
 def _make_source(view: StereoView) -> Source:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime
 
-from splatnode.recon.networks.weight_folder import WeightsError
+from splatnode.recon.networks.weights import WeightsError
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -1,7 +1,7 @@
 """Scenes and cameras as files. NumPy only: a result can be read, converted and written where there is no torch."""
 
-from splatnode.recon.result.export.convert import export_scene
-from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.format import export_scene
+from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.result import remove_result, write_beside, write_result
 from splatnode.recon.result.export.staged import ResultWriteError, write_file, write_files

@@ -13,18 +13,13 @@ from typing import Annotated, TypeAlias
 import msgspec
 import numpy as np
 
-from splatnode.capture.frame import Intrinsics
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, sanitize_text
+from splatnode.capture.frame import LARGEST_NS, Clock, Intrinsics, Stamp
 from splatnode.capture.process.records import record_in
-from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
-from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.camera_check import MAX_COORDINATE, find_camera_problem
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES
+from splatnode.capture.process.text import LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
+from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES, SceneFileError
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.scale import RELATIVE, Scale
-from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.snapshot import MAX_COORDINATE, CameraEstimate, find_camera_problem
+from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale
 
 Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Row3: TypeAlias = tuple[Number, Number, Number]

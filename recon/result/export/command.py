@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from splatnode.capture.process.progress import show_waiting
-from splatnode.capture.process.terminal import say
-from splatnode.recon.result.export.convert import export_scene
-from splatnode.recon.result.export.selection import Box, Selection
+from splatnode.capture.process.terminal import say, show_waiting
+from splatnode.recon.result.export.format import export_scene
+from splatnode.recon.result.export.prepare import Box, Selection
 
 
 def export(args: argparse.Namespace) -> int:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib import import_module
+from pathlib import Path
 from pkgutil import iter_modules
 from typing import Protocol, cast
 
 from splatnode.recon.result.export import formats
+from splatnode.recon.result.export.prepare import EVERYTHING, Selection
+from splatnode.recon.result.export.result import write_beside
 from splatnode.recon.result.export.stored import StoredResult
 
 
@@ -39,3 +42,32 @@ def load_format(name: str) -> Format:
     if name not in list_format_names():
         raise ValueError(f"the format must be one of {', '.join(list_format_names())}; got {name!r}")
     return cast(Format, import_module(f"{formats.__name__}.{name}"))
+
+
+# export_scene: a result, or a scene file, in another format.
+
+
+def export_scene(source: Path, to: str, destination: Path | None = None, selection: Selection = EVERYTHING) -> Path:
+    """Writes the result folder or scene file `source` in the format `to`; returns where it is.
+
+    `to` is a module of recon.result.export.formats, `selection` says which Gaussians are written. `destination` is a
+    file, or a folder for a format of several files (colmap); without it, it is the format's own name beside the scene,
+    if nothing is there yet. What lies in the folder of a result is removed with that result (`write_beside`). Cameras
+    come from the cameras.json of the folder or beside the file. Raises ValueError for an unknown format, a destination
+    that is taken, or a selection where the format has no Gaussians; SceneFileError for input that cannot be read as
+    what it should be, or of which nothing is selected; FileNotFoundError where there is none, ResultWriteError where
+    the output cannot be written.
+    """
+    format_ = load_format(to)
+    if not selection.is_everything and not getattr(format_, "GAUSSIANS", True):
+        raise ValueError(
+            f"{to} holds cameras and no Gaussians: --only-seen, --no-background and --crop have nothing to leave out"
+        )
+    result = StoredResult.create_from_path(source, selection)
+    if destination is None:
+        destination = result.scene.with_name(format_.DEFAULT_NAME)
+        if destination.exists():
+            raise ValueError(f"{destination} is there already: give another place with --out PATH")
+    content = format_.export(result)
+    write_beside(destination, {"": content} if isinstance(content, bytes) else content, of=result.scene)
+    return destination

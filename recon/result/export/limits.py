@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.recon.result.export.error import SceneFileError
+from splatnode.capture.process.files import read_bounded
+
+# SceneFileError: a file that cannot be read as the scene it should hold.
+
+
+class SceneFileError(ValueError):
+    """The message names the file, what was expected in it and what was found."""
+
 
 MAX_GAUSSIANS = 10_000_000
 MAX_VALUES = 350_000_000  # numbers of all Gaussians: 5.6 million with spherical harmonics of degree 3

@@ -11,10 +11,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from splatnode.capture.process.printable import escape_text
+from splatnode.capture.process.text import escape_text
 from splatnode.recon.result.export.prepare import compute_base_rgb
-from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Landmarks, Snapshot
 from splatnode.recon.result.stored_snapshot import encode_image
 
 rr: Any = importlib.import_module("rerun")  # by its name: where it is not installed, pyright takes this file for it

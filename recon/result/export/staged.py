@@ -1,7 +1,8 @@
 """Files that appear together or not at all: written under temporary names, then renamed.
 
 What several files take to become one result is written down before the first is renamed: a process that is killed
-between two renames, or whose disk fails there, leaves a note beside them, from which `finish_interrupted_write` finishes the work.
+between two renames, or whose disk fails there, leaves a note beside them, from which `finish_interrupted_write`
+finishes the work.
 """
 
 from __future__ import annotations
@@ -22,10 +23,9 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.folders import make_folder
-from splatnode.capture.process.memory_shortage import raise_shortage
+from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.records import record_in
+from splatnode.capture.process.system import raise_shortage
 
 _MARK = "[0-9a-f]{12}"
 _TEMPORARY, _NOTE = re.compile(rf"\..+\.{_MARK}\.tmp"), re.compile(rf"\.{_MARK}\.renaming")

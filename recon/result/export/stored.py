@@ -8,16 +8,36 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
-from splatnode.capture.process.foreign import guard_untrusted
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.process.text import guard_untrusted
 from splatnode.recon.result.export import formats
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.limits import read_json_file, read_scene_file
-from splatnode.recon.result.export.prepare import sanitize_gaussians
-from splatnode.recon.result.export.selection import EVERYTHING, Selection
-from splatnode.recon.result.export.sources import SOURCES, decode_sources
-from splatnode.recon.result.scale import RELATIVE, Scale
+from splatnode.recon.result.export.limits import SceneFileError, read_json_file, read_scene_file
+from splatnode.recon.result.export.prepare import EVERYTHING, Selection, sanitize_gaussians
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.recon.result.verdict import RELATIVE, Scale
+
+# sources.bin: the source frames of a result's Gaussians (`recon.result.sources`), which scene files have no place for.
+#
+# Little-endian int32, one a Gaussian, in the order of the scene.ply beside it.
+
+SOURCES = "sources.bin"
+
+
+def encode_sources(source_frame: npt.NDArray[np.int32]) -> bytes:
+    return source_frame.astype("<i4").tobytes()
+
+
+def decode_sources(data: bytes, num_gaussians: int) -> npt.NDArray[np.int32]:
+    """The source frames (N,) of so many Gaussians. Raises SceneFileError where there are not so many."""
+    if len(data) != 4 * num_gaussians:
+        raise SceneFileError(
+            f"{SOURCES} tells where {len(data) / 4:g} Gaussians come from, the scene file beside it has "
+            f"{num_gaussians}: one of the two is not what was written. Make the scene anew"
+        )
+    return np.frombuffer(data, "<i4").astype(np.int32)
 
 
 @dataclass(frozen=True)

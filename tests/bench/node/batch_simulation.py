@@ -22,10 +22,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from splatnode.recon.batch.answer import FAILED
+from splatnode.recon.batch.batch import FAILED, LEDGER
 from splatnode.recon.batch.command import EXIT_SOME_FAILED
-from splatnode.recon.batch.ledger import LEDGER
-from splatnode.recon.batch.tables import CSV
+from splatnode.recon.batch.report import CSV
 from tests.bench.node.simulated_batch import OUT, TALLY, end_of, recordings
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT

@@ -8,10 +8,10 @@ import signal
 import subprocess
 import time
 
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.network import RECON_SCENE
+from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.status import heartbeats
-from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
+from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.trial import (

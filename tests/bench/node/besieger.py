@@ -19,13 +19,14 @@ from pathlib import Path
 import yaml
 import zmq
 
-from splatnode.capture.messaging.network import Network, runtime_directory
-from splatnode.capture.messaging.services import (
+from splatnode.capture.messaging.network import (
     CAPTURE_KEYFRAMES,
     CAPTURE_PREVIEW,
     RECON_CONTROL,
     RECON_SCENE,
     RECON_STATUS,
+    Network,
+    runtime_directory,
 )
 from splatnode.capture.process.config import parse_config
 from tests.bench.node.attacked import shout

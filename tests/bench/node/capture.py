@@ -20,13 +20,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from splatnode.capture.config import PreviewHeader
 from splatnode.capture.image_file import decode_image
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.keyframes import KeyframeClient
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
-from splatnode.capture.preview import PreviewHeader
-from splatnode.capture.process.memory import keep_freed
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
+from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.process.system import keep_freed
 from splatnode.capture.status import CaptureStatus
 from tests.support.node import processor_s
 

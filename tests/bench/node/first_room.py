@@ -9,9 +9,7 @@ from splatnode.capture.cameras import building
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.true_cameras import TrueCamera
-from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split, TrueCamera
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import Snapshot

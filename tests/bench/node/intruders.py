@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.messaging.keys import allow, create_keys, expect_server
-from splatnode.capture.messaging.network import Network, NotAllowed
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.network import RECON_SCENE, Network, NotAllowed
+from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.trial import RECON, Trial, expect, expect_whole, wait_for

@@ -19,14 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
-from splatnode.capture.preview import PreviewHeader
+from splatnode.capture.config import PreviewHeader
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW
+from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
-from splatnode.recon.evaluate.splits import Split, load_split
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot

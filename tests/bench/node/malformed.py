@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from splatnode.capture.config import Config as PreviewConfig
+from splatnode.capture.config import PreviewHeader, encode_preview
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.messaging.keyframe_messages import (
+from splatnode.capture.messaging.messages import (
     Acknowledge,
     ConsumerStatus,
     Delivery,
@@ -18,10 +20,8 @@ from splatnode.capture.messaging.keyframe_messages import (
     Refuse,
     Request,
 )
-from splatnode.capture.messaging.state import Want
+from splatnode.capture.messaging.pubsub import Want
 from splatnode.capture.messaging.wire import Numbering, encode
-from splatnode.capture.preview import Config as PreviewConfig
-from splatnode.capture.preview import PreviewHeader, encode_preview
 
 LENS = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0, "calibration", (0.1, -0.1))
 IMAGE = np.random.default_rng(0).integers(0, 256, (12, 16, 3)).astype(np.uint8)

@@ -21,17 +21,15 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.merging.command import write_map
 from splatnode.recon.merging.submap import Submap, load_submaps
 from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.submap_index import read_map_set
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.result.whole import read_map_set
 from tests.bench.node.stream import _split, _streamed
 
 SETTINGS = Settings(alignment_steps=80, alignment_levels=2)

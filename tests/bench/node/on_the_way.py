@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.messaging.keys import create_keys, expect_server
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.network import RECON_SCENE, Network
+from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
 from splatnode.capture.status import heartbeats
-from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
+from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.intruders import refusal
 from tests.bench.node.shortages import remounted

@@ -24,10 +24,10 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.messaging.keyframe_messages import FrameHeader
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.messages import FrameHeader
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.spool import Config, Key, Spool
+from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig
 from splatnode.capture.messaging.wire import Numbering, Part, encode
 from splatnode.capture.status import heartbeats
 from tests.bench.node.trial import RECON, expect, expect_scene
@@ -95,7 +95,7 @@ def _spoiled(message: list[Part], kind: str) -> list[Part]:
 def two_ends(folder: Path, count: int) -> dict[str, Any]:
     """KeyframeServer and KeyframeClient."""
     network, started = Network(directory=folder / "run"), time.monotonic()
-    spool = Spool(Config(directory=folder / "state", max_frames=count))
+    spool = Spool(SpoolConfig(directory=folder / "state", max_frames=count))
     images = [Frame(0, f"{index}.png", 0, np.full((6, 8, 3), index, np.uint8), None) for index in range(7)]
     refused, taken = fill(spool, count, images), []
     with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
@@ -120,7 +120,7 @@ def processes(folder: Path, count: int) -> dict[str, Any]:
     camera = {"camera": {"kind": "watched", "folder": str(folder / "empty")}}
     started = time.monotonic()
     with running(Node(folder / "node", camera, RECON)) as node:
-        with contextlib.closing(Spool(Config(directory=node.folder, max_frames=count, max_mb=4096))) as spool:
+        with contextlib.closing(Spool(SpoolConfig(directory=node.folder, max_frames=count, max_mb=4096))) as spool:
             refused = fill(spool, count, images)
         for verb in ("recon", "capture"):
             node.start(verb)

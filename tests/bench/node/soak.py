@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
-from splatnode.capture.preview import PreviewHeader
+from splatnode.capture.config import PreviewHeader
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW
+from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.status import heartbeats
 from tests.support.node import Node, descriptors, memory_mb, running
 

@@ -26,16 +26,15 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.process.progress import say
-from splatnode.recon.auditing.motion import MeasuredMotion, measure_motion, twist
+from splatnode.capture.process.terminal import say
+from splatnode.recon.auditing.audit import MeasuredMotion, measure_motion, twist
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.locating.locate import Localization, localize_with_inliers, prepare_query_image
-from splatnode.recon.result.landmarks import Landmarks
+from splatnode.recon.locating.localize import Localization, localize_with_inliers, prepare_query_image
+from splatnode.recon.result.snapshot import Landmarks
 from tests.bench.quality.locate import estimated
 from tests.support.synthetic import photographs, view_graph
 

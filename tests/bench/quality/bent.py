@@ -22,15 +22,13 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import Reconstruction, estimate_depth
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.places import TrialImage
-from splatnode.recon.evaluate.stability.warps import distort_image
-from splatnode.recon.evaluate.start import Start, extract_start_config, find_start
-from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split
+from splatnode.recon.evaluate.methods import Start, extract_start_config, find_start
+from splatnode.recon.evaluate.protocol import PerceptualNetworks
+from splatnode.recon.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import load_prior
-from splatnode.recon.registration.straightened import corner_shift, undistort_keyframes, undistort_pixels
+from splatnode.recon.registration.undistortion import corner_shift, undistort_keyframes, undistort_pixels
 from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = (

@@ -20,11 +20,14 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.coverage import CORNERS
-from splatnode.capture.calibration.gathering import Gathering
-from splatnode.capture.calibration.hold_out import choose
-from splatnode.capture.calibration.lacking import ENOUGH, describe_missing_coverage, describe_uncertainty
-from splatnode.capture.calibration.uncertainty import pixel_sigmas
+from splatnode.capture.calibration.collect import (
+    CORNERS,
+    ENOUGH,
+    Gathering,
+    describe_missing_coverage,
+    describe_uncertainty,
+)
+from splatnode.capture.calibration.estimate import choose, pixel_sigmas
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import lens as lenses
 from tests.support.board_photographs import Photographer, waved

@@ -22,13 +22,10 @@ from torch import Tensor
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.metrics import psnr, ssim
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Run, Settings, compute_mean, evaluate
-from splatnode.recon.evaluate.splits import Split, load_split
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, compute_mean, evaluate, psnr, ssim
 from splatnode.recon.geometry import angles_deg
-from splatnode.recon.offline import run
+from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize.cpu import rasterize
 from tests.bench.quality.held_out import Case
 

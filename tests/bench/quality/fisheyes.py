@@ -23,11 +23,9 @@ from splatnode.capture.image_file import encode_png
 from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Settings
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.truth import load_scene
-from splatnode.recon.offline import run
+from splatnode.recon.evaluate.dataset import Split, load_scene
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Settings
+from splatnode.recon.pipeline import run
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.staged import write_file, write_files
 from splatnode.recon.result.snapshot import CameraEstimate

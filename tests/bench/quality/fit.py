@@ -16,22 +16,20 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.recon.evaluate.stability.fitting.cross_validation import (
+from splatnode.recon.evaluate.stability.fitting.fit import (
     fit_models,
     fit_without_each_scene,
+    format_module,
     make_report,
     pair_held_out_models,
+    rejudge_rows,
 )
-from splatnode.recon.evaluate.stability.fitting.module import format_module
-from splatnode.recon.evaluate.stability.fitting.rejudged import rejudge_rows
 from splatnode.recon.evaluate.stability.fitting.samples import load_results, read_samples
-from splatnode.recon.evaluate.stability.windows import charts
-from splatnode.recon.evaluate.stability.windows.command import format_report
-from splatnode.recon.evaluate.stability.windows.row import WindowRow
-from splatnode.recon.evaluate.stability.windows.summary import summarise
-from splatnode.recon.evaluate.stability.windows.window import COUNTS
+from splatnode.recon.evaluate.stability.windows import campaign
+from splatnode.recon.evaluate.stability.windows.campaign import format_report, summarise
+from splatnode.recon.evaluate.stability.windows.windows import COUNTS, WindowRow
 from splatnode.recon.result.export.staged import json_bytes, write_file
-from splatnode.recon.verification.models import VerdictModel, VerdictModels
+from splatnode.recon.verification.error_model import VerdictModel, VerdictModels
 
 KEPT = ("scene", "count", "stride", "start", "angle_deg", "method", "verdict", "published", "right")  # of a row
 MODULE = Path("recon/verification/fitted.py")
@@ -69,7 +67,7 @@ def _windows(results: list[Path], numbers: Mapping[str, VerdictModel], out: Path
     judged = rejudge_rows([row for row in rows if row.count in COUNTS], numbers)
     records = [{**{name: getattr(row, name) for name in KEPT}, "found": row.outcome.value} for row in judged]
     write_file(out / "windows.json", json_bytes({"summary": summarise(judged), "rows": records}))
-    charts.draw(judged, out)
+    campaign.draw(judged, out)
     print("\n".join(format_report(judged)))
 
 

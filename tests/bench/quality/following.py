@@ -13,12 +13,18 @@ from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.geometry import align_cameras, angles_deg
-from splatnode.recon.locating.follow import QUICK, localize_near
-from splatnode.recon.locating.locate import Localization, QueryImage, localize_image, prepare_query_image
+from splatnode.recon.locating.localize import (
+    QUICK,
+    Localization,
+    QueryImage,
+    localize_image,
+    localize_near,
+    prepare_query_image,
+)
 from splatnode.recon.locating.outcome import LocalizationBounds, Located, NotLocated
-from splatnode.recon.matching.match import match
+from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import prepare
-from splatnode.recon.result.landmarks import Landmarks
+from splatnode.recon.result.snapshot import Landmarks
 
 Array = npt.NDArray[np.float64]
 

@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.recon.evaluate.methods import find_start
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate, load_networks
 from splatnode.recon.evaluate.protocol import Row as Scored
-from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.regions import Counts
-from splatnode.recon.evaluate.splits import Split, load_split
-from splatnode.recon.evaluate.start import find_start
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -19,13 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.given_pose import make_given_pose
-from splatnode.capture.process.progress import say
+from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.process.terminal import say
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
+from splatnode.recon.evaluate.dataset import EvaluationScene
 from splatnode.recon.evaluate.shown import Surface
-from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.geometry import Similarity, transform_to_camera
-from splatnode.recon.priors import reprojection, stereo
+from splatnode.recon.priors import pointmap, stereo
 from splatnode.recon.priors.pointmap import Pointmap
 
 Array = npt.NDArray[np.float64]
@@ -64,7 +64,7 @@ class KnownSurfaces:
         target = _pointmap(KnownView(T_world_camera, K, nothing))
         nearest = np.full((height, width), np.inf, np.float32)
         for view in self.views.values():
-            nearest = np.minimum(nearest, reprojection.project_nearest(_pointmap(view), target)[0])
+            nearest = np.minimum(nearest, pointmap.project_nearest(_pointmap(view), target)[0])
         return KnownView(T_world_camera, K, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32))
 
 

@@ -23,18 +23,26 @@ import numpy as np
 
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.stability.case import make_frames, make_world
-from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
+from splatnode.recon.evaluate.dataset import load_scene
+from splatnode.recon.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
 from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, AssumptionBreak, set_intrinsics
-from splatnode.recon.evaluate.stability.outcome import score_cameras
-from splatnode.recon.evaluate.stability.own_cameras import ensure_registration, list_registered_cameras
-from splatnode.recon.evaluate.stability.places import TrialImage, TrialScene, find_neighbour_sets, find_parallel_sets
-from splatnode.recon.evaluate.stability.windows.row import OURS
-from splatnode.recon.evaluate.stability.windows.store import Key, load_plain_features, match_keyframes, select_keys
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.stability.perturbations import (
+    TrialImage,
+    TrialScene,
+    find_neighbour_sets,
+    find_parallel_sets,
+)
+from splatnode.recon.evaluate.stability.trial import ensure_registration, list_registered_cameras
+from splatnode.recon.evaluate.stability.windows.windows import (
+    OURS,
+    PieceKey,
+    load_plain_features,
+    match_keyframes,
+    select_keys,
+)
+from splatnode.recon.fallbacks.run import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
-from splatnode.recon.ladder.ladder import run_fallbacks
-from splatnode.recon.matching.moving import mask_moving_objects
+from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.preparation import load_prior, prepare
 
 STEP_DEG = 12.0
@@ -88,7 +96,7 @@ def run_trial(
     photos: Sequence[TrialImage],
     kind: AssumptionBreak,
     setting: str,
-    known: dict[Key, bytes],
+    known: dict[PieceKey, bytes],
     config: ReconstructionConfig,
 ) -> Trial:
     """`known` keeps features and matches of the photographs by their names, for the next trials of the scene."""
@@ -151,7 +159,7 @@ def run_scene(
         photos = window(place, count)
         if not photos:
             continue
-        caches: dict[str, dict[Key, bytes]] = defaultdict(dict)
+        caches: dict[str, dict[PieceKey, bytes]] = defaultdict(dict)
         for setting in settings:
             possible = [name for name in kinds if setting in KINDS[name].settings and name != "clean"]
             drawn = np.random.default_rng([count, zlib.crc32(f"{place.name} {setting}".encode())]).permutation(possible)

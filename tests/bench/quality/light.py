@@ -21,20 +21,18 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Settings
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.start import Start, extract_start_config, find_start
-from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split
+from splatnode.recon.evaluate.methods import Start, extract_start_config, find_start
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene import light
+from splatnode.recon.scene import exposure as scene_exposure
 from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = ("fountain_p11:6", "llff_fern:6", "fox:12")
 LEAST, MOST, BALANCE = 0.5, 2.0, 0.2
 ON = preset("balanced")
-OFF = msgspec.structs.replace(ON, light=light.ExposureConfig(enabled=False))
+OFF = msgspec.structs.replace(ON, light=scene_exposure.ExposureConfig(enabled=False))
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ def logs_of(start: Start, told: Mapping[str, float] = MappingProxyType({})) -> M
     """(3,) logarithms of the gains that are found, by photograph; `told` is what cameras say of them."""
     maps = list(start.estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
-    found = light.estimate_log_gains(maps, [images[each.name] for each in maps], told)
+    found = scene_exposure.estimate_log_gains(maps, [images[each.name] for each in maps], told)
     return {each.name: own for each, own in zip(maps, found, strict=True)}
 
 
@@ -114,7 +112,9 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Perce
 
     def scored(kind: str, made: Callable[[], Snapshot], shown: Sequence[Frame], *found: float) -> Row:
         _, row, seconds = timed(made, scene, split, networks, Settings(best_gain=True))
-        saturated = 100.0 * float(np.mean([(frame.image >= light.SATURATED).any(-1).mean() for frame in shown]))
+        saturated = 100.0 * float(
+            np.mean([(frame.image >= scene_exposure.SATURATED).any(-1).mean() for frame in shown])
+        )
         scores = row.psnr, row.ssim, row.lpips_alex, row.num_gaussians
         return Row(scene.name, len(frames), kind, row.verdict, *scores, round(seconds, 1), round(saturated, 2), found)
 

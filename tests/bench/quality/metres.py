@@ -32,17 +32,13 @@ from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.geometry import compute_rms_radius
-from splatnode.recon.metric.config import Baseline, MetricConfig
 from splatnode.recon.metric.evidence import Evidence, gather_evidence
-from splatnode.recon.metric.marker_detection import MarkerDetection
-from splatnode.recon.metric.markers import estimate_scale_from_markers
-from splatnode.recon.metric.measurement import Measurement
+from splatnode.recon.metric.markers import MarkerDetection, estimate_scale_from_markers
+from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig, MetricView, make_metric_views
 from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.poses import PoseAlignment, PoseSigmas, align_to_poses
-from splatnode.recon.metric.stereo import estimate_scale_from_stereo
-from splatnode.recon.metric.stereo_pairs import StereoPair, make_pairs
-from splatnode.recon.metric.views import MetricView, make_metric_views
-from splatnode.recon.offline import run
+from splatnode.recon.metric.odometry import PoseAlignment, PoseSigmas, align_to_poses
+from splatnode.recon.metric.stereo import StereoPair, estimate_scale_from_stereo, make_pairs
+from splatnode.recon.pipeline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support import marked
 from tests.support.odometry import drifting

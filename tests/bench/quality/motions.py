@@ -24,17 +24,14 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.odometry import Config as Odometry
-from splatnode.capture.diorama.odometry import odometry
-from splatnode.capture.motion import Motion
+from splatnode.capture.diorama.scene import Config as Odometry
+from splatnode.capture.diorama.scene import odometry
+from splatnode.capture.odometry import Motion
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.metric.config import MetricConfig
-from splatnode.recon.metric.gravity import estimate_up
-from splatnode.recon.metric.measurement import Measurement
-from splatnode.recon.metric.motions import estimate_scale_from_motions
-from splatnode.recon.metric.views import MetricView, make_metric_views
-from splatnode.recon.offline import run
+from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView, make_metric_views
+from splatnode.recon.metric.odometry import estimate_scale_from_motions, estimate_up
+from splatnode.recon.pipeline import run
 from tests.bench.quality.metres import Array, Row, measured
 
 DRAWS = 40  # of odometry, in each place

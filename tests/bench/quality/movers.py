@@ -3,7 +3,8 @@
     python -m tests.bench movers --scenes shared/scenes --out movers.json
 
 The thing is an ellipse of the built-in capture, of one look and another place in each photograph. Held-out photographs
-have none. They are scored whole, and by how many photographs show a pixel beside the thing (`escape_source.py`): what the thing
+have none. They are scored whole, and by how many photographs show a pixel beside the thing (`escape_source.py`): what
+the thing
 hides in all of them can only be guessed. The scene of the photographs as they are is scored on the same pixels.
 """
 
@@ -19,12 +20,11 @@ from pathlib import Path
 from splatnode.capture.frame import Frame
 from splatnode.capture.masks import apply_mask
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.protocol import Settings
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.shown import compute_surfaces, count_visibility_by_name
 from splatnode.recon.frames.keyframe import resize_mask
-from splatnode.recon.offline import run
+from splatnode.recon.pipeline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case
 from tests.support.moving import look_of, pasted

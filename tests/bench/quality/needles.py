@@ -36,11 +36,11 @@ import numpy.typing as npt
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
 from splatnode.recon.config import ReconstructionConfig, preset
+from splatnode.recon.evaluate.methods import Start, continue_reconstruction, find_start
 from splatnode.recon.evaluate.protocol import Settings
-from splatnode.recon.evaluate.start import Start, continue_reconstruction, find_start
 from splatnode.recon.geometry import Similarity, align_cameras
 from splatnode.recon.result.export import sanitize_gaussians
-from splatnode.recon.result.only_seen import remove_unconfirmed
+from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality import known_surfaces
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case, parsed, parser_of

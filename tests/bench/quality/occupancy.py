@@ -30,20 +30,17 @@ import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
 from splatnode.capture.cameras import building, synthetic
-from splatnode.capture.diorama.building import view
-from splatnode.capture.diorama.building.interior import interior
+from splatnode.capture.diorama.building import walk
+from splatnode.capture.diorama.building.building import CHAIR_ROOM, MIRROR_ROOM, interior
 from splatnode.capture.diorama.building.plan import ZONES
-from splatnode.capture.diorama.building.rooms import CHAIR_ROOM, MIRROR_ROOM
-from splatnode.capture.diorama.cast import Camera
-from splatnode.capture.diorama.solids import Solid
+from splatnode.capture.diorama.render import Camera, Solid
 from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import Similarity, align_cameras
-from splatnode.recon.occupancy.build import NoMap, occupancy_map
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
+from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.priors.confirmed import compute_consistent_depths
+from splatnode.recon.priors.pointmap import compute_consistent_depths
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.threads import apply_thread_limit
 from tests.bench.quality.pane import Pane, photograph
@@ -137,12 +134,12 @@ def room(name: str, keyframes: Sequence[int], mirror: bool = False, config: buil
     )
 
 
-def _building(state: view.BuildingState) -> list[Solid]:
+def _building(state: walk.BuildingState) -> list[Solid]:
     zones = [interior(state.seed, building.BARE, zone.number) for zone in ZONES]
     return [solid for zone in zones for solid in zone.solids] + list(zones[CHAIR_ROOM].chairs[state.chair])
 
 
-def _mirror(state: view.BuildingState) -> Solid:
+def _mirror(state: walk.BuildingState) -> Solid:
     zone = interior(state.seed, building.BARE, MIRROR_ROOM)
     assert zone.mirror is not None
     return zone.solids[zone.mirror]

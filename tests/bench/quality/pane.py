@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.builder import turn
-from splatnode.capture.diorama.building.view import mirror_camera
-from splatnode.capture.diorama.cast import Camera, cast, colour_pixels, trace
-from splatnode.capture.diorama.solids import Shape, Solid
+from splatnode.capture.diorama.building.walk import mirror_camera
+from splatnode.capture.diorama.render import Camera, Shape, Solid, cast, colour_pixels, trace
+from splatnode.capture.diorama.scene import turn
 
 THROUGH, BACK = 0.9, 0.08  # of the light, that passes the glass, and that it reflects
 

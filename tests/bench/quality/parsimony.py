@@ -19,15 +19,15 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from splatnode.recon.config import ReconstructionConfig, preset
+from splatnode.recon.evaluate.methods import Start, continue_reconstruction
 from splatnode.recon.evaluate.protocol import Settings
-from splatnode.recon.evaluate.start import Start, continue_reconstruction
 from splatnode.recon.optimize.control import prune, relocate
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.report import peak_rss_mb
-from splatnode.recon.scene import pixelwise
+from splatnode.recon.scene import initialization
 from tests.bench.quality import race_cases
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
@@ -61,7 +61,7 @@ def configurations(chosen: int) -> dict[str, ReconstructionConfig]:
     ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
     fine = replace(ours.seeding, max_error=1e-4, min_area_px=1.0)
     by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
-    by_pixel = replace(ours, pixelwise=pixelwise.PixelwiseConfig(), optimize=replace(ours.optimize, control=None))
+    by_pixel = replace(ours, pixelwise=initialization.PixelwiseConfig(), optimize=replace(ours.optimize, control=None))
     relocating = replace(ours.optimize, control=ControlChoice("relocate", relocate.Config()))
     forced = {
         f"x{factor:g}": replace(ours, seeding=fine, optimize=by_size, max_gaussians=round(factor * chosen))

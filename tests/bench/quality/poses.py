@@ -20,18 +20,17 @@ import numpy as np
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.evaluate.camera_errors import compare_cameras
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.stability.claim import measure_camera_errors
-from splatnode.recon.evaluate.stability.own_cameras import list_registered_cameras
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
+from splatnode.recon.evaluate.stability.case import measure_camera_errors
+from splatnode.recon.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.frames.keyframe import Keyframe, resize_image
 from splatnode.recon.matching import features
-from splatnode.recon.matching.match import match
-from splatnode.recon.registration import register
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.matching.view_graph import match
+from splatnode.recon.registration import registration as registration_registration
+from splatnode.recon.registration.registration import Registration
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.decision import decide, refuse_before_registration
-from splatnode.recon.verification.verify import verify
+from splatnode.recon.verification.evidence import verify
 
 RIGHT_ROTATION_DEG = 2.0
 RIGHT_CENTRE_PCT = 5.0
@@ -70,7 +69,7 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Reconstructi
     pictures = [resize_image(frame.image, config.size) for frame in frames]
     graph = match(map(Keyframe, frames, pictures, found), config.matching)
     laps.append(time.perf_counter())
-    registration = register.register(graph.keyframes, graph.pairs, config.registration)
+    registration = registration_registration.register(graph.keyframes, graph.pairs, config.registration)
     laps.append(time.perf_counter())
     evidence = verify(graph, registration, config.verification)
     laps.append(time.perf_counter())

@@ -31,13 +31,12 @@ import numpy.typing as npt
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.locating.locate import localize_image
+from splatnode.recon.locating.localize import localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.result.landmarks_file import decode_landmarks, encode_landmarks
+from splatnode.recon.result.npz_files import decode_landmarks, encode_landmarks
+from splatnode.recon.result.snapshot import Landmarks
 from tests.bench.quality.following import errors_of
 from tests.bench.quality.locate import estimated, head_commit, outcome
 from tests.bench.quality.query_warps import BAR, CLEAN, WARPS, Query

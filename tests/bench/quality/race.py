@@ -22,19 +22,15 @@ import msgspec
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.arguments import names, positive
-from splatnode.capture.process.progress import say
+from splatnode.capture.process.terminal import say
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import MethodRunner, Plan, run_bench
-from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
-from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Settings
-from splatnode.recon.evaluate.records import Bench
-from splatnode.recon.evaluate.report import redraw
-from splatnode.recon.evaluate.start import Start, continue_reconstruction, extract_start_config
+from splatnode.recon.evaluate.methods import Start, continue_reconstruction, extract_start_config
+from splatnode.recon.evaluate.protocol import INTERPOLATED_START, PerceptualNetworks, Settings, load_networks
+from splatnode.recon.evaluate.report import Bench, redraw
+from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
 from splatnode.recon.jobs.calls import Engine, engine
-from splatnode.recon.rasterize.device import Device, DeviceUnavailable, choose_device
-from splatnode.recon.rasterize.dispatch import make_rasterizer
+from splatnode.recon.rasterize.dispatch import Device, DeviceUnavailable, choose_device, make_rasterizer
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.shared_arguments import add_device

@@ -14,9 +14,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from splatnode.recon.config import PRESETS
 from splatnode.recon.evaluate.charts import INK, choose_style, encode_png, style_axes
-from splatnode.recon.evaluate.contest import OURS, WHOLE
 from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.tables import Measure
+from splatnode.recon.evaluate.report import OURS, WHOLE, Measure
 
 TICKS = (0.5, 1.0, 2.0, 4.0, 8.0)  # of time, over ours
 SMALLEST, LARGEST = 25.0, 330.0  # bubble areas, in points^2

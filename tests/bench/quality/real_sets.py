@@ -12,13 +12,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.process.progress import say
+from splatnode.capture.process.terminal import say
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks, load_networks
-from splatnode.recon.evaluate.protocol import Row, Run, Settings, evaluate
-from splatnode.recon.evaluate.splits import Split, load_split
-from splatnode.recon.evaluate.start import Start, continue_reconstruction
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.recon.evaluate.methods import Start, continue_reconstruction
+from splatnode.recon.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate, load_networks
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 

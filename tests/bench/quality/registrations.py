@@ -22,16 +22,20 @@ from typing import Any
 
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.stability.case import MatrixRow
-from splatnode.recon.evaluate.stability.claim import ROUGH
+from splatnode.recon.evaluate.stability.case import ROUGH, MatrixRow, classify_outcome, score_cameras
 from splatnode.recon.evaluate.stability.matrix import ROWS
-from splatnode.recon.evaluate.stability.outcome import classify_outcome, score_cameras
-from splatnode.recon.evaluate.stability.own_cameras import ensure_registration, list_registered_cameras
-from splatnode.recon.evaluate.stability.places import Sampler, load_scenes_by_motion, load_trial_scenes
-from splatnode.recon.evaluate.stability.windows import ours
-from splatnode.recon.evaluate.stability.windows.row import OURS, judge_window
-from splatnode.recon.evaluate.stability.windows.store import Key, select_keys
-from splatnode.recon.evaluate.stability.windows.window import Window, draw_windows, select_moving_scenes
+from splatnode.recon.evaluate.stability.perturbations import Sampler, load_scenes_by_motion, load_trial_scenes
+from splatnode.recon.evaluate.stability.trial import ensure_registration, list_registered_cameras
+from splatnode.recon.evaluate.stability.windows import campaign
+from splatnode.recon.evaluate.stability.windows.windows import (
+    OURS,
+    PieceKey,
+    Window,
+    draw_windows,
+    judge_window,
+    select_keys,
+    select_moving_scenes,
+)
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 
@@ -45,10 +49,12 @@ OTHERS = (
 )  # fmt: skip
 
 
-def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, ours.Told]]:
+def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, campaign.Told]]:
     """The windows of a place and what is told, in an order in which they share most of what was found."""
-    something: tuple[ours.Told, ...] = ("exif", "given")
-    asked: list[tuple[Window, ours.Told]] = [(window, "nothing") for window in place_windows(2, counts=(2, 3, 6, 12))]
+    something: tuple[campaign.Told, ...] = ("exif", "given")
+    asked: list[tuple[Window, campaign.Told]] = [
+        (window, "nothing") for window in place_windows(2, counts=(2, 3, 6, 12))
+    ]
     for window in [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]:
         asked.extend((window, told) for told in something)
     asked.sort(key=lambda each: (each[0].count, each[0].stride, each[0].start, each[1]))
@@ -57,12 +63,12 @@ def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, ours.To
 
 def of_scene(scene: Path, out: Path) -> list[dict[str, Any]]:
     """The rows of the scene's windows, each with what was told."""
-    rows, caches = [], defaultdict[str, dict[Key, bytes]](dict)
+    rows, caches = [], defaultdict[str, dict[PieceKey, bytes]](dict)
     for place in select_moving_scenes(load_trial_scenes([scene], out)):
         for window, told in plan(partial(draw_windows, place, seed=0)):
             cache = caches["given" if told == "given" else "centred"]
             known = {key: cache[key] for key in select_keys(cache.keys(), window.names)}
-            answer, found = ours.answer_window(place, window, ReconstructionConfig(), False, told, known)
+            answer, found = campaign.reconstruct_window(place, window, ReconstructionConfig(), False, told, known)
             cache.update(found)
             rows.append({"told": told, "row": asdict(judge_window(window, OURS, answer, place.scene.cameras))})
     return rows

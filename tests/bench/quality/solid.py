@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.cast import Camera, trace
-from splatnode.capture.diorama.solids import Shape, Solid
+from splatnode.capture.diorama.render import Camera, Shape, Solid, trace
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

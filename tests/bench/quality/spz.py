@@ -14,7 +14,7 @@ import numpy as np
 
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.formats.spz import decode, encode_spz
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.start import extract_start_config
+from splatnode.recon.evaluate.methods import extract_start_config
 from tests.bench.quality import race
 
 

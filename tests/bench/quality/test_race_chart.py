@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from splatnode.recon.evaluate.contest import LPIPS
 from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.tables import PSNR
+from splatnode.recon.evaluate.report import LPIPS, PSNR
 from tests.bench.quality import race_chart
 
 

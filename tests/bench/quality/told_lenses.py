@@ -19,12 +19,10 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.lens import project, unproject
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.places import TrialImage
-from splatnode.recon.evaluate.stability.warps import distort_image
-from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.offline import run
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split
+from splatnode.recon.evaluate.protocol import PerceptualNetworks
+from splatnode.recon.evaluate.stability.perturbations import TrialImage, distort_image
+from splatnode.recon.pipeline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.real_sets import measure
 from tests.bench.quality.unknown_lenses import corner_moves_pct

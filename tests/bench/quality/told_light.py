@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatnode.recon.evaluate.perceptual import PerceptualNetworks
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.start import Start, extract_start_config, find_start
-from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.scene import light
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split
+from splatnode.recon.evaluate.methods import Start, extract_start_config, find_start
+from splatnode.recon.evaluate.protocol import PerceptualNetworks
+from splatnode.recon.scene import exposure
 from tests.bench.quality.light import ON, changed, drawn, gain_errors
 from tests.bench.quality.real_sets import measure
 
@@ -50,7 +49,7 @@ def words(gains: Mapping[str, float]) -> dict[str, dict[str, float]]:
 def is_left(start: Start, told: Mapping[str, float]) -> bool:
     maps = list(start.estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
-    return not light.estimate_exposures(maps, images, ON.light, told)
+    return not exposure.estimate_exposures(maps, images, ON.light, told)
 
 
 def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: PerceptualNetworks) -> list[Row]:

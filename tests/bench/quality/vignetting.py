@@ -19,18 +19,17 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import preset
+from splatnode.recon.evaluate.dataset import EvaluationScene, Split
+from splatnode.recon.evaluate.methods import extract_start_config, find_start
 from splatnode.recon.evaluate.protocol import PerceptualNetworks
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.corruptions import apply_vignetting
-from splatnode.recon.evaluate.start import extract_start_config, find_start
-from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.scene import light
+from splatnode.recon.evaluate.stability.perturbations import apply_vignetting
+from splatnode.recon.scene import exposure
 from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = ("fountain_p11:6", "llff_fern:6", "sceaux:6")
 LOSSES = (0.0, 0.45, 0.6)  # of the light in the corners
 ON = preset("balanced")
-OFF = msgspec.structs.replace(ON, light=light.ExposureConfig(enabled=False))
+OFF = msgspec.structs.replace(ON, light=exposure.ExposureConfig(enabled=False))
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from splatnode.capture.process.progress import say
-from splatnode.recon.evaluate.stability.places import load_trial_scenes
-from splatnode.recon.evaluate.timing import describe_processor
+from splatnode.capture.process.terminal import say
+from splatnode.recon.evaluate.report import describe_processor
+from splatnode.recon.evaluate.stability.perturbations import load_trial_scenes
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT
 

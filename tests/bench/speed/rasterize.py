@@ -27,12 +27,12 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon import core
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import exp_se3, twist_gradient
-from splatnode.recon.optimize.adam import Adam
-from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.optimize.optimizer import Adam
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize import cpu
 from splatnode.recon.rasterize.reference import CHANNELS
-from splatnode.recon.scene.gaussians import SH_C0
+from splatnode.recon.scene.scene import SH_C0
 
 FLOPS_PER_PAIR = 117
 LRS = {"means": 1.6e-3, "quats": 1e-2, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh": 1e-1, "twist": 1e-4}

@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import resize_image
-from splatnode.recon.networks.weight_folder import find
+from splatnode.recon.networks.weights import find
 from splatnode.recon.priors.classical import DepthEstimator
-from splatnode.recon.priors.consistency import DepthMap
+from splatnode.recon.priors.multi_view_consistency import DepthMap
 from splatnode.recon.priors.patchmatchnet import WEIGHTS, load_network
 from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
 from splatnode.recon.priors.stereo import (

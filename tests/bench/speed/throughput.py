@@ -20,7 +20,7 @@ from pathlib import Path
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.process.progress import say
+from splatnode.capture.process.terminal import say
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT
 

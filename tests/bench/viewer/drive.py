@@ -19,20 +19,17 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.network import RECON_SCENE, RECON_STATUS, Network
+from splatnode.capture.messaging.pubsub import Publisher, StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.analysis import analyse
-from splatnode.viewer.canvas import project
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.sources import load_result
-from splatnode.viewer.viewpoint import overview
+from splatnode.viewer.state import Moment
+from splatnode.viewer.viewpoint import overview, project
 from tests.support.node import heartbeat
 from tests.support.screen import Screen
 

@@ -26,10 +26,9 @@ import numpy.typing as npt
 from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.analysis import analyse
-from splatnode.viewer.canvas import project
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.sources import load_result
-from splatnode.viewer.viewpoint import overview
+from splatnode.viewer.state import Moment
+from splatnode.viewer.viewpoint import overview, project
 from tests.bench.speed.rasterize import processor_name
 from tests.bench.viewer.drive import growing
 from tests.support.chromium import Browser, browser

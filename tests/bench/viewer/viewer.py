@@ -22,11 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.viewer.moment import Moment
 from splatnode.viewer.probe import probe_window
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import FixedSource, load_result
-from splatnode.viewer.state import Engine, ViewerState
+from splatnode.viewer.state import Engine, Moment, ViewerState
 from splatnode.viewer.viewpoint import orbit
 from tests.bench.speed.rasterize import processor_name
 from tests.bench.viewer.agreement import agreement

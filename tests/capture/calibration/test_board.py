@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture.calibration.board import Board, board_page
-from splatnode.capture.calibration.pdf import PAPERS, Page
+from splatnode.capture.calibration.board import PAPERS, Board, Page, board_page
 
 _PIXELS_PER_MM = 4
 

@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from splatnode import command_line
-from splatnode.capture.calibration import command
+from splatnode.capture.calibration import collect
 from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.lacking import Limits
+from splatnode.capture.calibration.collect import Limits
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.lens_file import read_lens
@@ -93,8 +93,8 @@ def every_frame(opened: Callable[[], Iterator[Frame | DroppedFrame]], live: bool
 
 
 def test_a_camera_is_watched_until_the_lens_is_known(photographs, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(command, "GOOD", Limits(focal=0.002, corner=0.0008))
-    monkeypatch.setattr(command, "Reader", every_frame)
+    monkeypatch.setattr(collect, "GOOD", Limits(focal=0.002, corner=0.0008))
+    monkeypatch.setattr(collect, "Reader", every_frame)
     with fake_camera("showing", CAMERA, tmp_path, monkeypatch) as config:
         arguments = [str(config), "--set", f"camera.folder={photographs}", "--model", "opencv2"]
         assert command_line.main(["calibrate", *arguments, "--out", str(tmp_path / "lens.yaml")]) == 0
@@ -175,10 +175,10 @@ def test_a_film_is_named_as_for_replay(tmp_path, capsys):
     (data_set / "meta").mkdir(parents=True)
     (data_set / "meta" / "info.json").write_text("{}")
     film.write_bytes(b"")
-    camera = command._config(tmp_path / "set#3" / "observation.images.top", []).camera
+    camera = collect._config(tmp_path / "set#3" / "observation.images.top", []).camera
     assert (camera.kind, camera.config.folder, camera.config.part) == ("lerobot", data_set, "3/observation.images.top")
-    assert command._is_moving(camera) and command._is_moving(command._config(film, []).camera)
-    assert not command._is_moving(command._config(tmp_path, []).camera)
+    assert collect._is_moving(camera) and collect._is_moving(collect._config(film, []).camera)
+    assert not collect._is_moving(collect._config(tmp_path, []).camera)
     code, told = refusal(capsys, tmp_path / "film.mp4#3", "--out", tmp_path / "lens.yaml")
     assert code == 2 and "behind the # must be seconds of the video" in told
 

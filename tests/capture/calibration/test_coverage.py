@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatnode.capture.calibration.corners import BoardView
-from splatnode.capture.calibration.coverage import add_picture, add_view, create_coverage
-from splatnode.capture.calibration.lacking import describe_missing_coverage
+from splatnode.capture.calibration.board import BoardView
+from splatnode.capture.calibration.collect import add_picture, add_view, create_coverage, describe_missing_coverage
 
 LIGHT = np.full((300, 400, 3), 100, np.uint8)
 

@@ -7,13 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.corners import BoardView
-from splatnode.capture.calibration.estimate import estimate_lens
-from splatnode.capture.calibration.hold_out import choose
-from splatnode.capture.calibration.lacking import ENOUGH
-from splatnode.capture.calibration.models import MODELS
-from splatnode.capture.calibration.uncertainty import pixel_sigmas
+from splatnode.capture.calibration.board import Board, BoardView
+from splatnode.capture.calibration.collect import ENOUGH
+from splatnode.capture.calibration.estimate import MODELS, choose, estimate_lens, pixel_sigmas
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import lens as lenses
 from tests.support.board_photographs import parallel, waved

@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.capture.calibration import command, gathering, thinning
-from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.corners import LEAST_CORNERS, BoardView
-from splatnode.capture.calibration.coverage import add_view, create_coverage
-from splatnode.capture.calibration.gathering import MOST_VIEWS, Gathering
-from splatnode.capture.calibration.lacking import TooLittle, describe_missing_coverage
-from splatnode.capture.calibration.models import MODELS
-from splatnode.capture.calibration.rotations import rotations
+from splatnode.capture.calibration import collect
+from splatnode.capture.calibration.board import LEAST_CORNERS, Board, BoardView
+from splatnode.capture.calibration.collect import (
+    MOST_VIEWS,
+    Gathering,
+    TooLittle,
+    add_view,
+    create_coverage,
+    describe_missing_coverage,
+)
+from splatnode.capture.calibration.estimate import MODELS, rotations
 from splatnode.capture.cameras import folder, v4l2
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.frame import Frame
@@ -66,7 +69,7 @@ def finding(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, BoardView]],
     """Pictures show the views of their names, without being looked at."""
 
     def find(views: dict[str, BoardView]) -> None:
-        monkeypatch.setattr(gathering, "corner_finder", lambda board: lambda name, image: views[name])
+        monkeypatch.setattr(collect, "corner_finder", lambda board: lambda name, image: views[name])
 
     return find
 
@@ -85,8 +88,8 @@ def test_of_two_views_near_each_other_the_one_that_is_nearer_to_a_third_is_super
     places = {"a": (500.0, 375.0), "b": (504.0, 375.0), "c": (512.0, 375.0), "low": (504.0, 640.0)}
     a, b, c, low = (shown(name, (0.0, 0.0), place, 0.3) for name, place in places.items())
     apart = np.array([[np.inf, 4.0, 12.0], [4.0, np.inf, 8.0], [12.0, 8.0, np.inf]])
-    assert thinning.find_redundant_view([a, b, c], apart, WIDTH, HEIGHT) == 1
-    assert thinning.find_redundant_view([a, low, c], apart, WIDTH, HEIGHT) == 0
+    assert collect.find_redundant_view([a, b, c], apart, WIDTH, HEIGHT) == 1
+    assert collect.find_redundant_view([a, low, c], apart, WIDTH, HEIGHT) == 0
 
 
 def test_of_too_many_views_those_are_kept_that_see_all_that_was_seen(finding):
@@ -124,12 +127,12 @@ class FromFrames:
 
 
 def focal_by(monkeypatch: pytest.MonkeyPatch, opened: FromFrames, live: bool) -> float:
-    monkeypatch.setattr(command, "camera_opener", opened)
-    monkeypatch.setattr(command, "is_live", lambda camera: live)
-    monkeypatch.setattr(command, "Reader", lambda opener, _live, config: Reader(opener, False, config))
+    monkeypatch.setattr(collect, "camera_opener", opened)
+    monkeypatch.setattr(collect, "is_live", lambda camera: live)
+    monkeypatch.setattr(collect, "Reader", lambda opener, _live, config: Reader(opener, False, config))
     camera = Camera("v4l2", v4l2.Config()) if live else Camera("folder", folder.Config(Path("photographs")))
     config = CaptureConfig(camera, reader=Config())
-    choice, _ = command._calibrate_stream(config, BOARD, [MODELS["pinhole"]], None, lambda _: None)
+    choice, _ = collect._calibrate_stream(config, BOARD, [MODELS["pinhole"]], None, lambda _: None)
     return choice.taken.estimate.lens.fx
 
 
@@ -150,7 +153,7 @@ def test_all_of_a_folder_is_looked_at(finding, monkeypatch, late):
 def test_a_camera_is_watched_until_enough_was_shown_and_no_longer(finding, monkeypatch, late):
     views = by_chance(300, **late)
     finding(views)
-    monkeypatch.setattr(command, "_TRY_EVERY", 50)
+    monkeypatch.setattr(collect, "_TRY_EVERY", 50)
     opened = FromFrames(frames(views, 2))
     assert abs(focal_by(monkeypatch, opened, live=True) / FOCAL - 1) < 0.003 and 220 < opened.given < 400
 
@@ -158,8 +161,8 @@ def test_a_camera_is_watched_until_enough_was_shown_and_no_longer(finding, monke
 def test_a_camera_that_never_shows_what_is_missing_is_not_watched_for_ever(finding, monkeypatch):
     views = by_chance(200, left=0, tilted_from=200)
     finding(views)
-    monkeypatch.setattr(command, "_GIVEN_UP", MOST_VIEWS + 10)
-    monkeypatch.setattr(command, "_TRY_EVERY", 50)
+    monkeypatch.setattr(collect, "_GIVEN_UP", MOST_VIEWS + 10)
+    monkeypatch.setattr(collect, "_TRY_EVERY", 50)
     opened = FromFrames(frames(views, 2))
     with pytest.raises(TooLittle, match="Tilt"):
         focal_by(monkeypatch, opened, live=True)

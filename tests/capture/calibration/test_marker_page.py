@@ -6,9 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture.calibration.board import DICTIONARIES
-from splatnode.capture.calibration.marker_page import Markers, marker_pages
-from splatnode.capture.calibration.pdf import PAPERS, Page
+from splatnode.capture.calibration.board import DICTIONARIES, PAPERS, Markers, Page, marker_pages
 from splatnode.command_line import main
 
 _DOTS = 4  # a millimetre

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from splatnode.capture.calibration.pdf import PAPERS, Page, Rectangle, Text, pdf_of
+from splatnode.capture.calibration.board import PAPERS, Page, Rectangle, Text, pdf_of
 
 
 def test_the_table_says_where_each_object_begins():

@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.capture.calibration.models import MODELS
-from splatnode.capture.calibration.projection import project_points
+from splatnode.capture.calibration.estimate import MODELS, project_points
 from splatnode.capture.lenses import lens as lenses
 
 RNG = np.random.default_rng(0)

@@ -3,12 +3,9 @@ from __future__ import annotations
 import numpy as np
 import yaml
 
-from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.corners import BoardView
-from splatnode.capture.calibration.coverage import add_view, create_coverage
-from splatnode.capture.calibration.hold_out import Choice, choose
-from splatnode.capture.calibration.models import MODELS
-from splatnode.capture.calibration.report import describe_choice, lens_file
+from splatnode.capture.calibration.board import Board, BoardView
+from splatnode.capture.calibration.collect import add_view, create_coverage, describe_choice, lens_file
+from splatnode.capture.calibration.estimate import MODELS, Choice, choose
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.lenses import lens as lenses

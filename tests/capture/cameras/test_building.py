@@ -7,14 +7,12 @@ import pytest
 
 from splatnode.capture.cameras import building
 from splatnode.capture.config import CaptureConfig, camera_opener
-from splatnode.capture.diorama.building import view
-from splatnode.capture.diorama.building.interior import interior
+from splatnode.capture.diorama.building import walk
+from splatnode.capture.diorama.building.building import CHAIR_ROOM, LOOK_ALIKES, MIRROR_ROOM, interior
 from splatnode.capture.diorama.building.plan import CORRIDOR, ZONES, zones_at
-from splatnode.capture.diorama.building.rooms import CHAIR_ROOM, LOOK_ALIKES, MIRROR_ROOM
-from splatnode.capture.diorama.look_at import look_at
-from splatnode.capture.frame import Frame
+from splatnode.capture.diorama.render import look_at
+from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.process.config import parse_config
-from splatnode.capture.stamp import Clock, Stamp
 
 TINY = building.Config(width=96, height=72, samples=1)
 
@@ -111,7 +109,7 @@ def test_the_chair_stands_elsewhere_when_the_robot_comes_again():
     before, after = building.state(TINY, first + 10), building.state(TINY, again + 10)
     assert (before.chair, building.state(TINY, last + 3).chair, after.chair) == (0, 1, 1)
     camera = building.scene_camera(TINY, 12)
-    depths = [view.depth(state, camera, 96, 72) for state in (before, after)]
+    depths = [walk.depth(state, camera, 96, 72) for state in (before, after)]
     assert 0.01 < (np.abs(depths[0] - depths[1]) > 0.1).mean() < 0.3
 
 
@@ -126,7 +124,7 @@ def test_the_mirror_shows_what_a_camera_at_its_glass_sees():
     face = glass.centre + glass.axes[:, 1]
     stand = np.array([0.6 * x + 0.4 * face[0], 0.6 * y + 0.4 * face[1], 1.3])
     camera = look_at(stand, face), building.intrinsic_matrix(TINY)
-    colours, z = view.view(state, camera, 96, 72), view.depth(state, camera, 96, 72)
+    colours, z = walk.view(state, camera, 96, 72), walk.depth(state, camera, 96, 72)
     agree = []
     for row, column in itertools.product((24, 36, 44), (36, 44, 52, 60)):
         ray = camera[0][:3, :3] @ np.linalg.inv(camera[1]) @ [column + 0.5, row + 0.5, 1.0]
@@ -138,8 +136,8 @@ def test_the_mirror_shows_what_a_camera_at_its_glass_sees():
             look_at(point + 0.001 * normal, point + turned),
             np.array([[400.0, 0, 0.5], [0, 400, 0.5], [0, 0, 1]]),
         )
-        seen = view.view(state, at_glass, 1, 1)[0, 0]
-        agree.append(np.abs(colours[row, column] - view.SILVER * seen).max() < 8)
+        seen = walk.view(state, at_glass, 1, 1)[0, 0]
+        agree.append(np.abs(colours[row, column] - walk.SILVER * seen).max() < 8)
     assert len(agree) >= 6 and np.mean(agree) > 0.8
 
 
@@ -147,9 +145,9 @@ def test_a_mirrored_camera_mirrored_again_is_itself():
     zone = interior(0, building.state(TINY, 0).density, MIRROR_ROOM)
     assert zone.mirror is not None
     camera = building.scene_camera(TINY, 3)
-    once = view.mirror_camera(zone.solids[zone.mirror], camera)
+    once = walk.mirror_camera(zone.solids[zone.mirror], camera)
     assert np.linalg.det(once[0][:3, :3]) == pytest.approx(-1)
-    assert np.allclose(view.mirror_camera(zone.solids[zone.mirror], once)[0], camera[0])
+    assert np.allclose(walk.mirror_camera(zone.solids[zone.mirror], once)[0], camera[0])
 
 
 def test_some_keyframes_in_a_row_show_a_blank_wall_and_few():

@@ -17,11 +17,15 @@ import pytest
 
 from splatnode.capture.cameras import depthai as oak
 from splatnode.capture.cameras.depthai import Config, Source, convert_frame, convert_stereo_pair, find, read, stream
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.right_image import Baseline
-from splatnode.capture.stamp import Clock
-from splatnode.capture.unavailable import CameraUnavailable
+from splatnode.capture.frame import (
+    Baseline,
+    CameraUnavailable,
+    Clock,
+    DroppedFrame,
+    ExposureSettings,
+    Frame,
+    Intrinsics,
+)
 from tests.conftest import ROOT
 
 PERSPECTIVE = "CameraModel.Perspective"

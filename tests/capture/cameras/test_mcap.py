@@ -19,10 +19,9 @@ from mcap.writer import CompressionType
 
 from splatnode.capture import film
 from splatnode.capture.cameras.mcap import Config, image_topics, stream
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.logged import mcap
 from splatnode.capture.logged.mcap import UnusableLog, unpack_chunk
-from splatnode.capture.stamp import Clock, Stamp
 from tests.support.mcap_files import START_NS, STEP_NS, as_json, calibration, compressed, raw, write
 
 K = (100.0, 0.0, 31.5, 0.0, 110.0, 23.5, 0.0, 0.0, 1.0)

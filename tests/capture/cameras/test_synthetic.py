@@ -7,11 +7,10 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.cameras.synthetic import Config
-from splatnode.capture.diorama.layout import place
-from splatnode.capture.diorama.solids import Shape, face_points, ray_interval, surface_coordinates
-from splatnode.capture.frame import Intrinsics
+from splatnode.capture.diorama.render import Shape, face_points, ray_interval, surface_coordinates
+from splatnode.capture.diorama.scene import place
+from splatnode.capture.frame import Clock, Intrinsics, Stamp
 from splatnode.capture.lenses.lens import unproject
-from splatnode.capture.stamp import Clock, Stamp
 from tests.support.synthetic import SMALL, photographs, planar, pure_rotation, pure_rotation_cameras, tiny_scene
 
 

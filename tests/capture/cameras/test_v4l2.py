@@ -12,13 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
+from splatnode.capture import v4l2_device
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.cameras.v4l2 import Config, find, stream
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.stamp import Clock
-from splatnode.capture.unavailable import CameraUnavailable
-from splatnode.capture.video4linux import layout, locks
-from splatnode.capture.video4linux.device import Device, System
+from splatnode.capture.frame import CameraUnavailable, Clock, DroppedFrame, Frame, Intrinsics
+from splatnode.capture.v4l2_device import Device, System
 
 IMAGE = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8), (0, 0), 3)
 JPEG = cv2.imencode(".jpg", cv2.cvtColor(IMAGE, cv2.COLOR_RGB2BGR))[1].tobytes()
@@ -56,25 +54,25 @@ class Driver:
 
     def _ioctl(self, fd, request, argument):
         assert fd == 7 and not self.closed
-        name = next(name for name in dir(layout) if getattr(layout, name) == request)
+        name = next(name for name in dir(v4l2_device) if getattr(v4l2_device, name) == request)
         getattr(self, f"_{name.lower()}")(argument)
 
     def _querycap(self, it):
         it.card, it.bus_info = b"Fake Webcam", b"usb-1"
-        it.capabilities = layout.HAS_DEVICE_CAPS | layout.CAN_CAPTURE
-        it.device_caps = layout.CAN_CAPTURE | layout.CAN_STREAM
+        it.capabilities = v4l2_device.HAS_DEVICE_CAPS | v4l2_device.CAN_CAPTURE
+        it.device_caps = v4l2_device.CAN_CAPTURE | v4l2_device.CAN_STREAM
 
     def _enum_fmt(self, it):
         if it.index >= len(self.formats):
             raise OSError(errno.EINVAL, "Invalid argument")
-        it.pixelformat = layout.fourcc(self.formats[it.index])
+        it.pixelformat = v4l2_device.fourcc(self.formats[it.index])
 
     def _s_fmt(self, it):
         pix = it.fmt.pix
-        self.pixels = layout.fourcc_name(pix.pixelformat)
+        self.pixels = v4l2_device.fourcc_name(pix.pixelformat)
         if self.pixels not in self.formats:
             self.pixels = self.formats[0]
-        pix.pixelformat, pix.width, pix.height = layout.fourcc(self.pixels), 64, 48
+        pix.pixelformat, pix.width, pix.height = v4l2_device.fourcc(self.pixels), 64, 48
         pix.bytesperline = 128 + self.padding if self.pixels == "YUYV" else 0
 
     def _s_parm(self, it):
@@ -92,7 +90,7 @@ class Driver:
         self.queued.append(it.index)
 
     def _streamon(self, it):
-        assert isinstance(it, ctypes.c_int) and it.value == layout.CAPTURE
+        assert isinstance(it, ctypes.c_int) and it.value == v4l2_device.CAPTURE
 
     _streamoff = _streamon
 
@@ -108,7 +106,7 @@ class Driver:
         self.memory[it.index][: len(data)] = data
         it.bytesused, it.sequence = len(data), self.delivered
         it.timestamp.seconds, it.timestamp.microseconds = 100, 1000 * self.delivered
-        it.flags = layout.TIMESTAMP_MONOTONIC | (layout.BUFFER_ERROR if event == "error" else 0)
+        it.flags = v4l2_device.TIMESTAMP_MONOTONIC | (v4l2_device.BUFFER_ERROR if event == "error" else 0)
 
     def _padded(self):
         lines = np.frombuffer(YUYV, np.uint8).reshape(48, 128)
@@ -139,10 +137,16 @@ def no_real_cameras(monkeypatch):
 
 
 def test_the_structs_are_as_large_as_the_kernels():
-    sizes = (layout.Capability, layout.Format, layout.BufferRequest, layout.Buffer, layout.StreamParameters)
+    sizes = (
+        v4l2_device.Capability,
+        v4l2_device.FormatStruct,
+        v4l2_device.BufferRequest,
+        v4l2_device.Buffer,
+        v4l2_device.StreamParameters,
+    )
     assert [ctypes.sizeof(size) for size in sizes] == [104, 208, 20, 88, 204]
-    assert (layout.QUERYCAP, layout.S_FMT, layout.DQBUF) == (0x80685600, 0xC0D05605, 0xC0585611)
-    assert (layout.STREAMON, layout.S_PARM, layout.QUERYCTRL) == (0x40045612, 0xC0CC5616, 0xC0445624)
+    assert (v4l2_device.QUERYCAP, v4l2_device.S_FMT, v4l2_device.DQBUF) == (0x80685600, 0xC0D05605, 0xC0585611)
+    assert (v4l2_device.STREAMON, v4l2_device.S_PARM, v4l2_device.QUERYCTRL) == (0x40045612, 0xC0CC5616, 0xC0445624)
 
 
 def test_jpeg_frames_keep_their_bytes():
@@ -209,23 +213,28 @@ def test_a_lost_camera_says_why(driver, config, message):
 
 
 def test_exposure_and_white_balance_are_held_at_what_the_camera_chose():
-    controls = {locks.AUTO_EXPOSURE: 1, locks.EXPOSURE: 156, locks.AUTO_WHITE_BALANCE: 0, locks.EXPOSURE_PRIORITY: 1}
+    controls = {
+        v4l2_device.AUTO_EXPOSURE: 1,
+        v4l2_device.EXPOSURE: 156,
+        v4l2_device.AUTO_WHITE_BALANCE: 0,
+        v4l2_device.EXPOSURE_PRIORITY: 1,
+    }
     driver = Driver(controls=controls)
     frames(driver, 1, lock=True)
     assert driver.controls == {
-        locks.AUTO_EXPOSURE: locks.EXPOSURE_MANUAL,
-        locks.EXPOSURE: 156,
-        locks.AUTO_WHITE_BALANCE: 0,
-        locks.EXPOSURE_PRIORITY: 0,
+        v4l2_device.AUTO_EXPOSURE: v4l2_device.EXPOSURE_MANUAL,
+        v4l2_device.EXPOSURE: 156,
+        v4l2_device.AUTO_WHITE_BALANCE: 0,
+        v4l2_device.EXPOSURE_PRIORITY: 0,
     }
     frames(driver, 1, lock=True, exposure_us=5000)
-    assert driver.controls[locks.EXPOSURE] == 50
+    assert driver.controls[v4l2_device.EXPOSURE] == 50
 
 
 def test_what_cannot_be_held_is_told():
-    controls = {locks.AUTO_EXPOSURE: "stubborn", locks.AUTO_WHITE_BALANCE: 1}
+    controls = {v4l2_device.AUTO_EXPOSURE: "stubborn", v4l2_device.AUTO_WHITE_BALANCE: 1}
     with Device("/dev/video0", Driver(controls=controls).system()) as device:
-        assert locks.hold(device) == {"exposure": False, "gain": None, "white_balance": True, "focus": None}
+        assert v4l2_device.hold(device) == {"exposure": False, "gain": None, "white_balance": True, "focus": None}
 
 
 def test_closing_the_stream_closes_the_device():

@@ -12,9 +12,8 @@ import pytest
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.cameras.video import Config, stream
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.pace import pace_frames
-from splatnode.capture.stamp import Clock, Stamp
 from tests.support.clips import level_images, turn, write_clip, write_sound
 
 

@@ -17,13 +17,18 @@ import pytest
 from splatnode.capture.cameras import watched
 from splatnode.capture.cameras.watched import Config, stream
 from splatnode.capture.config import Camera, camera_opener
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.nothing_new import KeepAlive
+from splatnode.capture.frame import (
+    CameraUnavailable,
+    Clock,
+    DroppedFrame,
+    ExposureSettings,
+    Frame,
+    Intrinsics,
+    KeepAlive,
+    Stamp,
+)
 from splatnode.capture.reader import Config as ReaderConfig
 from splatnode.capture.reader import Reader, ReaderState
-from splatnode.capture.stamp import Clock, Stamp
-from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.cameras.test_folder import with_exif
 from tests.capture.messaging.test_sockets import wait_for
 

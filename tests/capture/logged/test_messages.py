@@ -14,11 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from splatnode.capture.cameras.mcap import Config, image_topics, stream
-from splatnode.capture.logged.calibration import calibration_topic
-from splatnode.capture.logged.cdr import Cdr
-from splatnode.capture.logged.message import Calibration, UnusableMessage
-from splatnode.capture.logged.protobuf import Fields
-from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES
+from splatnode.capture.logged.messages import (
+    CALIBRATIONS,
+    PICTURES,
+    Calibration,
+    Cdr,
+    Fields,
+    UnusableMessage,
+    calibration_topic,
+)
 from tests.support.mcap_files import START_NS, jpeg, write
 
 K = (100.0, 0.0, 31.5, 0.0, 110.0, 23.5, 0.0, 0.0, 1.0)

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras.mcap import Config, stream
-from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.logged import order
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
+from splatnode.capture.logged import messages
 from splatnode.capture.logged.mcap import topics
 from splatnode.capture.reader import Config as Reading
 from splatnode.capture.reader import Reader, ReaderState
-from splatnode.capture.stamp import Clock, Stamp
 from tests.support.mcap_files import START_NS, compressed, write
 
 COUNT, STEP_NS = 8, 100_000_000
@@ -81,10 +80,10 @@ def test_what_waits_takes_no_more_than_its_memory(tmp_path, monkeypatch):
     """Of a file that lies backwards only three messages may wait, so it is read again and again."""
     lie = list(range(COUNT))[::-1]
     file = log_of(tmp_path / "a.mcap", UTC, UTC, lie, chunk_size=1000)
-    plain, passes = order.messages, list[int]()
+    plain, passes = messages.messages, list[int]()
     one = max(len(message.data) for message in plain(file, {"/image"}))
-    monkeypatch.setattr(order, "_MAX_HELD_BYTES", 3 * one)
-    monkeypatch.setattr(order, "messages", lambda *args: passes.append(1) or plain(*args))
+    monkeypatch.setattr(messages, "_MAX_HELD_BYTES", 3 * one)
+    monkeypatch.setattr(messages, "messages", lambda *args: passes.append(1) or plain(*args))
     assert [number for number, *_ in read_frames(file)] == list(range(COUNT))
     assert len(passes) == 1 + 2, "once for the times, and once for each four: three that wait, and one that comes"
 
@@ -108,4 +107,4 @@ def test_an_image_that_cannot_be_read_is_named_where_it_lies(tmp_path):
     assert isinstance(first, Frame) and isinstance(broken, DroppedFrame) and isinstance(last, Frame)
     assert (broken.name, last.name) == ("image_000001.png", "image_000002.png")
     (known,) = topics(file)
-    assert [each.place for each in order.read_times(file, known)] == [0, 1, 2]
+    assert [each.place for each in messages.read_times(file, known)] == [0, 1, 2]

@@ -13,11 +13,16 @@ import pytest
 import zmq
 
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.broadcast import Publisher, Subscriber
-from splatnode.capture.messaging.keyframe_messages import DroppedHeader
-from splatnode.capture.messaging.network import Network, NetworkError, NotAllowed, runtime_directory
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_SCENE
-from splatnode.capture.messaging.state import StateClient, StateServer
+from splatnode.capture.messaging.messages import DroppedHeader
+from splatnode.capture.messaging.network import (
+    CAPTURE_PREVIEW,
+    RECON_SCENE,
+    Network,
+    NetworkError,
+    NotAllowed,
+    runtime_directory,
+)
+from splatnode.capture.messaging.pubsub import Publisher, StateClient, StateServer, Subscriber
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.command_line import main
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
@@ -26,10 +31,10 @@ from tests.support.strays import STRAYS
 
 SERVES = """
 import pathlib, resource, sys
-from splatnode.capture.messaging.keyframe_messages import DroppedHeader
+from splatnode.capture.messaging.messages import DroppedHeader
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.network import RECON_SCENE
+from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.messaging.wire import Numbering
 resource.setrlimit(resource.RLIMIT_NOFILE, (60, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
 with StateServer(RECON_SCENE, Network(directory=pathlib.Path(sys.argv[1]))) as server:

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 import zmq
 
-from splatnode.capture.frame import Frame
-from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
-from splatnode.capture.messaging.keyframe_messages import FrameHeader, decode_frame, encode_frame
+from splatnode.capture.frame import Baseline, Frame, RightImage
+from splatnode.capture.messaging.messages import FrameHeader, arrays_of, decode_frame, encode_frame, frame_in
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Limits, Numbering, decode
-from splatnode.capture.right_image import Baseline, RightImage
 
 IMAGE = np.zeros((5, 11, 3), np.uint8)
 MASK = np.random.default_rng(0).random((5, 11)) < 0.5

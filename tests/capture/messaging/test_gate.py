@@ -11,13 +11,12 @@ import zmq
 
 from splatnode.capture.messaging import gate as gate_module
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.broadcast import Publisher, Subscriber
 from splatnode.capture.messaging.gate import PLACES
-from splatnode.capture.messaging.network import files_for_strangers
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, files_for_strangers
+from splatnode.capture.messaging.pubsub import Publisher, Subscriber
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.crowd import network_of, next_to_go
-from splatnode.capture.process.limits import LimitTooLow
+from splatnode.capture.process.system import LimitTooLow
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
 from tests.fuzz.siege import GREETING, HELLO
 from tests.support.node import descriptors
@@ -91,5 +90,5 @@ def test_what_strangers_may_take_is_left_free_or_the_start_is_refused(tmp_path, 
     needed = files_for_strangers(tcp(tmp_path), 4)
     assert needed >= 4 * PLACES
     with pytest.raises(LimitTooLow, match="ulimit -n"):
-        monkeypatch.setattr("splatnode.capture.process.limits.resource.getrlimit", lambda _: (needed, needed))
+        monkeypatch.setattr("splatnode.capture.process.system.resource.getrlimit", lambda _: (needed, needed))
         network_module.make_sure_of_room(needed, 0)

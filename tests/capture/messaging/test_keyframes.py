@@ -15,16 +15,14 @@ import numpy as np
 import pytest
 import zmq
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_pose import make_given_pose
-from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Refuse, Request, add_delivery
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
-from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
-from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
-from splatnode.capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.messages import Delivery, FrameHeader, Refuse, Request, add_delivery
+from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, AlreadyRunning, Network, runtime_directory
+from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, SpoolFull, spool_directory
 from splatnode.capture.messaging.wire import MAGIC, WireError, decode, encode
-from splatnode.capture.process.lock import LockHeld
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.process.files import LockHeld
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
 from tests.support.schemas import without
@@ -43,7 +41,7 @@ def frame(index, size=(6, 8)):
 
 
 def open_spool(folder, **limits):
-    return Spool(Config(folder / "state", **limits))
+    return Spool(SpoolConfig(folder / "state", **limits))
 
 
 def receive(server, client, count, seconds=30.0):
@@ -139,13 +137,13 @@ def test_a_restarted_capture_does_not_send_again_what_recon_holds(tmp_path):
 
 KILLED = """
 import os, pathlib, sys, numpy
-from splatnode.capture.process.lock import LockHeld
+from splatnode.capture.process.files import LockHeld
 from splatnode.capture.frame import Frame
-from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.spool import Config, Spool
+from splatnode.capture.messaging.spool import SpoolConfig, Spool
 folder = pathlib.Path(sys.argv[1])
-server = KeyframeServer(Network(directory=folder / "run"), Spool(Config(folder / "state")))
+server = KeyframeServer(Network(directory=folder / "run"), Spool(SpoolConfig(folder / "state")))
 for index in range(3):
     server.offer(Frame(index, f"{index}.png", index, numpy.full((6, 8, 3), index, numpy.uint8), None))
 os.kill(os.getpid(), 9)
@@ -303,7 +301,7 @@ def test_a_recon_of_before_poses_refuses_a_keyframe_with_one_by_a_sentence_and_t
         server.offer(frame(1))  # with a pose
         server.offer(frame(2))
         earlier = without(FrameHeader, "given_pose")
-        monkeypatch.setattr("splatnode.capture.messaging.keyframe_messages.FrameHeader", earlier)
+        monkeypatch.setattr("splatnode.capture.messaging.messages.FrameHeader", earlier)
         (one,) = receive(server, client, 1)
         assert one.frame.name == "2.png"
         settle(server, client, lambda: server.set_aside)
@@ -399,7 +397,7 @@ def test_the_spool_is_bounded(tmp_path):
     spool.remove(KEY)
     spool.store(KEY._replace(sequence=2), [b"c"])
     assert [key.sequence for key in spool] == [1, 2]
-    small = Spool(Config(tmp_path / "other", max_mb=1))
+    small = Spool(SpoolConfig(tmp_path / "other", max_mb=1))
     with pytest.raises(SpoolFull):
         small.store(KEY, [bytes(1 << 20)])
 
@@ -410,7 +408,7 @@ def test_a_full_disk_is_a_full_spool_and_leaves_nothing(tmp_path, monkeypatch):
     def no_space(descriptor):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("splatnode.capture.process.durable.os.fsync", no_space)
+    monkeypatch.setattr("splatnode.capture.process.files.os.fsync", no_space)
     with pytest.raises(SpoolFull, match="No space left"):
         spool.store(KEY, [b"a"])
     assert len(spool) == 0 and [path.name for path in spool.directory.iterdir()] == ["lock"]
@@ -450,12 +448,12 @@ def test_a_frame_that_the_disk_loses_does_not_block_the_others(tmp_path):
 def test_where_the_spool_is(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    assert spool_directory(Config()) == tmp_path / "home" / "splatnode" / "spool"
+    assert spool_directory(SpoolConfig()) == tmp_path / "home" / "splatnode" / "spool"
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "service"))
-    assert spool_directory(Config()) == Path(tmp_path, "service", "spool")
-    holder = Spool(Config())
+    assert spool_directory(SpoolConfig()) == Path(tmp_path, "service", "spool")
+    holder = Spool(SpoolConfig())
     with pytest.raises(LockHeld, match=f"held by process {os.getpid()}"):
-        Spool(Config())
+        Spool(SpoolConfig())
     holder.close()
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.messaging.message_file import MessageFileError, read_message, write_message
+from splatnode.capture.messaging.spool import MessageFileError, read_message, write_message
 from splatnode.capture.messaging.wire import MAGIC, VERSION
 
 EDGES = (0, 1, 7, 8, 9, 2**31, 2**32 - 1, 2**62, 2**63, 2**64 - 1)

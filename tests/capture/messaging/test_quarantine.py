@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from splatnode.capture.messaging.quarantine import Config, Quarantine, QuarantinedKeyframe
+from splatnode.capture.messaging.spool import Quarantine, QuarantineConfig, QuarantinedKeyframe
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def waiting(tmp_path):
 
 
 def open_quarantine(tmp_path, **limits):
-    return Quarantine(tmp_path / "quarantine", Config(**limits))
+    return Quarantine(tmp_path / "quarantine", QuarantineConfig(**limits))
 
 
 def test_what_is_set_aside_is_there_after_a_restart_with_its_reason(tmp_path, waiting):
@@ -92,7 +92,7 @@ def test_a_disk_that_takes_nothing_costs_no_more_than_the_reason(tmp_path, waiti
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("splatnode.capture.messaging.quarantine.write_atomically", full)
+    monkeypatch.setattr("splatnode.capture.messaging.spool.write_atomically", full)
     quarantine.take(waiting(0), "a", "b")
     assert quarantine.newest(1)[0].reason == "b"
     quarantine.mark_seen()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from splatnode.capture.messaging import services
-from splatnode.capture.messaging.services import Service
+from splatnode.capture.messaging import network
+from splatnode.capture.messaging.network import Service
 
 
 def test_names_and_ports_stay():
-    table = [value for value in vars(services).values() if isinstance(value, Service)]
+    table = [value for value in vars(network).values() if isinstance(value, Service)]
     assert {service.name: service.tcp_port for service in table} == {
         "capture.keyframes": 0,
         "capture.preview": 1,
@@ -19,4 +19,4 @@ def test_names_and_ports_stay():
         "recon.map": 8,
         "recon.depth": 10,
     }
-    assert services.RECON_SCENE.requests == Service("recon.scene.requests", services.Pattern.STATE, 4)
+    assert network.RECON_SCENE.requests == Service("recon.scene.requests", network.Pattern.STATE, 4)

@@ -14,9 +14,9 @@ import zmq
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
-from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
-from splatnode.capture.messaging.spool import Config, Spool
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from tests.capture.messaging.test_sockets import tcp, wait_for
 from tests.support.slow_link import THERE, slow_link
 
@@ -32,7 +32,7 @@ def networks(tmp_path, monkeypatch):
 
 
 def keyframe_server(network, folder) -> KeyframeServer:
-    return KeyframeServer(network, Spool(Config(folder / "state")))
+    return KeyframeServer(network, Spool(SpoolConfig(folder / "state")))
 
 
 def exchanged(server, client, until) -> None:

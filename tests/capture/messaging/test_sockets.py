@@ -16,11 +16,23 @@ import pytest
 import zmq
 
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.broadcast import Publisher, Subscriber
-from splatnode.capture.messaging.commands import CommandServer, NoAnswer, ask
-from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_CONTROL, RECON_SCENE
-from splatnode.capture.messaging.state import StateClient, StateServer
+from splatnode.capture.messaging.network import (
+    CAPTURE_PREVIEW,
+    RECON_CONTROL,
+    RECON_SCENE,
+    AlreadyRunning,
+    Network,
+    runtime_directory,
+)
+from splatnode.capture.messaging.pubsub import (
+    CommandServer,
+    NoAnswer,
+    Publisher,
+    StateClient,
+    StateServer,
+    Subscriber,
+    ask,
+)
 from splatnode.capture.messaging.wire import Header, Numbering
 from tests.conftest import ROOT
 
@@ -151,9 +163,9 @@ def test_one_process_offers_a_service(network, count):
 
 DIES = """
 import os, sys, pathlib
-from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.pubsub import Publisher
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 publisher = Publisher(CAPTURE_PREVIEW, Network(directory=pathlib.Path(sys.argv[1])))
 os.kill(os.getpid(), 9)
 """

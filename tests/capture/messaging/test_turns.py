@@ -6,11 +6,16 @@ import time
 
 import pytest
 
-from splatnode.capture.messaging import turns
-from splatnode.capture.messaging.keyframe_messages import Acknowledge, Ready, Refuse
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging import keyframe_queue
+from splatnode.capture.messaging.keyframe_queue import (
+    MOST_CONNECTIONS,
+    SILENT_S,
+    ConsumerArbiter,
+    KeyframeClient,
+    KeyframeServer,
+)
+from splatnode.capture.messaging.messages import Acknowledge, Ready, Refuse
 from splatnode.capture.messaging.spool import Key
-from splatnode.capture.messaging.turns import MOST_CONNECTIONS, SILENT_S, ConsumerArbiter
 from tests.capture.messaging.test_keyframes import frame, open_spool, receive, settle
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 
@@ -83,7 +88,7 @@ def test_what_is_held_is_outstanding_if_it_is_still_there():
 @pytest.mark.parametrize("make", [ipc, tcp], ids=["ipc", "tcp+curve"])
 def test_two_recons_on_one_capture(tmp_path, make, monkeypatch):
     """The second takes nothing and is told so; when the first falls silent, it gets what is left."""
-    monkeypatch.setattr(turns, "SILENT_S", 1.5)
+    monkeypatch.setattr(keyframe_queue, "SILENT_S", 1.5)
     network, spool = make(tmp_path), open_spool(tmp_path)
     with KeyframeServer(network, spool) as server, KeyframeClient(network) as second:
         with KeyframeClient(network) as first:

@@ -7,11 +7,10 @@ import re
 import pytest
 
 from splatnode import command_line
+from splatnode.capture.frame import CameraUnavailable
 from splatnode.capture.messaging.keys import KeyFileError
 from splatnode.capture.messaging.network import NotAllowed
-from splatnode.capture.process.after_ready import FailedAfterReady, wrap_late_errors
-from splatnode.capture.process.service_manager import ServiceManager
-from splatnode.capture.unavailable import CameraUnavailable
+from splatnode.capture.process.system import FailedAfterReady, ServiceManager, wrap_late_errors
 from tests.conftest import ROOT
 
 ERRORS = [ValueError("a"), NotAllowed("b"), KeyFileError("c"), FileNotFoundError(2, "d"), PermissionError(13, "e"),

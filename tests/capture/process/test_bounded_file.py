@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.image_file import UnusableImage, find_common_range
-from splatnode.capture.process.bounded_file import read_bounded
+from splatnode.capture.process.files import read_bounded
 
 
 def test_a_name_with_a_null_byte_is_refused(tmp_path):

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from splatnode.capture.process.disk_space import shortage
+from splatnode.capture.process.files import shortage
 
 
 @pytest.fixture

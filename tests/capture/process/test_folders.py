@@ -8,8 +8,7 @@ import signal
 
 import pytest
 
-from splatnode.capture.process.folders import LOCK, claim_folder, make_folder
-from splatnode.capture.process.lock import LockHeld, exclusive
+from splatnode.capture.process.files import LOCK, LockHeld, claim_folder, exclusive, make_folder
 
 
 def test_a_folder_that_stays_empty_is_removed_with_those_above_it(tmp_path):

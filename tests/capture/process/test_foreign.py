@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from splatnode.capture.process.foreign import guard_untrusted
+from splatnode.capture.process.text import guard_untrusted
 
 
 class Refused(Exception):

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.capture.process.lengths import format_length, metres, parse_measurement
+from splatnode.capture.process.text import format_length, metres, parse_measurement
 
 
 def test_a_length_has_its_unit():

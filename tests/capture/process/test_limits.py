@@ -12,10 +12,10 @@ from tests.conftest import ROOT
 STARTS = """
 import resource, sys, tempfile
 from pathlib import Path
-from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.pubsub import Publisher
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_STATUS
-from splatnode.capture.process.limits import LimitTooLow
+from splatnode.capture.messaging.network import RECON_STATUS
+from splatnode.capture.process.system import LimitTooLow
 number = int(sys.argv[1])
 resource.setrlimit(resource.RLIMIT_NOFILE, (number, number))
 with tempfile.TemporaryDirectory() as folder:

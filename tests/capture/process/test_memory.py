@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.capture.process.memory_shortage import is_shortage
+from splatnode.capture.process.system import is_shortage
 from tests.conftest import ROOT
 
 FAULTS = """
 import resource, sys
 import numpy as np
-from splatnode.capture.process.memory import keep_freed
+from splatnode.capture.process.system import keep_freed
 if sys.argv[1] == "kept":
     keep_freed()
 def frame():

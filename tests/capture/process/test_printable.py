@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.process.printable import LONGEST_LINE, is_printable, sanitize_lines, sanitize_text
+from splatnode.capture.process.text import LONGEST_LINE, is_printable, sanitize_lines, sanitize_text
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,18 @@ import tempfile
 
 import pytest
 
-from splatnode.capture.process.durable import open_itself, write_atomically
-from splatnode.capture.process.lock import exclusive
-from splatnode.capture.process.private import (
+from splatnode.capture.process.files import (
     NotOwnerOnly,
     StrayFile,
     check_owner_only,
     check_way,
+    exclusive,
     list_own_files,
     make_owner_only_folder,
+    open_itself,
     read_own,
     temporary_folder,
+    write_atomically,
 )
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 from tests.support.strays import STRAYS

@@ -9,9 +9,15 @@ import time
 
 import pytest
 
-from splatnode.capture.process import progress
-from splatnode.capture.process.progress import ProgressPrinter, ProgressStep, report_items, show_progress, show_waiting
-from splatnode.capture.process.terminal import sanitize_output
+from splatnode.capture.process import terminal
+from splatnode.capture.process.terminal import (
+    ProgressPrinter,
+    ProgressStep,
+    report_items,
+    sanitize_output,
+    show_progress,
+    show_waiting,
+)
 from tests.capture.process.test_terminal import Terminal
 
 
@@ -37,7 +43,7 @@ def test_where_there_is_no_terminal_each_step_is_one_plain_line(printed):
 
 
 def test_on_a_terminal_a_step_is_shown_in_place_with_its_seconds(printed, monkeypatch):
-    monkeypatch.setattr(progress.time, "monotonic", lambda: 7.0)
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: 7.0)
     reading = "\rreading: 1 of 2 photographs (0 s)\rreading: 2 of 2 photographs (0 s)\n"
     assert printed(Terminal()) == f"{reading}1 of 2: a is sharp\n\rthinking (0 s)\n"
 
@@ -46,7 +52,7 @@ def test_a_terminal_is_written_to_ten_times_a_second_at_most_and_at_the_end_of_a
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     now = iter([0.0, 0.05, 0.15, 0.16, 0.17])
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
     with sanitize_output():
         tell = ProgressPrinter()
         for done in range(1, 6):
@@ -69,7 +75,7 @@ def test_a_step_tells_how_long_the_rest_will_take(done, of, now_s, said, monkeyp
     screen = Terminal()
     monkeypatch.setattr(sys, "stderr", screen)
     now = iter([0.0, now_s])
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
     with sanitize_output():
         tell = ProgressPrinter()
         tell(ProgressStep("refining", 0, of, "step"))
@@ -80,7 +86,7 @@ def test_a_step_tells_how_long_the_rest_will_take(done, of, now_s, said, monkeyp
 def test_a_step_that_ends_early_leaves_no_time_behind(monkeypatch):
     with shown_on_terminal(monkeypatch, tick_s=60.0) as screen:
         now = iter([0.0, 5.0, 5.0, 5.0])
-        monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+        monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
         tell = ProgressPrinter()
         tell(ProgressStep("matching", 1, 4, "pair"))
         tell(ProgressStep("matching", 2, 4, "pair"))
@@ -92,7 +98,7 @@ def test_a_step_that_ends_early_leaves_no_time_behind(monkeypatch):
 def shown_on_terminal(monkeypatch, tick_s=0.01):
     """A terminal that shows what standard output and error get, on which a second is `tick_s`."""
     screen = Terminal()
-    monkeypatch.setattr(progress, "_TICK_S", tick_s)
+    monkeypatch.setattr(terminal, "_TICK_S", tick_s)
     monkeypatch.setattr(sys, "stdout", screen)
     monkeypatch.setattr(sys, "stderr", screen)
     with sanitize_output():

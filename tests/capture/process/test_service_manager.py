@@ -8,7 +8,7 @@ import socket
 
 import pytest
 
-from splatnode.capture.process.service_manager import ServiceManager
+from splatnode.capture.process.system import ServiceManager
 from tests.support.hostile import TEXTS, unprintable
 
 
@@ -65,7 +65,7 @@ def test_without_a_descriptor_to_spare_nothing_ends(manager, monkeypatch):
         raise OSError(errno.EMFILE, "Too many open files")
 
     with monkeypatch.context() as short:
-        short.setattr("splatnode.capture.process.service_manager.socket.socket", none)
+        short.setattr("splatnode.capture.process.system.socket.socket", none)
         service.ready()
         service.alive("idle")
     service.alive("idle")

@@ -15,21 +15,20 @@ import numpy as np
 import pytest
 import zmq
 
-from splatnode.capture import daemon, selection
+from splatnode.capture import daemon, keyframe_selection
 from splatnode.capture.cameras import folder, watched
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_header import UnusableImage
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.keys import AllowList, allow, create_keys
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Spool
-from splatnode.capture.process import apart, memory, memory_shortage
-from splatnode.capture.process.memory_shortage import is_shortage, may_be_shortage, outlast
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
+from splatnode.capture.process import apart, system
+from splatnode.capture.process.system import is_shortage, may_be_shortage, outlast
 from splatnode.capture.process.unfailing import Unfailing
 from splatnode.capture.reader import ReaderState
-from splatnode.recon.daemon.checkpoint.ledger import read_ledger
+from splatnode.recon.daemon.checkpoint.records import read_ledger
 from splatnode.recon.daemon.checkpoint.store import Store
 from tests.capture.messaging.test_sockets import wait_for
 from tests.support.starved import no_file, starved
@@ -82,7 +81,7 @@ def test_a_shortage_is_outlasted_and_said_once(caplog, monkeypatch):
     assert outlast(work, "photo.png") == "done" and len(caplog.records) == 1
     with pytest.raises(OSError, match="broken"):
         outlast(lambda: (_ for _ in ()).throw(OSError(errno.EIO, "broken")), "photo.png")
-    monkeypatch.setattr(memory_shortage, "_MEMORY_S", 0.1)
+    monkeypatch.setattr(system, "_MEMORY_S", 0.1)
     with pytest.raises(MemoryError):
         outlast(lambda: (_ for _ in ()).throw(MemoryError()), "photo.png")
 
@@ -106,7 +105,7 @@ def test_a_watched_folder_gives_up_no_photograph_for_want_of_files(tmp_path):
 
 def test_a_photograph_that_asks_for_too_much_memory_is_dropped_in_the_end(tmp_path, monkeypatch):
     photographs(tmp_path, 2)
-    monkeypatch.setattr(memory_shortage, "_MEMORY_S", 0.1)
+    monkeypatch.setattr(system, "_MEMORY_S", 0.1)
 
     def greedy(data, *_):
         raise UnusableImage("damaged") from MemoryError()
@@ -169,10 +168,10 @@ def test_no_further_process_is_a_shortage(monkeypatch):
 
 
 def test_the_memory_is_told_as_unknown_where_it_cannot_be_read(caplog):
-    memory._say_unknown.cache_clear()
+    system._say_unknown.cache_clear()
     with starved():
-        assert memory.resident_mb() == memory.resident_mb() == 0.0
-    assert len(caplog.records) == 1 and memory.resident_mb() > 0
+        assert system.resident_mb() == system.resident_mb() == 0.0
+    assert len(caplog.records) == 1 and system.resident_mb() > 0
 
 
 def test_what_is_done_again_and_again_ends_nothing_and_says_once_why(caplog):
@@ -193,7 +192,7 @@ def test_what_is_done_again_and_again_ends_nothing_and_says_once_why(caplog):
 def capturing(place):
     """A capture's session of a recording."""
     network, camera = Network(directory=place / "run"), Camera("folder", folder.Config(folder=place))
-    config = CaptureConfig(camera, network=network, selection=selection.Config(every_frame=True))
+    config = CaptureConfig(camera, network=network, selection=keyframe_selection.Config(every_frame=True))
     with contextlib.ExitStack() as resources:
         server = resources.enter_context(KeyframeServer(network, Spool(SpoolConfig(directory=place))))
         yield daemon._Session(config, server, resources)
@@ -211,7 +210,7 @@ def test_capture_keeps_a_frame_that_cannot_be_written_for_want_of_files(tmp_path
 def test_capture_keeps_a_frame_that_memory_lacks_for(tmp_path, monkeypatch):
     with capturing(tmp_path) as session:
         with monkeypatch.context() as short:
-            short.setattr(selection, "assess", lambda image: (_ for _ in ()).throw(MemoryError()))
+            short.setattr(keyframe_selection, "assess", lambda image: (_ for _ in ()).throw(MemoryError()))
             session.handle(frame(), ReaderState.STREAMING)
             assert session.waits(0.01) and session.frames == 0
         assert not session.waits(0.01) and session.keyframes == session.frames == 1

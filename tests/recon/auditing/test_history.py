@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.auditing.history import Move, Period, extend_history, find_moves
-from splatnode.recon.auditing.motion import MIN_COMMON, measure_motion
-from splatnode.recon.auditing.sighting import CameraSighting
-from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
-from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.locate import Localization
+from splatnode.recon.auditing.audit import (
+    MIN_COMMON,
+    CameraSighting,
+    Move,
+    Period,
+    extend_history,
+    find_moves,
+    measure_motion,
+)
+from splatnode.recon.locating.localize import Localization
 from splatnode.recon.locating.outcome import LocalizationBounds, Located
+from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens
 
 LENS = Lens(500.0, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
 SIZE = (640, 480)

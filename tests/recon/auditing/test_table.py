@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from xml.etree import ElementTree
 
-from splatnode.recon.auditing.audit import Audit
-from splatnode.recon.auditing.picture import draw_audit
-from splatnode.recon.auditing.sighting import MOVING, SightingFailure
+from splatnode.recon.auditing.audit import MOVING, Audit, SightingFailure
+from splatnode.recon.auditing.report import draw_audit, format_heading, format_lines, format_summary, make_values
 from splatnode.recon.auditing.stations import ImageFiles, StationRecording
-from splatnode.recon.auditing.table import format_heading, format_lines, format_summary, make_values
 
 NAMES = tuple(f"episode_{number:06d}" for number in range(100))
 WRIST = {number: SightingFailure(f"{number}.png", MOVING, f"it turned by {number} degrees") for number in range(1, 99)}

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.recon.batch import command
-from splatnode.recon.batch.sources import BatchRecording, recordings
+from splatnode.recon.batch.batch import BatchRecording, recordings
 from splatnode.recon.batch.write_back import WriteBackOutcome, write_back
 from tests.support.recordings import options
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
-from splatnode.recon.batch.answer import FAILED
+from splatnode.recon.batch.batch import FAILED
 from splatnode.recon.batch.command import EXIT_SOME_FAILED
 from tests.support import lerobot_sets
 from tests.support.synthetic import photographs

@@ -12,12 +12,10 @@ import pytest
 
 import splatnode.recon.batch
 from splatnode import command_line
-from splatnode.capture.process.printable import cell
-from splatnode.recon.batch.answer import make_failed_outcome
+from splatnode.capture.process.text import cell
+from splatnode.recon.batch.batch import LEDGER, BatchRecording, Ledger, OtherBatch, make_failed_outcome
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
-from splatnode.recon.batch.ledger import LEDGER, Ledger, OtherBatch
-from splatnode.recon.batch.sources import BatchRecording
-from splatnode.recon.batch.tables import CSV, write_csv
+from splatnode.recon.batch.report import CSV, write_csv
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.jobs.child import NOT_RUN
 from tests.support.recordings import GOOD, REFUSED, options, simulated

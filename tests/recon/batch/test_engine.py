@@ -11,11 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY
-from splatnode.recon.batch.answer import make_failed_outcome
-from splatnode.recon.batch.engine import Plan, run_all
-from splatnode.recon.batch.keeping import LOG
-from splatnode.recon.batch.sources import BatchRecording
+from splatnode.capture.process.system import SHORT_OF_MEMORY
+from splatnode.recon.batch.batch import LOG, BatchRecording, Plan, make_failed_outcome, run_all
 from splatnode.recon.jobs.child import NOT_RUN, Limits
 from tests.conftest import ROOT
 from tests.support.recordings import GOOD, REFUSED, simulated

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.capture.process.lock import exclusive
+from splatnode.capture.process.files import exclusive
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED
 from splatnode.recon.result.export.cameras import encode_cameras
 from tests.conftest import ROOT

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from splatnode.batch import reconstruct_dataset, recordings
+from splatnode.recon.batch.batch import BatchRecording
 from splatnode.recon.batch.command import EXIT_SOME_FAILED, run_batch
 from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.call import pack_call
 from splatnode.recon.jobs.calls import Task, engine
 from splatnode.recon.jobs.child import Limits

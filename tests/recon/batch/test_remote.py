@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from splatnode.recon.batch import command
+from splatnode.recon.batch.batch import BatchRecording
 from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import BatchRecording
 from splatnode.recon.jobs.child import Limits
 from splatnode.recon.jobs.cores import free_core
 from splatnode.recon.jobs.version import own_version

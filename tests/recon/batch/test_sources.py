@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.recon.batch import sources
-from splatnode.recon.batch.sources import recordings
+from splatnode.recon.batch import batch
+from splatnode.recon.batch.batch import recordings
 from tests.support import lerobot_sets
 from tests.support.mcap_files import as_json, compressed, write
 
@@ -162,8 +162,8 @@ def test_lists_that_lead_to_lists_for_ever_are_told(tmp_path):
 def test_a_source_that_a_list_names_often_is_looked_into_once(tmp_path, monkeypatch):
     put(tmp_path / "many" / "a" / "1.jpg")
     (tmp_path / "b.mcap").write_bytes(b"no log")
-    looked, parts = [], sources.list_parts
-    monkeypatch.setattr(sources, "list_parts", lambda path: looked.append(path) or parts(path))
+    looked, parts = [], batch.list_parts
+    monkeypatch.setattr(batch, "list_parts", lambda path: looked.append(path) or parts(path))
     (tmp_path / "list.txt").write_text("many\nb.mcap\nmany/../many\n" * 100)
     assert names(tmp_path / "list.txt") == ["a", "b"]
     assert len(looked) == 2

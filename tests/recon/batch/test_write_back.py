@@ -14,11 +14,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from splatnode import command_line
+from splatnode.capture.frame import Clock, Stamp
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lerobot.data_set import list_parts
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.recon.batch.batch import BatchRecording, recordings
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
-from splatnode.recon.batch.sources import BatchRecording, recordings
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support import lerobot_sets, mcap_files

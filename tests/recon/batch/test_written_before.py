@@ -11,8 +11,8 @@ import pytest
 from mcap.reader import make_reader
 
 from splatnode.capture import film
+from splatnode.recon.batch.batch import recordings
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
-from splatnode.recon.batch.sources import recordings
 from tests.recon.batch.test_write_back import PICTURE, data_set, drive, placed  # noqa: F401  fixtures
 from tests.support import mcap_files
 from tests.support.recordings import options

@@ -15,41 +15,35 @@ from types import SimpleNamespace
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.messaging.commands import ask
-from splatnode.capture.messaging.keyframes import KeyframeServer
-from splatnode.capture.messaging.network import AlreadyRunning, Network
-from splatnode.capture.messaging.services import RECON_CONTROL, RECON_SCENE
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Spool
-from splatnode.capture.messaging.state import StateClient
-from splatnode.capture.process.folders import LOCK
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.network import RECON_CONTROL, RECON_SCENE, AlreadyRunning, Network
+from splatnode.capture.messaging.pubsub import StateClient, ask
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
+from splatnode.capture.process.files import LOCK
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import PREVIEW
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import membership, worker
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.control import Answer, RemoveKeyframe
-from splatnode.recon.daemon.daemon import Daemon
-from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
+from splatnode.recon.daemon.node import Answer, Daemon, RemoveKeyframe
+from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.locating.locate import localize_image
+from splatnode.recon.locating.localize import localize_image
 from splatnode.recon.locating.outcome import Located
-from splatnode.recon.optimize import refinement
-from splatnode.recon.result.bounds_in_words import format_widest_bounds
-from splatnode.recon.result.depth_file import read_depths
+from splatnode.recon.optimize import training
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.folder import FolderInUse
-from splatnode.recon.result.landmarks_file import read_landmarks
 from splatnode.recon.result.message import LiveScene, SceneHeader, decode_snapshot
-from splatnode.recon.result.scale import RELATIVE
-from splatnode.recon.result.verdict import Code
+from splatnode.recon.result.npz_files import read_depths, read_landmarks
+from splatnode.recon.result.snapshot import format_widest_bounds
+from splatnode.recon.result.verdict import RELATIVE, Code
 from tests.capture.messaging.test_sockets import wait_for
 from tests.support.synthetic import photographs, places
 
 QUICK = Reconstruction(
     size=160,
     preview=replace(PREVIEW, iterations=2),
-    optimize=refinement.RefinementConfig(iterations=20, checkpoints=(10,)),
+    optimize=training.RefinementConfig(iterations=20, checkpoints=(10,)),
 )
 PATIENCE_S = 120.0
 
@@ -206,7 +200,7 @@ def test_a_result_that_could_not_be_written_is_written_by_the_next_process(confi
 
 
 def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, peer):
-    wild = replace(QUICK.optimize, rates=refinement.LearningRates(means=1.0, means_unit="depth", log_scales=1.0))
+    wild = replace(QUICK.optimize, rates=training.LearningRates(means=1.0, means_unit="depth", log_scales=1.0))
     config = replace(config, reconstruction=replace(QUICK, optimize=wild))
     for frame in photographs()[:3]:
         peer.server.offer(frame)

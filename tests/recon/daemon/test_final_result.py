@@ -7,14 +7,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from splatnode.capture.messaging.commands import Answer
-from splatnode.recon.daemon import final_result, worker
+from splatnode.capture.messaging.pubsub import Answer
+from splatnode.recon.daemon import submap, worker
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.control import RemoveKeyframe
-from splatnode.recon.daemon.daemon import Daemon
-from splatnode.recon.daemon.final_result import AGAIN_S, FinalResult
-from splatnode.recon.daemon.inbox import CAPACITY, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import CAPACITY, Inbox, RemovedFrame
+from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
+from splatnode.recon.daemon.submap import AGAIN_S, FinalResult
 
 FINAL = SimpleNamespace(final=True)
 WORK = SimpleNamespace(names=["a.png", "b.png"])
@@ -37,7 +36,7 @@ class Disk:
 @pytest.fixture
 def clock(monkeypatch):
     now = SimpleNamespace(s=100.0)
-    monkeypatch.setattr(final_result, "time", SimpleNamespace(monotonic=lambda: now.s))
+    monkeypatch.setattr(submap, "time", SimpleNamespace(monotonic=lambda: now.s))
     return now
 
 

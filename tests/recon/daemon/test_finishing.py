@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import PRESETS, ReconstructionConfig
-from splatnode.recon.daemon import finishing
+from splatnode.recon.daemon import membership
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.modelling import SceneWithVerdict
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct
 from tests.support.synthetic import photographs
 
@@ -22,13 +22,13 @@ class Work:
     """What finishing needs of an IncrementalReconstruction."""
 
     begun: str = "initial_scene"
-    asked: list[refinement.RefinementConfig] = field(default_factory=list)
+    asked: list[training.RefinementConfig] = field(default_factory=list)
 
     def rebuild(self, pause: Callable[[], None]) -> None:
         pause()
 
     def refine(
-        self, scene: str, steps: refinement.RefinementConfig, pause: Callable[[], None]
+        self, scene: str, steps: training.RefinementConfig, pause: Callable[[], None]
     ) -> Iterator[SceneWithVerdict]:
         assert scene == self.begun
         self.asked.append(steps)
@@ -40,12 +40,12 @@ class Work:
 def test_the_scene_is_that_of_an_offline_run_to_the_bit():
     frames = photographs()[1:4]
     config = ReconstructionConfig(
-        size=160, optimize=refinement.RefinementConfig(iterations=refinement.MIN_SOFT, checkpoints=())
+        size=160, optimize=training.RefinementConfig(iterations=training.MIN_SOFT, checkpoints=())
     )
     work = IncrementalReconstruction(config)
     for frame in frames:
         work.add_frame(frame)
-    *_, live = finishing.refine(work, config, lambda: None)
+    *_, live = membership.refine(work, config, lambda: None)
     *_, offline = reconstruct(frames, config)
     assert live.scene is not None and len(offline.gaussians) > 1000
     found = live.scene.arrays()
@@ -56,7 +56,7 @@ def test_the_scene_is_that_of_an_offline_run_to_the_bit():
 @pytest.mark.parametrize("name", PRESETS)
 def test_its_refinement_is_that_of_photographs_that_are_all_at_hand(name):
     work = Work()
-    assert len(list(finishing.refine(work, PRESETS[name], lambda: None))) == 1
+    assert len(list(membership.refine(work, PRESETS[name], lambda: None))) == 1
     # No checkpoint more: before one that comes early a scene would not start with soft Gaussians.
     assert work.asked == [PRESETS[name].optimize]
 
@@ -74,7 +74,7 @@ def test_it_can_be_abandoned_every_few_steps():
 
     config = PRESETS["fast"]
     with pytest.raises(Abandoned):
-        list(finishing.refine(Work(), config, pause))
+        list(membership.refine(Work(), config, pause))
     paused.clear()
-    list(finishing.refine(Work(), config, lambda: paused.append(0)))
-    assert len(paused) == 1 + config.optimize.steps // finishing.STEP
+    list(membership.refine(Work(), config, lambda: paused.append(0)))
+    assert len(paused) == 1 + config.optimize.steps // membership.STEP

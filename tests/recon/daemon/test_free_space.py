@@ -12,10 +12,10 @@ from msgspec.structs import replace
 import splatnode
 from splatnode.recon.daemon import free_space
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyConfig, OccupancyMapper
-from splatnode.recon.daemon.present_place import Abandoned
+from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState
-from splatnode.recon.daemon.watcher import FinalScene
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+from splatnode.recon.daemon.submap import Abandoned
+from splatnode.recon.occupancy.grid import OccupancyMap
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.recon.daemon.test_daemon import PATIENCE_S, Peer, config, finished, peer, running  # noqa: F401
 from tests.support.occupied import room_snapshot

@@ -11,26 +11,22 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from splatnode.capture import preview, status
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import Intrinsics
-from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.gravity import Gravity
-from splatnode.capture.messaging import commands, keyframe_messages
-from splatnode.capture.messaging.state import Want
+from splatnode.capture import config, status
+from splatnode.capture.frame import Baseline, ExposureSettings, Intrinsics
+from splatnode.capture.messaging import messages, pubsub
+from splatnode.capture.messaging.pubsub import Want
 from splatnode.capture.messaging.wire import Header
-from splatnode.capture.motion import Motion
-from splatnode.capture.right_image import Baseline
-from splatnode.recon.daemon import control
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.recon.daemon import node
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.occupancy.message import MapHeader
-from splatnode.recon.result.depth_message import DepthHeader
-from splatnode.recon.result.message import SceneHeader
+from splatnode.recon.result.message import DepthHeader, SceneHeader
 
 SCHEMAS = [
-    keyframe_messages.FrameHeader, keyframe_messages.DroppedHeader, keyframe_messages.Delivery,
-    keyframe_messages.ConsumerStatus, keyframe_messages.Ready, keyframe_messages.Acknowledge, keyframe_messages.Refuse,
-    preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.MarkProblemsSeen, commands.Answer, control.RemoveKeyframe,
+    messages.FrameHeader, messages.DroppedHeader, messages.Delivery,
+    messages.ConsumerStatus, messages.Ready, messages.Acknowledge, messages.Refuse,
+    config.PreviewHeader, status.CaptureStatus, status.Heartbeat, pubsub.MarkProblemsSeen, pubsub.Answer,
+    node.RemoveKeyframe,
     Want, ReconStatus, SceneHeader, MapHeader, DepthHeader,
 ]  # fmt: skip
 # Their __post_init__ knows all their bounds.

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from splatnode.recon.daemon import membership
-from splatnode.recon.matching import config as matching
+from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict
 

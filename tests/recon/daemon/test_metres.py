@@ -8,11 +8,11 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.given_pose import make_given_pose
+from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.status import heartbeats
-from splatnode.recon.daemon.metres import MetricScaler
+from splatnode.recon.daemon.output import MetricScaler
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.metric.config import MetricConfig as Metric
+from splatnode.recon.metric.measurement import MetricConfig as Metric
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.cameras import decode_scale
 from tests.recon.daemon.test_daemon import config, finished, peer, running  # noqa: F401

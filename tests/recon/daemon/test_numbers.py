@@ -9,15 +9,14 @@ from dataclasses import replace as changed
 import numpy as np
 from msgspec.structs import replace
 
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.pubsub import Publisher, StateServer
 from splatnode.capture.messaging.wire import WireError
-from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.free_space import OccupancyResult
+from splatnode.recon.daemon.node import Daemon
 from splatnode.recon.daemon.output import PublishedSnapshot
+from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.daemon.watcher import FinalScene
 from splatnode.recon.occupancy.message import MapHeader
 from splatnode.recon.result.message import SceneHeader
 from tests.recon.daemon.test_daemon import config  # noqa: F401

@@ -10,29 +10,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from splatnode.capture.config import Config as PreviewConfig
+from splatnode.capture.config import encode_preview
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.commands import Answer, MarkProblemsSeen, ask
-from splatnode.capture.messaging.keyframe_messages import FrameHeader
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_CONTROL
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Key, Spool
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.messages import FrameHeader
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_CONTROL
+from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, Publisher, ask
+from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig
 from splatnode.capture.messaging.wire import Numbering, encode
-from splatnode.capture.preview import Config as PreviewConfig
-from splatnode.capture.preview import encode_preview
-from splatnode.capture.process.problems import Problems
+from splatnode.capture.process.logs import Problems
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
-from splatnode.recon.daemon import intake, previews, watcher
+from splatnode.recon.daemon import ingest, relocalization
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.control import RemoveKeyframe
-from splatnode.recon.daemon.inbox import ArrivedKeyframe, Inbox, RemovedFrame
-from splatnode.recon.daemon.intake import Intake
-from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
-from splatnode.recon.daemon.watcher import FinalScene, Watcher
+from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, Intake, RemovedFrame
+from splatnode.recon.daemon.node import RemoveKeyframe
+from splatnode.recon.daemon.relocalization import FinalScene, Watcher
+from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.recon.daemon.test_daemon import config, peer, running  # noqa: F401
 from tests.support.synthetic import photographs
@@ -99,13 +96,13 @@ def taking(network, folder, first=None):
 @pytest.fixture
 def plain(monkeypatch):
     """Keyframes need no features."""
-    monkeypatch.setattr(intake, "prepare", lambda frame, _: SimpleNamespace(name=frame.name))
+    monkeypatch.setattr(ingest, "prepare", lambda frame, _: SimpleNamespace(name=frame.name))
 
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(intake, "RETRY_S", 0.05)
-    monkeypatch.setattr(previews, "RETRY_S", 0.05)
+    monkeypatch.setattr(ingest, "RETRY_S", 0.05)
+    monkeypatch.setattr(relocalization, "RETRY_S", 0.05)
 
 
 def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plain, impatient):
@@ -134,7 +131,7 @@ def test_what_cannot_be_stored_is_refused_and_told_until_seen(tmp_path, monkeypa
 
 
 def test_what_cannot_be_used_is_left_out_also_where_the_checkpoint_cannot_be_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr(intake, "prepare", lambda *_: _raise(ArithmeticError("for the test")))
+    monkeypatch.setattr(ingest, "prepare", lambda *_: _raise(ArithmeticError("for the test")))
     with taking(ipc(tmp_path), tmp_path) as node:
         monkeypatch.setattr(node.store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
         for index in range(3):
@@ -155,7 +152,7 @@ def test_what_the_camera_could_not_give_is_remembered_and_disturbs_no_scene(tmp_
 
 def test_what_there_is_no_memory_for_waits_until_there_is(tmp_path, monkeypatch, plain, impatient):
     with taking(ipc(tmp_path), tmp_path) as node:
-        for module, what in ((node.store, "put"), (intake, "prepare")):
+        for module, what in ((node.store, "put"), (ingest, "prepare")):
             real, failures = getattr(module, what), [MemoryError(), RuntimeError("can't allocate memory")]
 
             def short(*args, real=real, failures=failures):
@@ -191,7 +188,7 @@ def test_another_recon_is_told_that_it_is_not_served(tmp_path, plain):
 def test_an_intake_that_is_not_served_says_so(tmp_path, plain):
     network = ipc(tmp_path)
     with KeyframeClient(network) as first, taking(network, tmp_path, first=first) as node:
-        node.until(lambda: first.receive(0.01) or node.intake.unconnected == intake.ANOTHER_IS_SERVED)
+        node.until(lambda: first.receive(0.01) or node.intake.unconnected == ingest.ANOTHER_IS_SERVED)
         assert first.served
 
 
@@ -221,9 +218,11 @@ def test_a_preview_that_makes_tracking_fail_is_one_preview(tmp_path, monkeypatch
             raise ArithmeticError("for the test")
 
     monkeypatch.setattr(
-        watcher, "compute_landmarks", lambda *_: _raise(IndexError("none")) if where == "compute_landmarks" else None
+        relocalization,
+        "compute_landmarks",
+        lambda *_: _raise(IndexError("none")) if where == "compute_landmarks" else None,
     )
-    monkeypatch.setattr(watcher, "Tracker", Failing)
+    monkeypatch.setattr(relocalization, "Tracker", Failing)
     camera = SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)
     finished = FinalScene(SimpleNamespace(cameras=[camera]), [])
     watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems, stopping)

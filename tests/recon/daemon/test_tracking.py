@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import opencv
-from splatnode.recon.daemon.tracking import (
+from splatnode.recon.daemon.relocalization import (
     KeyframeLandmarks,
     Tracker,
     TrackingConfig,

@@ -10,16 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Frame, reduce_image
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.tracking import Tracker, compute_landmarks
-from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
-from splatnode.recon.daemon.watcher import scale_intrinsics
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import load_scene
-from splatnode.recon.optimize import refinement
+from splatnode.recon.daemon.relocalization import Tracker, compute_landmarks, scale_intrinsics
+from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
+from splatnode.recon.evaluate.dataset import load_scene, load_split
+from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.preparation import prepare
 
-QUICK = replace(ReconstructionConfig(), size=256, optimize=refinement.RefinementConfig(iterations=10))
+QUICK = replace(ReconstructionConfig(), size=256, optimize=training.RefinementConfig(iterations=10))
 
 
 def preview(frame: Frame, gain: float, seed: int) -> np.ndarray:

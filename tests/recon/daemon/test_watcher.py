@@ -10,17 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import Frame
-from splatnode.capture.messaging.broadcast import Publisher, Subscriber
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.config import Config as PreviewConfig
+from splatnode.capture.config import encode_preview
+from splatnode.capture.frame import Clock, Frame, Stamp
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW
+from splatnode.capture.messaging.pubsub import Publisher, Subscriber
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.capture.preview import Config as PreviewConfig
-from splatnode.capture.preview import encode_preview
-from splatnode.capture.process.problems import Problems
-from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.daemon import previews, watcher
-from splatnode.recon.daemon.tracking import TrackingConfig as Tracking
-from splatnode.recon.daemon.watcher import FinalScene, Watcher
+from splatnode.capture.process.logs import Problems
+from splatnode.recon.daemon import relocalization
+from splatnode.recon.daemon.relocalization import FinalScene, Watcher
+from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 
 CAPTURED_AT = Stamp(1_714_989_607_250_000_001, Clock.UTC)
@@ -39,8 +38,8 @@ class Standing:
 @contextmanager
 def watching_a_scene(network, monkeypatch, tracker=Standing, problems=None):
     """A watcher in its thread."""
-    monkeypatch.setattr(watcher, "compute_landmarks", lambda *_: None)
-    monkeypatch.setattr(watcher, "Tracker", tracker)
+    monkeypatch.setattr(relocalization, "compute_landmarks", lambda *_: None)
+    monkeypatch.setattr(relocalization, "Tracker", tracker)
     stopping = threading.Event()
     finished = FinalScene(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)]), [])
     watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems or Problems(), stopping)
@@ -75,7 +74,7 @@ def test_the_live_camera_has_the_time_of_the_picture_in_which_it_was_found(tmp_p
 
 def test_the_newest_preview_is_tracked_however_long_the_one_before_took(tmp_path, monkeypatch):
     network, came, examined, go_on = ipc(tmp_path), [], [], threading.Event()
-    count, decode = Subscriber._count, watcher.decode_preview
+    count, decode = Subscriber._count, relocalization.decode_preview
 
     def counted(subscriber, header):
         came.append(header.sequence)
@@ -91,7 +90,7 @@ def test_the_newest_preview_is_tracked_however_long_the_one_before_took(tmp_path
             return super().track(image, K)
 
     monkeypatch.setattr(Subscriber, "_count", counted)
-    monkeypatch.setattr(watcher, "decode_preview", decoded)
+    monkeypatch.setattr(relocalization, "decode_preview", decoded)
     with watching_a_scene(network, monkeypatch, Slow), Publisher(CAPTURE_PREVIEW, network) as publisher:
         send = sender_of(publisher)
         wait_for(lambda: (send(), time.sleep(0.01), examined)[2])
@@ -107,9 +106,9 @@ def test_the_newest_preview_is_tracked_however_long_the_one_before_took(tmp_path
 
 @pytest.mark.parametrize("damaged", [None, b"half of a ke"])
 def test_a_key_that_is_missing_or_damaged_for_a_while_ends_no_thread(tmp_path, monkeypatch, damaged):
-    monkeypatch.setattr(previews, "RETRY_S", 0.02)
+    monkeypatch.setattr(relocalization, "RETRY_S", 0.02)
     network, problems, tries = tcp(tmp_path), Problems(), []
-    monkeypatch.setattr(previews, "Subscriber", lambda *args: (tries.append(args), Subscriber(*args))[1])
+    monkeypatch.setattr(relocalization, "Subscriber", lambda *args: (tries.append(args), Subscriber(*args))[1])
     with Publisher(CAPTURE_PREVIEW, network) as publisher:
         send, key = sender_of(publisher), network.keys / "secret.key"
         kept = key.rename(tmp_path / "kept.key")

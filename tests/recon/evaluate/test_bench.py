@@ -18,18 +18,15 @@ import pytest
 from splatnode.capture.frame import Frame
 from splatnode.command_line import build_parser
 from splatnode.recon.config import PRESETS, ReconstructionConfig
-from splatnode.recon.evaluate.bench import MethodRunner, Plan, format_run, run_bench
-from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import create_empty_networks
-from splatnode.recon.evaluate.protocol import Row, Settings
-from splatnode.recon.evaluate.schedule import PlannedRun
-from splatnode.recon.evaluate.start import Start, continue_reconstruction, extract_start_config, find_start
-from splatnode.recon.evaluate.timing import explain_missing_seconds
+from splatnode.recon.evaluate.methods import Start, continue_reconstruction, extract_start_config, find_start
+from splatnode.recon.evaluate.protocol import Row, Settings, create_empty_networks
+from splatnode.recon.evaluate.report import explain_missing_seconds
+from splatnode.recon.evaluate.runner import MethodRunner, Plan, PlannedRun, Scoring, format_run, run_bench
 from splatnode.recon.jobs.alone import ALONE
 from splatnode.recon.jobs.calls import Engine, engine
 from splatnode.recon.jobs.child import Limits
 from splatnode.recon.jobs.cores import usable_cores
-from splatnode.recon.optimize.refinement import RefinementConfig as Optimize
+from splatnode.recon.optimize.training import RefinementConfig as Optimize
 from splatnode.recon.pipeline import reconstruct as pipeline
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
@@ -49,7 +46,7 @@ def scene_folder(tmp_path_factory) -> Path:
 @pytest.fixture
 def alone(monkeypatch):
     """Other work on this machine is not seen, so that all seconds are reported."""
-    monkeypatch.setattr("splatnode.recon.evaluate.timing.others_share", lambda since, until: 0.0)
+    monkeypatch.setattr("splatnode.recon.evaluate.report.others_share", lambda since, until: 0.0)
 
 
 def reconstruct(frames: Sequence[Frame], method: str, seed: int, start: Start | None = None) -> Iterator[Snapshot]:
@@ -188,7 +185,7 @@ def test_what_failed_is_run_again_when_a_benchmark_goes_on(scene_folder, tmp_pat
         raise RuntimeError("no memory was left")
 
     with monkeypatch.context() as patch:
-        patch.setattr("splatnode.recon.evaluate.one_run.find_start", fail)
+        patch.setattr("splatnode.recon.evaluate.runner.find_start", fail)
         first = bench(plan, tmp_path, shared="shared")
     ends = [("shared", None, "FAILED"), ("exact", 150, "OK"), ("exact", None, "OK"), ("broken", None, "FAILED")]
     assert [(row.method, row.checkpoint, row.verdict) for row in first] == ends
@@ -275,7 +272,7 @@ def test_methods_that_share_cameras_and_points_have_them_found_once(scene_folder
         calls.append((len(frames), config.seed))
         return find_start(frames, config)
 
-    monkeypatch.setattr("splatnode.recon.evaluate.one_run.find_start", find)
+    monkeypatch.setattr("splatnode.recon.evaluate.runner.find_start", find)
     plan = Plan((scene_folder,), (3,), ("shared-a", "own", "shared-b"), seeds=(4,))
     rows = {row.method: row for row in bench(plan, tmp_path, shared="shared")}
     assert calls == [(3, 4)] and list(rows) == ["shared-a", "own", "shared-b"]
@@ -287,7 +284,7 @@ def test_methods_that_share_cameras_and_points_have_them_found_once(scene_folder
 
 def test_seconds_are_those_of_runs_that_had_their_cores_alone(scene_folder, tmp_path, monkeypatch):
     shares = iter([0.3, 0.0, 0.0, 0.0])  # of the start of two, of each of them, of one that needs no start
-    monkeypatch.setattr("splatnode.recon.evaluate.timing.others_share", lambda since, until: next(shares))
+    monkeypatch.setattr("splatnode.recon.evaluate.report.others_share", lambda since, until: next(shares))
     rows = bench(Plan((scene_folder,), (3,), ("shared-a", "shared-b", "own")), tmp_path, shared="shared")
     assert [row.others for row in rows] == [0.3, 0.3, 0.0]
     assert [row.seconds["total"] is None for row in rows] == [True, True, False]
@@ -295,7 +292,7 @@ def test_seconds_are_those_of_runs_that_had_their_cores_alone(scene_folder, tmp_
     assert "seconds not reported: others took 30% of its cores" in format_run(rows[0])
     said = explain_missing_seconds([row.others for row in rows])
     assert said.startswith("seconds are not reported of 2 of 3 runs: others took more than 5% of")
-    monkeypatch.setattr("splatnode.recon.evaluate.timing.others_share", lambda since, until: 0.0)
+    monkeypatch.setattr("splatnode.recon.evaluate.report.others_share", lambda since, until: 0.0)
     (row,) = bench(Plan((scene_folder,), (3,), ("own",), timed=False), tmp_path / "gpu")
     assert row.seconds["total"] is None
 
@@ -304,7 +301,7 @@ def test_a_start_that_fails_fails_the_methods_that_need_it(scene_folder, tmp_pat
     def fail(frames: object, config: object) -> Start:
         raise RuntimeError("out of memory")
 
-    monkeypatch.setattr("splatnode.recon.evaluate.one_run.find_start", fail)
+    monkeypatch.setattr("splatnode.recon.evaluate.runner.find_start", fail)
     rows = bench(Plan((scene_folder,), (3,), ("shared", "own")), tmp_path, shared="shared")
     assert [row.verdict for row in rows] == ["FAILED", "OK"] and rows[0].error == "out of memory"
 

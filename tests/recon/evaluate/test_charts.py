@@ -9,10 +9,19 @@ import numpy as np
 import pytest
 
 from splatnode.recon.evaluate.protocol import Row, Settings
-from splatnode.recon.evaluate.records import Bench, make_bench_files, merge_benches, read_bench
-from splatnode.recon.evaluate.report import redraw
-from splatnode.recon.evaluate.summary import compute_method_means, select_shared_runs
-from splatnode.recon.evaluate.tables import PSNR, compute_paired_changes, make_tables, make_views_table
+from splatnode.recon.evaluate.report import (
+    PSNR,
+    Bench,
+    compute_method_means,
+    compute_paired_changes,
+    make_bench_files,
+    make_tables,
+    make_views_table,
+    merge_benches,
+    read_bench,
+    redraw,
+    select_shared_runs,
+)
 
 pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
 

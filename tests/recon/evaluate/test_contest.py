@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.recon.evaluate.contest import SHOWN, WHOLE, compute_margins, make_case_tables
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.regions import RegionScore
+from splatnode.recon.evaluate.report import SHOWN, WHOLE, compute_margins, make_case_tables
 
 
 def row(method: str, psnr: float | None, lpips: float = 0.1, scene: str = "church", seed: int = 0) -> Row:
@@ -69,6 +69,6 @@ def test_the_table_says_what_is_lost():
 
 
 def test_the_chart_of_the_cases_is_a_picture():
-    case_chart = pytest.importorskip("splatnode.recon.evaluate.case_chart", reason="matplotlib is not installed")
+    case_chart = pytest.importorskip("splatnode.recon.evaluate.charts", reason="matplotlib is not installed")
     assert case_chart.draw([*ROWS, row("paper", 25.5, seed=1)])["cases.png"].startswith(b"\x89PNG")
     assert case_chart.draw([r for r in ROWS if r.method == "fast"]) == {}

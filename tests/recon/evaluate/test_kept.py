@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from splatnode.recon.evaluate import kept
-from splatnode.recon.evaluate.kept import Journal
+from splatnode.recon.evaluate import runner
+from splatnode.recon.evaluate.runner import Journal
 
 
 def test_what_a_killed_process_left_is_found(tmp_path):
@@ -37,7 +37,7 @@ def test_a_number_that_the_whole_cannot_hold_is_not_kept(tmp_path):
 
 
 def test_the_whole_is_written_now_and_then(tmp_path, monkeypatch):
-    monkeypatch.setattr(kept, "WRITE_EVERY_S", 0.0)
+    monkeypatch.setattr(runner, "WRITE_EVERY_S", 0.0)
     journal, written = tmp_path / "journal", []
     with Journal(journal, lambda: written.append(True)) as goes_on:
         goes_on.add(1)

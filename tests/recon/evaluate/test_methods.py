@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from splatnode.recon.config import PRESETS
-from splatnode.recon.evaluate import ablation
+from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.methods import (
     CONFIGS,
     METHODS,
@@ -18,7 +18,7 @@ from splatnode.recon.evaluate.methods import (
     find_method,
     select_start_config,
 )
-from splatnode.recon.optimize import regularise
+from splatnode.recon.optimize import regularizers
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.report import build_report
 from tests.support.synthetic import photographs
@@ -39,7 +39,7 @@ def test_the_papers_schedule_and_weights():
     assert weights == {"point_render": 0.25, "depth": 0.05, "normal": 0.01, "semantic": 0.5}
     assert CONFIGS["paper"].optimize.iterations == 1000
     assert [losses[name].config.at(0.1) > 0 for name in ("point_render", "depth")] == [True, False]
-    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularise.RegularizerConfig())
+    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularizers.RegularizerConfig())
     assert without == CONFIGS["instantsplat-xl"].optimize
 
 
@@ -80,13 +80,13 @@ def test_a_start_with_surroundings_differs_in_nothing_else():
         optimize = msgspec.structs.replace(CONFIGS[name].optimize, regularise=losses)
         assert msgspec.structs.replace(CONFIGS[name], pixelwise=without, optimize=optimize) == CONFIGS[plain]
         assert CONFIGS[name].pixelwise.surroundings == around
-        assert select_start_config(name) == select_start_config(plain) and not ablation.is_variant(name)
+        assert select_start_config(name) == select_start_config(plain) and not methods.is_variant(name)
 
 
 def test_the_ablation_changes_one_part_at_a_time():
     """Alone on the base, and missing from the whole."""
     parts = ("point_render", "depth", "normal", "semantic")
-    whole = CONFIGS[ablation.WHOLE]
+    whole = CONFIGS[methods.WHOLE]
     for part in parts:
         name = part.replace("_", "-")
         alone, without = (
@@ -98,8 +98,8 @@ def test_the_ablation_changes_one_part_at_a_time():
     assert CONFIGS["paper-pseudo-views"].optimize.regularise.pseudo_views == 0
     thick = CONFIGS["paper-down-sampling"]
     assert thick.optimize == whole.optimize and thick.pixelwise != whole.pixelwise
-    assert set(ablation.list_names()) <= CONFIGS.keys() and ablation.is_variant("paper-depth")
-    assert not ablation.is_variant("paper")
+    assert set(methods.list_names()) <= CONFIGS.keys() and methods.is_variant("paper-depth")
+    assert not methods.is_variant("paper")
 
 
 def test_they_start_from_a_gaussian_a_pixel_and_keep_them():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.signal import convolve2d
 
-from splatnode.recon.evaluate.metrics import psnr, ssim
+from splatnode.recon.evaluate.protocol import psnr, ssim
 from splatnode.recon.networks.lpips import load_lpips
 
 

@@ -15,16 +15,19 @@ import torch
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.undistort import undistort_frame
-from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.protocol import Run, evaluate
+from splatnode.recon.evaluate.dataset import Split, load_scene
+from splatnode.recon.evaluate.protocol import (
+    Run,
+    average_intrinsics,
+    evaluate,
+    find_test_pose,
+    psnr,
+    undistort_counts,
+    undistort_view,
+)
 from splatnode.recon.evaluate.regions import UNKNOWN
-from splatnode.recon.evaluate.same_lens import average_intrinsics, undistort_counts, undistort_view
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.stability.places import TrialImage
-from splatnode.recon.evaluate.stability.warps import distort_image
-from splatnode.recon.evaluate.test_pose import find_test_pose
-from splatnode.recon.evaluate.truth import load_scene
-from splatnode.recon.frames import border
+from splatnode.recon.evaluate.stability.perturbations import TrialImage, distort_image
+from splatnode.recon.frames import screening
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import encode_cameras
@@ -224,7 +227,7 @@ def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monk
     def below(images):
         return [np.arange(len(image))[:, None] >= np.array([3] * image.shape[1]) for image in images]
 
-    monkeypatch.setattr(border, "valid_masks", below)
+    monkeypatch.setattr(screening, "valid_masks", below)
     row = score(perfect_snapshot(), spoilt / scene_folder.name)
     assert row.psnr is not None and row.psnr > 50
     assert row.psnr_with_rim is not None and row.psnr_with_rim < 20

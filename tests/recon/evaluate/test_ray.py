@@ -6,11 +6,10 @@ from dataclasses import asdict
 
 import pytest
 
-from splatnode.recon.evaluate.bench import MethodRunner, Plan, run_bench
-from splatnode.recon.evaluate.one_run import Scoring
-from splatnode.recon.evaluate.perceptual import create_empty_networks
+from splatnode.recon.evaluate.protocol import create_empty_networks
+from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
 from splatnode.recon.evaluate.stability import campaign
-from splatnode.recon.evaluate.stability.places import ScenesByMotion
+from splatnode.recon.evaluate.stability.perturbations import ScenesByMotion
 from splatnode.recon.jobs.calls import engine
 from splatnode.recon.rasterize.cpu import rasterize
 from tests.recon.evaluate import test_bench

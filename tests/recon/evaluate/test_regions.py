@@ -10,10 +10,9 @@ import torch
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
+from splatnode.recon.evaluate.dataset import EvaluationScene, TrueCamera
 from splatnode.recon.evaluate.regions import REGIONS, UNKNOWN, compute_error_maps, compute_region_scores
 from splatnode.recon.evaluate.shown import Surface, compute_surfaces, count_visibility
-from splatnode.recon.evaluate.true_cameras import TrueCamera
-from splatnode.recon.evaluate.truth import EvaluationScene
 from tests.support.synthetic import SMALL, photographs
 
 K = np.array([[40.0, 0.0, 20.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]])

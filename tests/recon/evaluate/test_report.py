@@ -9,9 +9,8 @@ from urllib.parse import unquote_to_bytes
 import pytest
 
 from splatnode.recon.evaluate.protocol import Row, Settings
-from splatnode.recon.evaluate.records import Bench
-from splatnode.recon.evaluate.renders import FOLDER, PHOTOGRAPH
-from splatnode.recon.evaluate.report import make_report_files
+from splatnode.recon.evaluate.report import Bench, make_report_files
+from splatnode.recon.evaluate.shown import FOLDER, PHOTOGRAPH
 from tests.support.hostile import TEXTS, unprintable
 
 NAMES = {what: text.replace("\x00", "").replace("/", "_")[:100] for what, text in TEXTS.items()}

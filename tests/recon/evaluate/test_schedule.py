@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from splatnode.recon.evaluate.schedule import PlannedRun, Prerequisite, run_schedule
+from splatnode.recon.evaluate.runner import PlannedRun, Prerequisite, run_schedule
 from splatnode.recon.jobs.calls import Engine
 from splatnode.recon.jobs.child import Limits
 from tests.support.calls import in_this_process

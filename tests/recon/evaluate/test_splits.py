@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.json_file import EvaluationFileError
-from splatnode.recon.evaluate.splits import Split, load_split, make_paper_split
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.colmap_model import EvaluationFileError
+from splatnode.recon.evaluate.dataset import Split, load_scene, load_split, make_paper_split
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.start_pose import interpolate_pose
+from splatnode.recon.evaluate.protocol import interpolate_pose
 
 
 def camera(x: float, turn_deg: float) -> np.ndarray:

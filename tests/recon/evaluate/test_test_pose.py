@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.evaluate.appearance import GaussianAppearance
-from splatnode.recon.evaluate.test_pose import find_test_pose
+from splatnode.recon.evaluate.protocol import find_test_pose
+from splatnode.recon.evaluate.regions import GaussianAppearance
 from splatnode.recon.geometry import angles_deg, exp_se3
 from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
 
 WIDTH, HEIGHT = 128, 96

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.evaluate.json_file import EvaluationFileError
-from splatnode.recon.evaluate.records import read_bench
-from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
+from splatnode.recon.evaluate.colmap_model import EvaluationFileError
+from splatnode.recon.evaluate.dataset import EvaluationScene, TrueCamera, load_scene, load_split
+from splatnode.recon.evaluate.report import read_bench
 from tests.support.crafted import Crafted
 from tests.support.crafted.bounded import MARGIN, readings
 from tests.support.crafted.images import HUGE, jpeg

@@ -10,9 +10,9 @@ import pytest
 
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.ladder import others
-from splatnode.recon.ladder.ladder import run_fallbacks
-from splatnode.recon.ladder.others import estimate_without_doubtful
+from splatnode.recon.fallbacks import others
+from splatnode.recon.fallbacks.others import estimate_without_doubtful
+from splatnode.recon.fallbacks.run import run_fallbacks
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.row_of_views import graph_of, registration_of
 

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.locating.camera_model import NUM_PARAMETERS, CameraModel, Lens, undistort_pixels
-from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.refinement import CORRELATED, optimize_camera, pose_covariance
+from splatnode.recon.locating.pose_refinement import (
+    CORRELATED,
+    NUM_PARAMETERS,
+    CameraModel,
+    Correspondences,
+    Lens,
+    optimize_camera,
+    pose_covariance,
+    undistort_pixels,
+)
 
 CAMERA = CameraModel(
     Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix(),

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.locating import checks, posing
-from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
-from splatnode.recon.locating.case import PoseHypothesis, QueryContext
-from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.locating import pose_candidates, verification
 from splatnode.recon.locating.outcome import LocalizationBounds, Reason
+from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens
+from splatnode.recon.locating.verification import PoseHypothesis, QueryContext
 
 WIDTH, HEIGHT = 1024, 768
 LENS = Lens(800.0, PINHOLE, np.zeros(2), 0.01, 0.0, 0.0)
@@ -51,12 +50,12 @@ def unrelated(count: int) -> Correspondences:
 
 
 def judged(known: Correspondences) -> PoseHypothesis:
-    by = QueryContext(known, WIDTH, HEIGHT, 0.5, 1.0, posing.PoseSearchConfig())
+    by = QueryContext(known, WIDTH, HEIGHT, 0.5, 1.0, pose_candidates.PoseSearchConfig())
     return by.make_hypothesis(by.estimate_pose(LENS))
 
 
 def code(known: Correspondences) -> Reason | None:
-    refusal = checks.run_checks(judged(known), checks.LocalizationCheckConfig())
+    refusal = verification.run_checks(judged(known), verification.LocalizationCheckConfig())
     return None if refusal is None else refusal.code
 
 
@@ -115,16 +114,21 @@ def test_a_lens_that_no_camera_has_is_refused():
     assert case.posed is not None
     for lens in (replace(LENS, focal=100.0), replace(LENS, shift=np.array([600.0, 0.0]))):
         fit = replace(case.posed.fit, camera=replace(case.posed.fit.camera, lens=lens))
-        refusal = checks.run_checks(replace(case, posed=replace(case.posed, fit=fit)), checks.LocalizationCheckConfig())
+        refusal = verification.run_checks(
+            replace(case, posed=replace(case.posed, fit=fit)), verification.LocalizationCheckConfig()
+        )
         assert refusal is not None and refusal.code is Reason.LENS
 
 
 def test_what_is_known_too_roughly_is_refused():
-    assert checks.check_uncertainty(LocalizationBounds(1.0, 0.02, 2.0, 1.0), checks.LocalizationCheckConfig()) is None
+    assert (
+        verification.check_uncertainty(LocalizationBounds(1.0, 0.02, 2.0, 1.0), verification.LocalizationCheckConfig())
+        is None
+    )
     for claim in (
         LocalizationBounds(6.0, 0.02, 2.0, 1.0),
         LocalizationBounds(1.0, 0.2, 20.0, 1.0),
         LocalizationBounds(np.nan, np.nan, np.nan, 1.0),
     ):
-        refusal = checks.check_uncertainty(claim, checks.LocalizationCheckConfig())
+        refusal = verification.check_uncertainty(claim, verification.LocalizationCheckConfig())
         assert refusal is not None and refusal.code is Reason.UNCERTAIN

@@ -12,8 +12,8 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.recording import Recorder
 from splatnode.command_line import main
-from splatnode.recon.locating.photographs import stream_query_frames as named
-from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
+from splatnode.recon.locating.localize import stream_query_frames as named
+from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
 from tests.support.located import PLACE, known_place, photograph
 
 

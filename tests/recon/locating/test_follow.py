@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.locating import follow as following
-from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.localize_image import localize_image
+from splatnode.recon.locating import localize as following
+from splatnode.recon.locating.localize import follow, localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from tests.support.located import errors, known_place, photograph
 

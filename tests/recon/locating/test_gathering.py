@@ -8,7 +8,7 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.geometry import project
-from splatnode.recon.locating import gathering
+from splatnode.recon.locating import landmarks as locating_landmarks
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -35,8 +35,8 @@ def test_landmarks_lie_on_the_surfaces_that_their_photographs_show_as_nearly_as_
 def test_no_more_descriptors_are_kept_than_may_be_and_every_photograph_has_some(monkeypatch):
     estimate = known_place().estimate
     assert estimate.registration is not None
-    monkeypatch.setattr(gathering, "DESCRIPTORS_A_PHOTOGRAPH", 100)
-    few = gathering.collect_landmarks(estimate.graph, estimate.registration, estimate.bounds)
+    monkeypatch.setattr(locating_landmarks, "DESCRIPTORS_A_PHOTOGRAPH", 100)
+    few = locating_landmarks.collect_landmarks(estimate.graph, estimate.registration, estimate.bounds)
     assert 400 < len(few.descriptors) <= 600 and len(few.points) <= len(few.descriptors) // 2
     assert (np.bincount(few.photograph_of, minlength=PLACE.views) > 40).all()
     assert set(few.point_of.tolist()) == set(range(len(few.points)))

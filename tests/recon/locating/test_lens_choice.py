@@ -9,17 +9,14 @@ import pytest
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames.keyframe import Features
-from splatnode.recon.locating import posing
-from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
-from splatnode.recon.locating.candidates import LensAssumption, assume_lenses, make_lens_grid
-from splatnode.recon.locating.case import QueryContext
-from splatnode.recon.locating.correspondences import Correspondences, measure_mirror_gain
-from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.lens_choice import LensChoice, choose_lens, search_cameras
-from splatnode.recon.locating.locate import localize_image, prepare_query_image
+from splatnode.recon.locating import pose_candidates
+from splatnode.recon.locating.localize import follow, localize_image, prepare_query_image
 from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason
-from splatnode.recon.result.landmarks import KnownLenses, Landmarks
-from splatnode.recon.verification import reflection
+from splatnode.recon.locating.pose_candidates import LensAssumption, assume_lenses, make_lens_grid
+from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens, measure_mirror_gain
+from splatnode.recon.locating.verification import LensChoice, QueryContext, choose_lens, search_cameras
+from splatnode.recon.result.snapshot import KnownLenses, Landmarks
+from splatnode.recon.verification import consistency
 from tests.bench.quality.query_warps import WARPS, Query
 from tests.support.located import PLACE, errors, known_place, photograph
 
@@ -126,7 +123,9 @@ def symmetric(landmarks: Landmarks, share: float) -> Landmarks:
         landmarks,
         points=np.concatenate([landmarks.points, landmarks.points[twice] @ MIRROR]),
         covariances=np.concatenate([landmarks.covariances, MIRROR @ landmarks.covariances[twice] @ MIRROR]),
-        descriptors=np.concatenate([landmarks.descriptors, reflection.mirror_descriptors(landmarks.descriptors[kept])]),
+        descriptors=np.concatenate(
+            [landmarks.descriptors, consistency.mirror_descriptors(landmarks.descriptors[kept])]
+        ),
         point_of=np.concatenate([landmarks.point_of, number[landmarks.point_of[kept]]]),
         photograph_of=np.concatenate([landmarks.photograph_of, len(landmarks.names) + landmarks.photograph_of[kept]]),
         names=landmarks.names + tuple(f"mirrored {name}" for name in landmarks.names),
@@ -151,10 +150,11 @@ def test_the_gain_of_mirroring_is_above_0_for_mirrored_images_alone():
     image, _ = photograph(2)
     features = prepare_query_image(image).features
     turned = Features(
-        features.points, reflection.mirror_descriptors(features.descriptors), features.point_of, features.tilt
+        features.points, consistency.mirror_descriptors(features.descriptors), features.point_of, features.tilt
     )
     gains = [
-        measure_mirror_gain(each, known_place().landmarks, reflection.ReflectionConfig()) for each in (features, turned)
+        measure_mirror_gain(each, known_place().landmarks, consistency.ReflectionConfig())
+        for each in (features, turned)
     ]
     assert gains[0] < -0.3 and gains[1] == pytest.approx(-gains[0])
 
@@ -173,7 +173,7 @@ def seen(lens: Lens, relief: float, count: int = 600, noise_px: float = 0.5) -> 
 
 
 def chosen_of(known: Correspondences, assumed: list[LensAssumption]) -> LensChoice:
-    judged = QueryContext(known, WIDTH, HEIGHT, 0.5, 4.0, posing.PoseSearchConfig())
+    judged = QueryContext(known, WIDTH, HEIGHT, 0.5, 4.0, pose_candidates.PoseSearchConfig())
     chosen = choose_lens(judged, search_cameras(judged, assumed, make_lens_grid(judged.side, assumed)), assumed)
     assert chosen is not None
     return chosen

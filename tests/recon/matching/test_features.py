@@ -10,8 +10,8 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.matching import config as matching
-from splatnode.recon.matching import features, nearest_neighbours, pair_matching
+from splatnode.recon.matching import features, pair_matching
+from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.two_view import TwoView
 
 
@@ -95,9 +95,7 @@ def num_right(picture: np.ndarray, shrunk: np.ndarray, tilt: float) -> tuple[int
     there = np.array(picture.shape[1::-1]) / shrunk.shape[1::-1]
 
     def count(chosen: np.ndarray) -> int:
-        found = nearest_neighbours.match(
-            both.descriptors[chosen], side.descriptors, nearest_neighbours.NearestNeighbourConfig()
-        )
+        found = features.match(both.descriptors[chosen], side.descriptors, features.NearestNeighbourConfig())
         points = both.points[both.point_of[chosen]][found[:, 0]]
         return int((np.linalg.norm(points - side.points[found[:, 1]] * there, axis=1) < 3.0).sum())
 

@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from splatnode.recon.frames.keyframe import Features
-from splatnode.recon.matching.features import FeatureConfig, add_affine_features, extract
-from splatnode.recon.matching.image_code import compute_global_descriptor, similarities
+from splatnode.recon.matching.features import (
+    FeatureConfig,
+    add_affine_features,
+    compute_global_descriptor,
+    extract,
+    similarities,
+)
 from tests.support.synthetic import photographs, places
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.truth import load_scene
-from splatnode.recon.matching import moving
-from splatnode.recon.matching.match import match
+from splatnode.recon.evaluate.dataset import load_scene
+from splatnode.recon.matching import dynamic_objects
+from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import prepare
 
 NAMES = ("0007.jpg", "0009.jpg", "0012.jpg", "0029.jpg", "0031.jpg", "0033.jpg", "0035.jpg")
@@ -16,6 +16,6 @@ def test_a_wall_whose_pattern_repeats_stands_still(shared, monkeypatch):
     config = ReconstructionConfig()
     keyframes = [prepare(frame, config) for frame in load_scene(shared / "scenes" / "fox").frames(NAMES)]
     graph = match(keyframes, config.matching)
-    assert moving.moving_masks(graph) == {}
-    monkeypatch.setattr(moving, "RESTS", len(NAMES))  # nothing is at rest so often
-    assert len(moving.moving_masks(graph)) >= moving.MIN_SHOWN
+    assert dynamic_objects.moving_masks(graph) == {}
+    monkeypatch.setattr(dynamic_objects, "RESTS", len(NAMES))  # nothing is at rest so often
+    assert len(dynamic_objects.moving_masks(graph)) >= dynamic_objects.MIN_SHOWN

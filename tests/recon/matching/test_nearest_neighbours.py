@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from splatnode.recon.core import instruction_sets, library
-from splatnode.recon.matching import nearest_neighbours
+from splatnode.recon.matching import features
 
 
 def descriptors(count: int, seed: int) -> np.ndarray:
     raw = np.random.default_rng(seed).exponential(size=(count, 128)).astype(np.float32) ** 2
-    return nearest_neighbours.quantise(raw / np.linalg.norm(raw, axis=1, keepdims=True))
+    return features.quantise(raw / np.linalg.norm(raw, axis=1, keepdims=True))
 
 
 def pairs(num_common: int, num_other: int, noise: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
@@ -23,13 +23,13 @@ def pairs(num_common: int, num_other: int, noise: float = 0.02) -> tuple[np.ndar
     seen_again = raw[::-1] + noise * np.random.default_rng(1).random(raw.shape).astype(np.float32)
     seen_again /= np.linalg.norm(seen_again, axis=1, keepdims=True)
     others = [descriptors(num_other, seed) for seed in (2, 3)]
-    first, second = nearest_neighbours.quantise(raw), nearest_neighbours.quantise(seen_again)
+    first, second = features.quantise(raw), features.quantise(seen_again)
     return np.concatenate([first, others[0]]), np.concatenate([second, others[1]])
 
 
 def test_what_corresponds_is_found_and_nothing_else():
     first, second = pairs(101, 57)
-    found = nearest_neighbours.match(first, second, nearest_neighbours.NearestNeighbourConfig())
+    found = features.match(first, second, features.NearestNeighbourConfig())
     common = found[(found[:, 0] < 101) & (found[:, 1] < 101)]
     assert len(common) == 101
     np.testing.assert_array_equal(common.sum(1), np.full(101, 100))
@@ -80,11 +80,11 @@ def test_nearby_it_equals_brute_force(sizes, reach, instruction_set):
 
 def test_matches_nearby_are_those_of_all_where_all_are_near():
     first, second = pairs(101, 57)
-    config = nearest_neighbours.NearestNeighbourConfig()
+    config = features.NearestNeighbourConfig()
     places = [np.random.default_rng(0).uniform(0, 100, (len(each), 2)) for each in (first, second)]
-    found = nearest_neighbours.match_near(first, places[0], second, places[1], 200.0, config)
-    np.testing.assert_array_equal(found, nearest_neighbours.match(first, second, config))
-    far = nearest_neighbours.match_near(first, places[0], second, places[1] + 1000.0, 200.0, config)
+    found = features.match_near(first, places[0], second, places[1], 200.0, config)
+    np.testing.assert_array_equal(found, features.match(first, second, config))
+    far = features.match_near(first, places[0], second, places[1] + 1000.0, 200.0, config)
     assert far.shape == (0, 2)
 
 
@@ -92,18 +92,14 @@ def test_matches_nearby_are_those_of_all_where_all_are_near():
 def test_what_is_no_place_is_refused(points):
     four = descriptors(4, 0)
     with pytest.raises(ValueError, match="finite"):
-        nearest_neighbours.match_near(
-            four, points, four, np.zeros((4, 2)), 1.0, nearest_neighbours.NearestNeighbourConfig()
-        )
+        features.match_near(four, points, four, np.zeros((4, 2)), 1.0, features.NearestNeighbourConfig())
     with pytest.raises(ValueError, match="reach"):
-        nearest_neighbours.match_near(
-            four, np.zeros((4, 2)), four, np.zeros((4, 2)), 0.0, nearest_neighbours.NearestNeighbourConfig()
-        )
+        features.match_near(four, np.zeros((4, 2)), four, np.zeros((4, 2)), 0.0, features.NearestNeighbourConfig())
 
 
 def test_the_most_distinct_matches_come_first():
     first, second = pairs(60, 40, noise=0.08)
-    found = nearest_neighbours.match(first, second, nearest_neighbours.NearestNeighbourConfig(ratio=1.0))
+    found = features.match(first, second, features.NearestNeighbourConfig(ratio=1.0))
     squared = ((first[:, None].astype(int) - second[None].astype(int)) ** 2).sum(2)
     two_nearest = np.sort(squared[found[:, 0]], axis=1)[:, :2]
     ratios = two_nearest[:, 0] / two_nearest[:, 1]
@@ -115,23 +111,19 @@ def test_products_of_the_largest_descriptors_do_not_overflow():
     peak = np.zeros((2, 128), np.float32)
     peak[:, :2] = np.sqrt(0.5)
     for kind in (even, peak):
-        bytes_ = nearest_neighbours.quantise(kind)
+        bytes_ = features.quantise(kind)
         assert np.linalg.norm(bytes_.astype(float), axis=1).max() <= 181.0
-        assert (
-            len(nearest_neighbours.match(bytes_, bytes_, nearest_neighbours.NearestNeighbourConfig())) == 0
-        )  # no nearest is distinct
+        assert len(features.match(bytes_, bytes_, features.NearestNeighbourConfig())) == 0  # no nearest is distinct
 
 
 def test_too_few_descriptors_give_no_match():
-    assert nearest_neighbours.match(
-        descriptors(1, 0), descriptors(9, 1), nearest_neighbours.NearestNeighbourConfig()
-    ).shape == (0, 2)
+    assert features.match(descriptors(1, 0), descriptors(9, 1), features.NearestNeighbourConfig()).shape == (0, 2)
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((4, 64), np.uint8), np.zeros((4, 128), np.float32)])
 def test_what_is_no_descriptor_is_refused(wrong):
     with pytest.raises(ValueError, match="uint8"):
-        nearest_neighbours.match(wrong, descriptors(4, 0), nearest_neighbours.NearestNeighbourConfig())
+        features.match(wrong, descriptors(4, 0), features.NearestNeighbourConfig())
 
 
 @pytest.mark.parametrize(
@@ -149,18 +141,18 @@ def test_descriptors_whose_products_overflow_are_refused(wrong, first):
     """Longer than 181, or with a byte that the core would take for a negative one."""
     good, bad = descriptors(40, 0), descriptors(40, 1)
     bad[23] = wrong
-    config, places = nearest_neighbours.NearestNeighbourConfig(), np.zeros((40, 2))
+    config, places = features.NearestNeighbourConfig(), np.zeros((40, 2))
     pair = (bad, good) if first else (good, bad)
     with pytest.raises(ValueError, match="bytes below 128 and norms of at most 181"):
-        nearest_neighbours.match(*pair, config)
+        features.match(*pair, config)
     with pytest.raises(ValueError, match="bytes below 128 and norms of at most 181"):
-        nearest_neighbours.match_near(pair[0], places, pair[1], places, 1.0, config)
+        features.match_near(pair[0], places, pair[1], places, 1.0, config)
 
 
 def test_the_longest_descriptors_are_matched():
     longest = np.zeros((3, 128), np.uint8)
     longest[0, :2], longest[1, :121], longest[2, 5] = (127, 127), 16, 127
-    found = nearest_neighbours.match(longest, longest, nearest_neighbours.NearestNeighbourConfig())
+    found = features.match(longest, longest, features.NearestNeighbourConfig())
     assert sorted(map(tuple, found.tolist())) == [(0, 0), (1, 1), (2, 2)]
 
 
@@ -168,5 +160,5 @@ def test_the_longest_descriptors_are_matched():
 def test_places_at_the_ends_of_their_type_are_places(far):
     four = descriptors(4, 0)
     places = np.array([[-far, 0.0], [far, -far], [0.0, far], [far / 3, 0.0]])
-    found = nearest_neighbours.match_near(four, places, four, places, 1.0, nearest_neighbours.NearestNeighbourConfig())
+    found = features.match_near(four, places, four, places, 1.0, features.NearestNeighbourConfig())
     assert len(found) == 4 or far < 1

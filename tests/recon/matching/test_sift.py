@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from splatnode.recon import core
-from splatnode.recon.matching import sift
+from splatnode.recon.matching import features
 from splatnode.recon.matching.features import root_sift
 
 CONTRAST = 0.01
@@ -48,7 +48,7 @@ def share_found_again(points1, descriptors1, points2, descriptors2) -> float:
 def test_the_same_features_as_opencv(width, height):
     grey = picture(width, height)
     points, descriptors, _ = by_opencv(grey, 3000)
-    ours, our_descriptors = sift.detect(grey, 3000, CONTRAST)
+    ours, our_descriptors = features.detect(grey, 3000, CONTRAST)
     assert abs(len(ours) - len(points)) <= 0.01 * len(points) + 1
     assert share_found_again(points, descriptors, ours, our_descriptors) > 0.98
     assert share_found_again(ours, our_descriptors, points, descriptors) > 0.98
@@ -56,14 +56,16 @@ def test_the_same_features_as_opencv(width, height):
 
 def test_the_strongest_come_first_and_no_more_than_wanted():
     grey = picture(400, 300)
-    every, _ = sift.detect(grey, 5000, CONTRAST)
-    some, _ = sift.detect(grey, 200, CONTRAST)
+    every, _ = features.detect(grey, 5000, CONTRAST)
+    some, _ = features.detect(grey, 200, CONTRAST)
     assert len(every) > 600 and len(some) == 200
     np.testing.assert_array_equal(some, every[:200])
     points, descriptors, response = by_opencv(grey, 5000)
     clearly_stronger = response > 1.01 * response[200]
     assert (
-        share_found_again(points[clearly_stronger], descriptors[clearly_stronger], *sift.detect(grey, 200, CONTRAST))
+        share_found_again(
+            points[clearly_stronger], descriptors[clearly_stronger], *features.detect(grey, 200, CONTRAST)
+        )
         > 0.98
     )
 
@@ -73,7 +75,7 @@ def test_the_number_of_threads_changes_nothing():
     found = []
     for threads in (1, 2, 5):
         core.set_threads(threads)
-        found.append(sift.detect(grey, 2000, CONTRAST))
+        found.append(features.detect(grey, 2000, CONTRAST))
     core.set_threads(core.default_threads())
     for points, descriptors in found[1:]:
         np.testing.assert_array_equal(points, found[0][0])
@@ -83,8 +85,8 @@ def test_the_number_of_threads_changes_nothing():
 @pytest.mark.numerical
 def test_a_turned_image_has_the_same_descriptors():
     grey = picture(300, 300)
-    points, descriptors = sift.detect(grey, 800, CONTRAST)
-    turned_points, turned_descriptors = sift.detect(np.rot90(grey).copy(), 800, CONTRAST)
+    points, descriptors = features.detect(grey, 800, CONTRAST)
+    turned_points, turned_descriptors = features.detect(np.rot90(grey).copy(), 800, CONTRAST)
     back = np.stack([299 - turned_points[:, 1], turned_points[:, 0]], 1)
     # The image is enlarged towards one corner: a turned one is shifted by half a pixel of the enlarged image.
     _, nearest = KDTree(back).query(points, distance_upper_bound=0.8)
@@ -95,10 +97,10 @@ def test_a_turned_image_has_the_same_descriptors():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 500), (5, 5), (6, 7), (11, 200), (480, 640)])
 def test_small_and_empty_images(shape):
-    points, descriptors = sift.detect(np.full(shape, 90, np.uint8), 100, CONTRAST)
+    points, descriptors = features.detect(np.full(shape, 90, np.uint8), 100, CONTRAST)
     assert points.shape == (0, 2) and descriptors.shape == (0, 128)
     noise = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
-    points, descriptors = sift.detect(noise, 100, CONTRAST)
+    points, descriptors = features.detect(noise, 100, CONTRAST)
     assert len(points) == len(descriptors) <= 100
     assert (points >= 0).all() and (points <= [shape[1], shape[0]]).all()
 
@@ -108,4 +110,4 @@ def test_small_and_empty_images(shape):
 )
 def test_other_arrays_are_refused(bad):
     with pytest.raises(ValueError, match="uint8"):
-        sift.detect(bad, 10, CONTRAST)
+        features.detect(bad, 10, CONTRAST)

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.matching import config as matching
-from splatnode.recon.matching import features, pair_matching, tilting
-from splatnode.recon.matching.match import FIRST_COMPARISONS, match, match_newest, match_pending
+from splatnode.recon.matching import features, pair_matching
+from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import MatchedPair
-from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration import register
+from splatnode.recon.matching.view_graph import FIRST_COMPARISONS, ViewGraph, match, match_newest, match_pending
+from splatnode.recon.registration import registration as registration_registration
 from tests.support.synthetic import photographs, places, view_graph
 
 NO_MATCHES = np.zeros((0, 2), np.int64)
@@ -56,9 +55,11 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
         return MatchedPair(NO_MATCHES, weak, -20.0 if weak else 0.0)
 
     monkeypatch.setattr(pair_matching, "match_plain", compare)
-    monkeypatch.setattr(pair_matching, "match_affine", match_tilted)
+    monkeypatch.setattr(pair_matching, "match_affine", match_affine)
     monkeypatch.setattr("splatnode.recon.matching.view_graph.content_key", lambda keyframe: keyframe.name)
-    monkeypatch.setattr("splatnode.recon.matching.match._try_affine_features", lambda keyframe, tilts, config: keyframe)
+    monkeypatch.setattr(
+        "splatnode.recon.matching.view_graph._try_affine_features", lambda keyframe, tilts, config: keyframe
+    )
     return calls
 
 
@@ -144,13 +145,13 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
     # a2 and a3 had two firm partners before; now they have one, and tilted features are worth their time.
     rest = complete(rest)
     assert names_of(rest) == names_of(graph_of("a2", "A1", "a3"))
-    assert ("a2", "a4") in names_of(complete(rest.with_keyframe(keyframe("a4"))))
+    assert ("a2", "a4") in names_of(complete(rest.add_keyframe(keyframe("a4"))))
     assert len(graph.keyframes) == 5 and ("a1", "a2") in names_of(graph)
 
 
 def test_out_of_time_no_pair_is_matched_with_tilted_features(compared):
     graph: Any = ViewGraph(matching.MatchingConfig(), (keyframe("a1"),))
-    *_, whole = match_pending(graph.with_keyframe(keyframe("A2")), None, until=0.0)
+    *_, whole = match_pending(graph.add_keyframe(keyframe("A2")), None, until=0.0)
     assert compared == [("A2", "a1")] and not whole.pending and not whole.tilted
 
 
@@ -169,14 +170,14 @@ def test_who_waits_hears_how_many_pairs_are_matched_and_how_many_weak_ones_again
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
     before = {(0, 1): Verified(range(77), ("a1", "a2"))}
     graph: Any = ViewGraph(matching.MatchingConfig(), (keyframe("a1"), keyframe("a2")), before)
-    graph = complete(graph.with_keyframe(keyframe("b1")))
+    graph = complete(graph.add_keyframe(keyframe("b1")))
     assert graph.pairs == before
 
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
 def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
     graph: Any = ViewGraph(
-        matching.MatchingConfig(tilting=tilting.AffineSimulationConfig(tilts=())),
+        matching.MatchingConfig(tilting=pair_matching.AffineSimulationConfig(tilts=())),
         ("a", "b", "c", "d", "e"),
         dict.fromkeys(pairs),
     )
@@ -198,7 +199,9 @@ def test_cameras_do_not_depend_on_the_order_of_the_photographs():
         images = [frames[index].image for index in order]
         found_in = [features.extract(image, config.features) for image in images]
         graph = match(map(Keyframe, [frames[index] for index in order], images, found_in), config)
-        registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+        registration = registration_registration.register(
+            graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+        )
         assert registration is not None and len(registration.cameras) == 3
         found[order] = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
     relative = []
@@ -235,7 +238,7 @@ def test_what_is_pending_stays_so_without_another_keyframe(compared):
     graph = graph_of(*(f"a{number}" for number in range(7)))
     graph = soon(graph, "a7")
     (later,) = {i for i, _ in graph.pending} & {0}
-    rest = graph.without({"a6"})
+    rest = graph.remove_keyframes({"a6"})
     assert (later, 6) in rest.pending and len(rest.keyframes) == 7
 
 

@@ -9,11 +9,11 @@ import pytest
 
 import splatnode
 from splatnode.command_line import main
-from splatnode.recon.occupancy.occupancy_map import VoxelState
+from splatnode.recon.occupancy.grid import VoxelState
 from splatnode.recon.result.export import read_cameras, read_gaussians
-from splatnode.recon.result.pieces import find_pieces
+from splatnode.recon.result.stored_snapshot import find_pieces
+from splatnode.recon.result.submap_index import read_map_set
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.result.whole import read_map_set
 from tests.support.walk import place, walk, write_walk
 
 PROVISIONAL = place("scene-0003", folder="scene-0003", verdict="OK", publishable=True, provisional=True)

@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.merging.merge import merge_submaps
-from splatnode.recon.merging.regions import NOBODY, REGION_PX, owners, regions
-from splatnode.recon.merging.seams import resolve_seams
-from splatnode.recon.merging.sight import measure_visibility, surface_views
+from splatnode.recon.merging.merge import NOBODY, REGION_PX, merge_submaps, owners, regions, resolve_seams
+from splatnode.recon.merging.merge_fit import measure_visibility, surface_views
 from splatnode.recon.merging.submap import Submap, place_submap
-from splatnode.recon.result.coarser import concatenate_gaussians
 from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.levels_of_detail import concatenate_gaussians
 from splatnode.recon.result.rendering import render_arrays
 from tests.support.walk import WalkScene, walk, without
 

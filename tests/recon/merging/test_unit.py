@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from splatnode.command_line import main
-from splatnode.recon.merging.unit import scale_and_up
+from splatnode.recon.merging.submap import scale_and_up
 from splatnode.recon.result.placement import IDENTITY, Placement
-from splatnode.recon.result.scale import Scale
-from splatnode.recon.result.up import Up
-from splatnode.recon.result.whole import JoinedMap, MapSet, SubmapEdge, SubmapEntry, read_map_set
+from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEdge, SubmapEntry, read_map_set
+from splatnode.recon.result.verdict import Scale, Up
 from tests.support.walk import write_walk
 
 SOURCE = "marker 0 of 100 mm in 3 photographs, known to 1.1 %"

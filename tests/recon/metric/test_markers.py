@@ -13,13 +13,10 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lenses.lens import project
 from splatnode.capture.lenses.undistort import undistort_frame
-from splatnode.recon.metric.config import Baseline, MetricConfig
 from splatnode.recon.metric.evidence import Evidence, gather_evidence
-from splatnode.recon.metric.marker_detection import MarkerDetection, detect_markers
-from splatnode.recon.metric.markers import estimate_scale_from_markers
-from splatnode.recon.metric.measurement import Measurement
+from splatnode.recon.metric.markers import MarkerDetection, detect_markers, estimate_scale_from_markers
+from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig, MetricView
 from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.views import MetricView
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.recon.result.test_preview import snapshot as ball_snapshot
 from tests.support import marked

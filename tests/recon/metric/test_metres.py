@@ -13,21 +13,19 @@ import pytest
 from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import ReconstructionConfig as ReconConfig
 from splatnode.recon.config import apply_changes
-from splatnode.recon.metric.config import Baseline, MetricConfig
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.measurement import Measurement
+from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.network import MetricDepth, estimate_scale_from_network
-from splatnode.recon.networks.crop import crop
-from splatnode.recon.result.bounds import Bounds, make_ball
+from splatnode.recon.metric.stereo import MetricDepth, estimate_scale_from_network
+from splatnode.recon.networks.vit import crop
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.cameras import decode_scale
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
 from splatnode.recon.result.rendering import render_arrays
-from splatnode.recon.result.report import build_report
+from splatnode.recon.result.report import build_report, write_result_folder
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
-from splatnode.recon.result.write import write_result_folder
+from splatnode.recon.result.verdict import Bounds, make_ball
 from tests.recon.result.test_preview import snapshot as ball_snapshot
 
 

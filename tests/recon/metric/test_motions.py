@@ -8,17 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from splatnode.capture.diorama.odometry import Config as Odometry
-from splatnode.capture.diorama.odometry import odometry
-from splatnode.capture.gravity import Gravity
-from splatnode.capture.motion import Motion
-from splatnode.recon.metric.config import MetricConfig
+from splatnode.capture.diorama.scene import Config as Odometry
+from splatnode.capture.diorama.scene import odometry
+from splatnode.capture.odometry import Gravity, Motion
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.gravity import estimate_up
-from splatnode.recon.metric.measurement import Measurement
+from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView, make_metric_views
 from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.motions import estimate_scale_from_motions
-from splatnode.recon.metric.views import MetricView, make_metric_views
+from splatnode.recon.metric.odometry import estimate_scale_from_motions, estimate_up
 from tests.recon.metric.test_poses import NAMES, TRUE, UNIT, scene
 
 NOISY = Odometry(drift=0.02, noise_deg=2.0)

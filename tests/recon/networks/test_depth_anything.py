@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.networks.crop import crop
 from splatnode.recon.networks.depth_anything import (
     INDOORS_M,
     DepthAnythingV2,
@@ -21,8 +20,8 @@ from splatnode.recon.networks.depth_anything import (
     load_network,
     load_relative,
 )
-from splatnode.recon.networks.dinov2 import Dinov2
-from splatnode.recon.networks.dinov2 import Size as VitSize
+from splatnode.recon.networks.vit import Dinov2, crop
+from splatnode.recon.networks.vit import Size as VitSize
 from splatnode.recon.optimize.losses.dino import DinoFeatures, load_dino
 from splatnode.recon.optimize.losses.dino import load_network as load_dinov2
 from splatnode.recon.priors.monocular import fit_monocular_depth

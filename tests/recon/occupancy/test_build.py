@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.occupancy.build import NoMap, occupancy_map
-from splatnode.recon.occupancy.occupancy_map import OccupancyMap, VoxelState
-from splatnode.recon.result.scale import Scale
+from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.verdict import Code
+from splatnode.recon.result.verdict import Code, Scale
 from tests.support.exported import make_snapshot
 from tests.support.occupied import WALL, room_snapshot
 

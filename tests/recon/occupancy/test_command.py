@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
-from splatnode.recon.occupancy.build import occupancy_map
+from splatnode.recon.occupancy.grid import occupancy_map
+from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.result.write import write_result_folder
 from tests.support.exported import make_snapshot
 from tests.support.occupied import room_snapshot
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.capture.diorama.look_at import look_at
-from splatnode.recon.occupancy.floor import find_floor
-from splatnode.recon.occupancy.upright import level, upright
+from splatnode.capture.diorama.render import look_at
+from splatnode.recon.occupancy.grid import find_floor, level, upright
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -12,7 +12,7 @@ import pytest
 from splatnode.recon.occupancy.formats.glb import encode_glb
 from splatnode.recon.occupancy.formats.ply import encode_ply_mesh
 from splatnode.recon.occupancy.mesh import Mesh, surface_mesh
-from splatnode.recon.result.scale import RELATIVE
+from splatnode.recon.result.verdict import RELATIVE
 from tests.support.occupied import small_map
 
 

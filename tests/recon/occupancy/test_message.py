@@ -11,7 +11,7 @@ from msgspec.structs import replace as with_fields
 
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.recon.occupancy.message import MapHeader, decode_map, encode_map, no_map
-from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.verdict import Scale
 from tests.support.occupied import small_map
 
 STATES = np.arange(24).reshape(2, 3, 4) % 3

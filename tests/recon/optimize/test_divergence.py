@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.optimize.divergence import check_divergence, misfit
-from splatnode.recon.optimize.refinement import refine
+from splatnode.recon.optimize.monitor import check_divergence, compute_photometric_misfit
+from splatnode.recon.optimize.training import refine
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene.scene import Scene
 from tests.recon.optimize.test_refinement import QUICK, disturbed, photographed
@@ -31,33 +31,43 @@ def scattered(scene: Scene, lost: float = 0.0) -> Scene:
 
 
 def test_the_true_scene_misses_nothing_and_others_more(truth):
-    assert misfit(truth) < 0.02 < misfit(disturbed(truth)) < misfit(scattered(truth))
+    assert (
+        compute_photometric_misfit(truth)
+        < 0.02
+        < compute_photometric_misfit(disturbed(truth))
+        < compute_photometric_misfit(scattered(truth))
+    )
 
 
 def test_a_refinement_that_works_is_let_through(truth):
     begun = disturbed(truth)
     *_, refined = refine(begun, QUICK, seed=0)
-    assert check_divergence(misfit(begun), refined) is None and check_divergence(misfit(begun), begun) is None
+    assert (
+        check_divergence(compute_photometric_misfit(begun), refined) is None
+        and check_divergence(compute_photometric_misfit(begun), begun) is None
+    )
 
 
 def test_a_ruined_scene_is_refused_with_both_figures(truth):
-    refused = check_divergence(misfit(truth), scattered(truth))
+    refused = check_divergence(compute_photometric_misfit(truth), scattered(truth))
     assert refused is not None and refused.code is Code.DIVERGED and not refused.publishable
     assert refused.frames == tuple(view.name for view in truth.views)
-    assert f"{misfit(scattered(truth)):.2g}" in refused.message and "optimize.rates" in refused.advice
+    assert (
+        f"{compute_photometric_misfit(scattered(truth)):.2g}" in refused.message and "optimize.rates" in refused.advice
+    )
 
 
 def test_numbers_that_nothing_can_show_are_refused(truth):
     broken = scattered(truth, lost=math.nan)
-    assert misfit(broken) == math.inf
-    refused = check_divergence(misfit(truth), broken)
+    assert compute_photometric_misfit(broken) == math.inf
+    refused = check_divergence(compute_photometric_misfit(truth), broken)
     assert refused is not None and refused.code is Code.DIVERGED
 
 
 def test_of_many_photographs_some_are_looked_at(truth, monkeypatch):
     looked_at: list[str] = []
     monkeypatch.setattr(
-        "splatnode.recon.optimize.divergence._misfit", lambda scene, view, valid: looked_at.append(view.name) or 1.0
+        "splatnode.recon.optimize.monitor._misfit", lambda scene, view, valid: looked_at.append(view.name) or 1.0
     )
     views = tuple(replace(truth.views[0], name=f"{index}.png") for index in range(30))
     assert check_divergence(1.0, replace(scattered(truth), views=views)) is None
@@ -73,4 +83,4 @@ def test_the_black_border_of_undistorted_photographs_is_not_compared(truth):
     bright = replace(truth, gaussians=replace(truth.gaussians, sh=truth.gaussians.sh + 3.0))
     views = tuple(replace(view, image=np.maximum(view.image, 120)) for view in bright.views)
     plain, rimmed = replace(bright, views=views), replace(bright, views=tuple(map(bordered, views)))
-    assert misfit(rimmed) == pytest.approx(misfit(plain), rel=0.05)
+    assert compute_photometric_misfit(rimmed) == pytest.approx(compute_photometric_misfit(plain), rel=0.05)

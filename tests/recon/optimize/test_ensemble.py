@@ -11,14 +11,14 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize import dropout, ensemble
+from splatnode.recon.optimize import ensemble
 from splatnode.recon.optimize.fit import Trainer
-from splatnode.recon.optimize.refinement import RefinementConfig, refine
+from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.known_scene import disturbed, photographed, render
 
 ALONE = RefinementConfig(
-    iterations=40, checkpoints=(15,), dssim=0.2, dropout=dropout.DropoutConfig(share=0.0), control=None
+    iterations=40, checkpoints=(15,), dssim=0.2, dropout=ensemble.DropoutConfig(share=0.0), control=None
 )
 TOGETHER = structs.replace(ALONE, ensemble=ensemble.EnsembleConfig(members=3, iterations=60, pseudo_views=2))
 

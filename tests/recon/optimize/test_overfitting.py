@@ -12,13 +12,12 @@ from msgspec.structs import replace as replace_fields
 from splatnode.recon import modelling
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.modelling import refine_scene
-from splatnode.recon.optimize import overfitting, refinement
-from splatnode.recon.optimize.watch import SHORT, RefinementWatch, examine, start_watch
+from splatnode.recon.optimize import monitor, training
+from splatnode.recon.optimize.monitor import SHORT, RefinementWatch, examine, start_watch
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 from tests.recon.optimize.test_refinement import photographed, plain
 
 SIZE = 64
@@ -70,20 +69,22 @@ def faded(scene: Scene, iterations: int) -> Scene:
 
 
 def test_the_true_scene_meets_what_is_expected_between_its_photographs(truth):
-    expected = overfitting.make_expectations(truth)
+    expected = monitor.make_expectations(truth)
     assert len(expected) == 2
-    right = overfitting.misfit(expected, truth.gaussians)
-    wrong = overfitting.misfit(expected, faded(truth, 0).gaussians)
-    assert right < 0.2 and wrong > overfitting.OVERFITTED * right
+    right = monitor.compute_dssim_misfit(expected, truth.gaussians)
+    wrong = monitor.compute_dssim_misfit(expected, faded(truth, 0).gaussians)
+    assert right < 0.2 and wrong > monitor.OVERFITTED * right
 
 
 def test_without_point_maps_nothing_is_expected():
     scene = photographed()
-    assert overfitting.make_expectations(scene) == () and overfitting.misfit((), scene.gaussians) == 0.0
+    assert monitor.make_expectations(scene) == () and monitor.compute_dssim_misfit((), scene.gaussians) == 0.0
 
 
 def test_an_overfitted_scene_gives_way_to_the_best_before_it(truth, monkeypatch):
-    monkeypatch.setattr("splatnode.recon.optimize.divergence.misfit", lambda scene: 0.1)  # the photographs fit
+    monkeypatch.setattr(
+        "splatnode.recon.optimize.monitor.compute_photometric_misfit", lambda scene: 0.1
+    )  # the photographs fit
     watching = start_watch(truth, SHORT + 1)
     better = replace(truth, iterations=150)
     watching, verdict = examine(replace(watching, best_misfit=2 * watching.best_misfit), better)
@@ -103,15 +104,15 @@ def test_a_scene_that_diverged_is_not_published_and_a_short_refinement_is_not_te
 
 
 def test_the_refinement_ends_with_the_best_scene_and_the_verdict(truth, monkeypatch):
-    monkeypatch.setattr(overfitting, "OVERFITTED", 0.0)  # whatever comes is too much
-    steps = plain(iterations=SHORT + 1, checkpoints=(refinement.MIN_SOFT,), first_opacity=None)
+    monkeypatch.setattr(monitor, "OVERFITTED", 0.0)  # whatever comes is too much
+    steps = plain(iterations=SHORT + 1, checkpoints=(training.MIN_SOFT,), first_opacity=None)
     (only,) = refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps)
     assert only.verdict is not None and only.verdict.code is Code.OVERFIT
     assert only.scene is not None and torch.equal(only.scene.gaussians.means, truth.gaussians.means)
 
 
 def test_a_scene_that_started_soft_is_not_judged_before_it_shows_its_photographs(truth):
-    steps = plain(iterations=refinement.MIN_SOFT, checkpoints=(2,))
+    steps = plain(iterations=training.MIN_SOFT, checkpoints=(2,))
     first, *_ = refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps)
     assert first.verdict is None and first.scene is not None and first.scene.iterations == 2
     assert first.scene.gaussians.opacities.max() < 0.15  # it is soft
@@ -126,7 +127,7 @@ def test_who_watches_changes_no_verdict(truth, monkeypatch):
         return watching, None
 
     monkeypatch.setattr(modelling, "examine", noting)
-    first = refinement.MIN_SOFT
+    first = training.MIN_SOFT
     steps = plain(iterations=first + 20, checkpoints=(first,), looks=(first + 5, first + 10), first_opacity=None)
     shown = list(refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps))
     assert [show.scene.iterations for show in shown if show.scene] == [first, first + 5, first + 10, first + 20]

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.optimize import own_axes
-from splatnode.recon.optimize.own_axes import (
+from splatnode.recon.optimize import optimizer
+from splatnode.recon.optimize.optimizer import (
     LARGEST_EXTENT,
     Shifts,
     axes_by_torch,
@@ -11,7 +11,7 @@ from splatnode.recon.optimize.own_axes import (
     rotate_to_axes,
     rotate_to_world,
 )
-from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Gaussians
 
 pytestmark = pytest.mark.numerical
 QUARTER_TURN = [
@@ -93,5 +93,5 @@ def random_gaussians(count: int = 5000) -> Gaussians:
 def test_gaussians_on_another_device_are_turned_by_torch(monkeypatch: pytest.MonkeyPatch):
     some, vectors = random_gaussians(20), torch.ones(20, 3)
     expected = rotate_to_world(vectors, some)
-    monkeypatch.setattr(own_axes.dispatch, "is_on_cpu", lambda _: False)
+    monkeypatch.setattr(optimizer.dispatch, "is_on_cpu", lambda _: False)
     assert rotate_to_world(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-6)

@@ -8,11 +8,11 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.networks.lpips import Layer, Lpips
-from splatnode.recon.optimize import perceptual_loss
+from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.optimize.losses.perceptual import LpipsDistance
-from splatnode.recon.optimize.perceptual_loss import PerceptualLossConfig
-from splatnode.recon.optimize.refinement import RefinementConfig as Refinement
-from splatnode.recon.optimize.refinement import refine
+from splatnode.recon.optimize.photometric_losses import PerceptualLossConfig
+from splatnode.recon.optimize.training import RefinementConfig as Refinement
+from splatnode.recon.optimize.training import refine
 from splatnode.recon.optimize.training_image import make_training_image
 from splatnode.recon.scene.scene import Exposure, TrainingView
 from tests.support.known_scene import disturbed, photographed
@@ -79,7 +79,7 @@ def test_it_changes_a_scene_where_there_is_a_network_and_nothing_where_there_is_
     configured = structs.replace(refined, perceptual=PerceptualLossConfig(weight=0.2, start=0.0, every=2))
 
     def end(config, found):
-        monkeypatch.setattr(perceptual_loss, "load_alex", lambda: found)
+        monkeypatch.setattr(photometric_losses, "load_alex", lambda: found)
         *_, scene = refine(start, config, seed=0)
         return scene
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from splatnode.recon import core
-from splatnode.recon.optimize import photometric_by_torch, photometric_loss, photometric_reference
-from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.optimize import photometric_losses
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.rasterize import dispatch
 
 
@@ -23,7 +23,7 @@ def textured(height: int, width: int, seed: int) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("instruction_set", core.instruction_sets())
 def test_value_and_gradient(height, width, weighted, instruction_set, monkeypatch):
-    monkeypatch.setattr(photometric_loss, "library", lambda: core.library(instruction_set))
+    monkeypatch.setattr(photometric_losses, "library", lambda: core.library(instruction_set))
     rgb, target = textured(height, width, height)
     weights = torch.ones(height, width).double()
     if weighted:
@@ -32,7 +32,7 @@ def test_value_and_gradient(height, width, weighted, instruction_set, monkeypatc
         weights[weights < 0.3] = 0
         weights[0, 0] = 1
     expected_rgb = rgb.clone().requires_grad_()
-    expected = photometric_reference.photometric_loss(expected_rgb, target.permute(2, 0, 1), 0.2, weights)
+    expected = photometric_losses.photometric_loss(expected_rgb, target.permute(2, 0, 1), 0.2, weights)
     expected.backward()
     actual_rgb = rgb.float().requires_grad_()
     actual = PhotometricLoss(target, weights=weights if weighted else None)(actual_rgb)
@@ -54,10 +54,10 @@ def test_the_closed_form_is_the_references(height, width, weighted):
         weights[0, 0] = 1
     target = target.permute(2, 0, 1).contiguous()
     expected_rgb = rgb.clone().requires_grad_()
-    expected = photometric_reference.photometric_loss(expected_rgb, target, 0.4, weights)
+    expected = photometric_losses.photometric_loss(expected_rgb, target, 0.4, weights)
     expected.backward()
-    weighing = photometric_by_torch.make_weights(target, 0.4, weights)
-    value, gradient = photometric_by_torch.evaluate_loss(rgb.permute(2, 0, 1), target, weighing)
+    weighing = photometric_losses.make_weights(target, 0.4, weights)
+    value, gradient = photometric_losses.evaluate_loss(rgb.permute(2, 0, 1), target, weighing)
     assert value.item() == pytest.approx(expected.item(), rel=1e-10)
     torch.testing.assert_close(gradient.permute(1, 2, 0), expected_rgb.grad, rtol=1e-8, atol=1e-12)
     assert gradient.permute(1, 2, 0).is_contiguous()  # as the rasteriser wants it
@@ -68,7 +68,7 @@ def test_where_torch_computes_single_precision_suffices(monkeypatch):
     rgb, target = textured(60, 80, 5)
     rgb, target = 0.02 * rgb + 0.9, 0.02 * target + 0.9  # bright and almost plain: where variances lose most digits
     expected_rgb, actual_rgb = rgb.clone().requires_grad_(), rgb.float().requires_grad_()
-    expected = photometric_reference.photometric_loss(expected_rgb, target.permute(2, 0, 1), 0.4)
+    expected = photometric_losses.photometric_loss(expected_rgb, target.permute(2, 0, 1), 0.4)
     expected.backward()
     actual = PhotometricLoss(target, 0.4)(actual_rgb)
     (3 * actual).backward()

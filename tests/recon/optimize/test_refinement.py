@@ -14,17 +14,16 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize import dropout, fit, refinement, regularise
+from splatnode.recon.optimize import ensemble, fit, regularizers, training
 from splatnode.recon.optimize.fit import Trainer
 from splatnode.recon.optimize.losses import normal
 from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.refinement import LearningRates, RefinementConfig, refine
+from splatnode.recon.optimize.training import LearningRates, RefinementConfig, refine
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.result.sources import SHELL
-from splatnode.recon.scene import pixelwise
-from splatnode.recon.scene.gaussians import logit
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.result.snapshot import SHELL
+from splatnode.recon.scene import initialization
+from splatnode.recon.scene.scene import Scene, TrainingView, logit
 from tests.support.known_scene import disturbed, photographed, render, turned
 
 FROZEN = LearningRates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0, sh=0.0)
@@ -32,12 +31,12 @@ FROZEN = LearningRates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0
 
 def plain(**changes: object) -> RefinementConfig:
     """A refinement that keeps all Gaussians in every render and to the end."""
-    nothing = RefinementConfig(checkpoints=(), dssim=0.2, dropout=dropout.DropoutConfig(share=0.0), control=None)
+    nothing = RefinementConfig(checkpoints=(), dssim=0.2, dropout=ensemble.DropoutConfig(share=0.0), control=None)
     return structs.replace(nothing, **changes)
 
 
 QUICK = plain(iterations=12)
-WITH_NORMALS = regularise.RegularizerConfig({"normal": LossChoice("normal", normal.Config(1.0))})
+WITH_NORMALS = regularizers.RegularizerConfig({"normal": LossChoice("normal", normal.Config(1.0))})
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +140,7 @@ def steps_until(deadline: float, truth: Scene, monkeypatch) -> list[float]:
     """The progress of each iteration when the clock is read at 0, 1, 2, ... seconds."""
     progress: list[float] = []
     clock = itertools.count()
-    monkeypatch.setattr(refinement.time, "monotonic", lambda: float(next(clock)))
+    monkeypatch.setattr(training.time, "monotonic", lambda: float(next(clock)))
     monkeypatch.setattr(Trainer, "step", lambda fit, index, share: progress.append(share))
     assert len(list(refine(truth, plain(iterations=100), seed=0, deadline=deadline))) == 1
     return progress
@@ -270,7 +269,7 @@ def test_a_begun_scene_starts_soft_and_one_that_goes_on_does_not(truth):
     sources = torch.zeros_like(gaussians.source_frame)
     sources[0] = SHELL
     scene = replace(truth, gaussians=replace(gaussians, source_frame=sources), iterations=0)
-    still = plain(iterations=refinement.MIN_SOFT, rates=FROZEN)
+    still = plain(iterations=training.MIN_SOFT, rates=FROZEN)
     soft = last(scene, still).gaussians.opacities
     assert soft[0] == pytest.approx(0.5) and soft[1:].tolist() == pytest.approx([0.1] * (len(soft) - 1))
     gone_on, as_seeded = replace(scene, iterations=1), structs.replace(still, first_opacity=None)
@@ -281,16 +280,16 @@ def test_a_begun_scene_starts_soft_and_one_that_goes_on_does_not(truth):
 
 def test_looks_change_nothing(truth):
     begun = replace(truth, iterations=0)
-    config = plain(iterations=refinement.MIN_SOFT)
+    config = plain(iterations=training.MIN_SOFT)
     unseen, watched = last(begun, config), last(begun, structs.replace(config, checkpoints=tuple(range(10, 100, 10))))
     assert torch.equal(unseen.gaussians.logit_opacities, watched.gaussians.logit_opacities)
 
 
 def test_what_is_as_soft_already_is_left_to_the_bit(truth):
     from_photographs = replace(truth.gaussians, source_frame=torch.zeros_like(truth.gaussians.source_frame))
-    soft = refinement.soften_opacities(from_photographs, 0.1)
+    soft = training.soften_opacities(from_photographs, 0.1)
     assert soft.opacities.max() < 0.11
-    again = refinement.soften_opacities(soft, pixelwise.PixelwiseConfig().opacity)
+    again = training.soften_opacities(soft, initialization.PixelwiseConfig().opacity)
     assert torch.equal(soft.logit_opacities, again.logit_opacities)
 
 
@@ -309,11 +308,12 @@ def test_a_longer_refinement_takes_no_more_memory():
     """Where a tensor was kept of each step, the allocator could often not join what lay around it: 90 MB more."""
     script = (
         "import resource\n"
-        "from splatnode.recon.optimize.refinement import RefinementConfig, refine\n"
+        "from splatnode.recon.optimize.training import RefinementConfig, refine\n"
         "from tests.support.known_scene import many_gaussians\n"
         "peaks = {}\n"
         "def note(done): peaks[done] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-        "list(refine(many_gaussians(), RefinementConfig(iterations=200, checkpoints=(), control=None), seed=0, gone_on=note))\n"
+        "list(refine(many_gaussians(), RefinementConfig(iterations=200, checkpoints=(), control=None), seed=0, "
+        "gone_on=note))\n"
         "print(peaks[200] - peaks[50])\n"
     )
     grown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

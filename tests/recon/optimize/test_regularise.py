@@ -9,12 +9,12 @@ from msgspec import structs
 
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.evaluate.methods import CONFIGS
-from splatnode.recon.networks.crop import Crop
+from splatnode.recon.networks.vit import Crop
 from splatnode.recon.optimize import losses
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularise import Regularizer, RegularizerConfig
+from splatnode.recon.optimize.regularizers import Regularizer, RegularizerConfig
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.rasterize.render import Render
+from splatnode.recon.rasterize.reference import Render
 
 PAPER = CONFIGS["paper"].optimize.regularise
 WIDTH, HEIGHT = 96, 64
@@ -167,7 +167,7 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
         def __call__(self, image):
             return torch.nn.functional.normalize(image.mean((0, 1)), dim=0)
 
-    monkeypatch.setattr("splatnode.recon.optimize.supervision.load_relative", Seer)
+    monkeypatch.setattr("splatnode.recon.optimize.regularizers.load_relative", Seer)
     monkeypatch.setattr("splatnode.recon.optimize.losses.semantic.load_dino", Encoder)
     pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4))), strict=True)
     for pointmap in pointmaps:

@@ -10,13 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
+from splatnode.recon.evaluate.dataset import EvaluationScene, TrueCamera, load_scene
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.priors.aliked import WEIGHTS, Config, load
-from splatnode.recon.priors.aliked.deformable import DeformableConv, sample_maps
-from splatnode.recon.priors.aliked.detection import detect_keypoints
 from splatnode.recon.priors.aliked.matcher import AlikedMatcher, match_mutual
-from splatnode.recon.priors.aliked.network import Aliked, load_aliked
+from splatnode.recon.priors.aliked.network import Aliked, DeformableConv, detect_keypoints, load_aliked, sample_maps
 from tests.support.generated import generated, generated_images, shapes_of
 
 

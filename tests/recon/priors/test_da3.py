@@ -15,11 +15,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.networks.dinov2 import MEAN, STD
-from splatnode.recon.priors.da3.inference import estimate_keyframes
+from splatnode.recon.networks.vit import MEAN, STD
 from splatnode.recon.priors.da3.network import DepthAnything3, DepthEstimate, PlacedCamera, load_network
-from splatnode.recon.priors.da3.prior import Config, Da3Prior, load
-from splatnode.recon.registration import register
+from splatnode.recon.priors.da3.prior import Config, Da3Prior, estimate_keyframes, load
+from splatnode.recon.registration import registration as registration_registration
 from tests.support.generated import generated_images, generated_weights, shapes_of
 from tests.support.synthetic import SMALL, photographs, view_graph
 
@@ -138,7 +137,9 @@ def test_depth_comes_out_right_for_the_verified_cameras():
     graph = view_graph(photographs()[:3])
     oracle = Oracle((0, 1, 2))
     prior = Da3Prior(oracle, Config(longer_side=320))
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None
     pointmaps = prior.pointmaps(graph, registration)
     assert oracle.told is not None  # the registered cameras, as the network's image has them

@@ -13,16 +13,15 @@ import torch
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
-from splatnode.recon.networks.crop import crop
-from splatnode.recon.priors.depth_normals import compute_depth_normals
-from splatnode.recon.priors.mast3r.inference import PATCH, NetworkCache, prepare_image
+from splatnode.recon.matching import view_graph as matching
+from splatnode.recon.networks.vit import crop
 from splatnode.recon.priors.mast3r.network import EncodedImage, Prediction
-from splatnode.recon.priors.mast3r.prior import Config, Mast3rPrior, load
-from splatnode.recon.registration import register
+from splatnode.recon.priors.mast3r.prior import PATCH, Config, Mast3rPrior, NetworkCache, load, prepare_image
+from splatnode.recon.priors.pointmap import compute_depth_normals
+from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
-from splatnode.recon.verification.verify import VerificationConfig, verify
+from splatnode.recon.verification.evidence import VerificationConfig, verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 VIEWS = 3
@@ -95,7 +94,9 @@ def test_cameras_and_depth_come_out_right():
     graph = view_graph(photographs()[:VIEWS])
     oracle = Oracle()
     prior = Mast3rPrior(oracle, Config(longer_side=320))
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None and len(registration.cameras) == VIEWS
     cameras = synthetic.scene_cameras(SMALL)[:VIEWS]
     Ks = np.stack([np.diag([c.focal, c.focal, 1.0]) for c in registration.cameras])
@@ -131,7 +132,9 @@ def test_what_a_lying_network_invents_is_refused(noise):
         frames = [replace(frame, image=rng.integers(0, 256, frame.image.shape, np.uint8)) for frame in frames]
     prior = Mast3rPrior(Liar(), Config(longer_side=192))
     graph = view_graph(frames, prior.matcher, few)
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     evidence = verify(graph, registration, VerificationConfig())
     verdict = refuse_before_registration(graph, (), DecisionConfig()) or decide(
         graph, registration, evidence, DecisionConfig()

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from splatnode.recon.priors import patchmatchnet
-from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
-from splatnode.recon.priors.patchmatchnet.sampling import Source
+from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet, Source
 from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo, _make_planes
 from splatnode.recon.priors.stereo import StereoConfig, StereoView
 

@@ -10,7 +10,7 @@ import pytest
 
 from splatnode.capture.process.config import ConfigError, parse_config
 from splatnode.recon.config import PriorChoice, ReconstructionConfig, apply_changes, preset
-from splatnode.recon.registration import register
+from splatnode.recon.registration import registration as registration_registration
 from tests.support.synthetic import SMALL, photographs, view_graph
 
 
@@ -40,7 +40,9 @@ def test_it_keeps_the_interface(kind):
     prior = loaded(kind)
     assert prior.matcher is None or callable(prior.matcher.match)
     graph = view_graph(photographs()[:3], prior.matcher)
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
     pointmaps = prior.pointmaps(graph, registration)
     assert [pointmap.name for pointmap in pointmaps] == [keyframe.name for keyframe in graph.keyframes]
@@ -61,7 +63,9 @@ def test_a_further_view_finds_depth_where_those_before_it_were_not_confirmed():
     """A camera that goes on sees what those before it saw at their edges, where no other view had confirmed it."""
     prior = loaded("classical")
     graph = view_graph(photographs()[:4], None)
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None
     known = {}
     for pointmap in prior.pointmaps(graph, registration)[:3]:

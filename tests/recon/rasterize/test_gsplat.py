@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from splatnode.recon.geometry import twist_gradient
-from splatnode.recon.rasterize import device, dispatch, gsplat, reference
-from splatnode.recon.rasterize.device import DeviceUnavailable
+from splatnode.recon.rasterize import dispatch, gsplat, reference
+from splatnode.recon.rasterize.dispatch import DeviceUnavailable
 from tests.support import gsplat_by_torch
 from tests.support.rasterize_cases import (
     CASES,
@@ -146,6 +146,6 @@ def test_tensors_must_be_on_the_gpu():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
 def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
     with pytest.raises(DeviceUnavailable, match=r"device cuda needs an NVIDIA GPU .* but .* Take device auto or cpu"):
-        device.choose_device("cuda")
-    assert device.choose_device("auto") == device.choose_device("cpu") == torch.device("cpu")
-    assert "on the processor: the torch that is installed" in device.format_device("auto", torch.device("cpu"))
+        dispatch.choose_device("cuda")
+    assert dispatch.choose_device("auto") == dispatch.choose_device("cpu") == torch.device("cpu")
+    assert "on the processor: the torch that is installed" in dispatch.format_device("auto", torch.device("cpu"))

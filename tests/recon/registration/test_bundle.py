@@ -10,13 +10,13 @@ import pytest
 from scipy.optimize import least_squares
 
 from splatnode.recon.core import default_threads, set_threads
-from splatnode.recon.registration import bundle
+from splatnode.recon.registration import bundle_adjustment
 
 NOISE_PX = 0.3
-PRIOR = bundle.LensPrior(np.log([950.0]), np.array([0.3]), np.array([[0.1, 0.05]]), np.array([10.0]))
+PRIOR = bundle_adjustment.LensPrior(np.log([950.0]), np.array([0.3]), np.array([[0.1, 0.05]]), np.array([10.0]))
 
 
-def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> bundle.Problem:
+def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> bundle_adjustment.Problem:
     """Four cameras around a cloud of points, their true parameters, and noisy pixels."""
     generator = np.random.default_rng(seed)
     points = np.random.default_rng(7).uniform(-1.5, 1.5, (num_points, 3)) + [0.0, 0.0, 5.0]
@@ -24,7 +24,7 @@ def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> 
     rotations = np.stack([cv2.Rodrigues(vector)[0] for vector in vectors])
     centres = np.array([[0, 0, 0], [1.4, 0.1, 0.2], [-1.1, 0.6, 0.1], [0.5, -0.9, -0.4]])
     camera_of, point_of = np.tile(np.arange(4), num_points), np.repeat(np.arange(num_points), 4)
-    true = bundle.Problem(
+    true = bundle_adjustment.Problem(
         rotations=rotations,
         translations=-np.einsum("cij,cj->ci", rotations, centres),
         lens_of_camera=np.zeros(4, np.int64),
@@ -36,12 +36,12 @@ def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> 
         point_of=point_of,
         pixels=np.zeros((len(camera_of), 2)),
     )
-    pixels, depths = bundle.project(true)
+    pixels, depths = bundle_adjustment.project(true)
     assert (depths > 0).all()
     return replace(true, pixels=pixels + generator.normal(size=pixels.shape) * noise_px)
 
 
-def disturbed(true: bundle.Problem, seed: int = 1) -> bundle.Problem:
+def disturbed(true: bundle_adjustment.Problem, seed: int = 1) -> bundle_adjustment.Problem:
     """The problem with parameters off by what a first estimate is off; camera 0 as it was."""
     generator = np.random.default_rng(seed)
     turns = np.stack([cv2.Rodrigues(vector)[0] for vector in generator.normal(size=(4, 3)) * 0.02])
@@ -59,7 +59,7 @@ def disturbed(true: bundle.Problem, seed: int = 1) -> bundle.Problem:
     )
 
 
-def turned_deg(one: bundle.Problem, other: bundle.Problem) -> float:
+def turned_deg(one: bundle_adjustment.Problem, other: bundle_adjustment.Problem) -> float:
     cosine = (np.einsum("cij,cij->c", one.rotations, other.rotations) - 1.0) / 2.0
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
 
@@ -67,8 +67,10 @@ def turned_deg(one: bundle.Problem, other: bundle.Problem) -> float:
 def test_what_was_disturbed_comes_back_exactly_without_noise():
     true = problem(noise_px=0.0)
     prior = replace(PRIOR, sigmas=np.array([1e3]), radial_sigmas=np.full((1, 2), 1e3), shift_sigmas=np.array([1e6]))
-    found = bundle.adjust(disturbed(true), prior, bundle.BundleAdjustmentConfig(tolerance=1e-14, max_iterations=200))
-    assert bundle.reprojection_errors(found).max() < 1e-4
+    found = bundle_adjustment.adjust(
+        disturbed(true), prior, bundle_adjustment.BundleAdjustmentConfig(tolerance=1e-14, max_iterations=200)
+    )
+    assert bundle_adjustment.reprojection_errors(found).max() < 1e-4
     assert turned_deg(found, true) < 1e-4
     assert np.exp(found.log_focals[0]) == pytest.approx(900.0, abs=0.01)
     np.testing.assert_allclose(found.radials[0], [0.03, -0.02], atol=1e-4)
@@ -76,10 +78,10 @@ def test_what_was_disturbed_comes_back_exactly_without_noise():
 
 
 def test_scipy_finds_no_lower_cost_from_where_it_ends():
-    config = bundle.BundleAdjustmentConfig(robust_px=0.5, tolerance=1e-12, max_iterations=200)
-    found = bundle.adjust(disturbed(problem(num_points=20)), PRIOR, config)
+    config = bundle_adjustment.BundleAdjustmentConfig(robust_px=0.5, tolerance=1e-12, max_iterations=200)
+    found = bundle_adjustment.adjust(disturbed(problem(num_points=20)), PRIOR, config)
 
-    def moved(step: np.ndarray) -> bundle.Problem:
+    def moved(step: np.ndarray) -> bundle_adjustment.Problem:
         poses = step[:18].reshape(3, 6)
         rotations, translations = found.rotations.copy(), found.translations.copy()
         for camera, pose in enumerate(poses, start=1):
@@ -102,14 +104,14 @@ def test_scipy_finds_no_lower_cost_from_where_it_ends():
             + ((at.radials / PRIOR.radial_sigmas) ** 2).sum(1)
             + ((at.shifts / PRIOR.shift_sigmas[:, None]) ** 2).sum(1)
         )
-        return bundle.robust_cost(at, config) + float(pulls.sum())
+        return bundle_adjustment.robust_cost(at, config) + float(pulls.sum())
 
     def residuals(step: np.ndarray) -> np.ndarray:
         return np.sqrt([cost(step)])  # its square is the cost
 
     start = cost(np.zeros(23 + 60))
     gradient = np.array([(cost(d) - cost(-d)) / 2e-6 for d in np.eye(83) * 1e-6])
-    at_start = bundle.robust_cost(disturbed(problem(num_points=20)), config)
+    at_start = bundle_adjustment.robust_cost(disturbed(problem(num_points=20)), config)
     assert np.abs(gradient).max() < 1e-3 * at_start
     polished = least_squares(residuals, np.zeros(83), max_nfev=20)
     assert start <= 2.0 * polished.cost * (1.0 + 1e-6)
@@ -119,14 +121,16 @@ def test_outliers_hardly_move_the_cameras():
     clean = problem()
     wrong = np.random.default_rng(3).random(len(clean.pixels)) < 0.1
     spoiled = replace(clean, pixels=clean.pixels + wrong[:, None] * [80.0, -50.0])
-    found = bundle.adjust(disturbed(spoiled), PRIOR, bundle.BundleAdjustmentConfig())
+    found = bundle_adjustment.adjust(disturbed(spoiled), PRIOR, bundle_adjustment.BundleAdjustmentConfig())
     assert turned_deg(found, clean) < 0.3
 
 
 def test_a_sigma_of_zero_fixes_a_parameter():
     start = disturbed(problem())
-    found = bundle.adjust(
-        start, replace(PRIOR, sigmas=np.zeros(1), radial_sigmas=np.zeros((1, 2))), bundle.BundleAdjustmentConfig()
+    found = bundle_adjustment.adjust(
+        start,
+        replace(PRIOR, sigmas=np.zeros(1), radial_sigmas=np.zeros((1, 2))),
+        bundle_adjustment.BundleAdjustmentConfig(),
     )
     assert found.log_focals[0] == start.log_focals[0]
     assert not found.radials.any()
@@ -140,7 +144,7 @@ def test_the_argument_is_left_alone_and_the_number_of_threads_does_not_matter():
     results = []
     for threads in (3, 1):
         set_threads(threads)
-        results.append(bundle.adjust(start, PRIOR, bundle.BundleAdjustmentConfig()))
+        results.append(bundle_adjustment.adjust(start, PRIOR, bundle_adjustment.BundleAdjustmentConfig()))
     set_threads(default_threads())
     np.testing.assert_array_equal(start.points, kept)
     np.testing.assert_array_equal(results[0].points, results[1].points)
@@ -153,15 +157,17 @@ def test_the_order_of_observations_does_not_matter():
     shuffled = replace(
         start, camera_of=start.camera_of[order], point_of=start.point_of[order], pixels=start.pixels[order]
     )
-    one, other = (bundle.adjust(case, PRIOR, bundle.BundleAdjustmentConfig()) for case in (start, shuffled))
+    one, other = (
+        bundle_adjustment.adjust(case, PRIOR, bundle_adjustment.BundleAdjustmentConfig()) for case in (start, shuffled)
+    )
     assert turned_deg(one, other) < 1e-4
 
 
 def test_covariance_is_the_spread_of_the_estimates():
     # Nearly squares, for which the covariance is exact.
-    config = bundle.BundleAdjustmentConfig(robust_px=50.0, noise_px=NOISE_PX)
-    estimates = [bundle.adjust(problem(seed=seed), PRIOR, config) for seed in range(60)]
-    predicted = bundle.covariance(estimates[0], PRIOR, config)
+    config = bundle_adjustment.BundleAdjustmentConfig(robust_px=50.0, noise_px=NOISE_PX)
+    estimates = [bundle_adjustment.adjust(problem(seed=seed), PRIOR, config) for seed in range(60)]
+    predicted = bundle_adjustment.covariance(estimates[0], PRIOR, config)
     true = problem()
     turns = np.stack([cv2.Rodrigues(e.rotations[2] @ true.rotations[2].T)[0][:, 0] for e in estimates])
     spread = np.sqrt(np.trace(np.cov(turns.T)))

@@ -9,28 +9,30 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.registration import bundle, pose_test
+from splatnode.recon.registration import bundle_adjustment, pose_test
 from tests.recon.registration.test_bundle import problem
 
 NOISE_PX, SIGMAS = 0.5, np.array([np.radians(0.1), 0.004])
-TOLD = bundle.LensPrior(np.log([900.0]), np.zeros(1), np.zeros((1, 2)), np.zeros(1))
-LOSS = bundle.BundleAdjustmentConfig(robust_px=1e3, noise_px=NOISE_PX, tolerance=1e-12)
+TOLD = bundle_adjustment.LensPrior(np.log([900.0]), np.zeros(1), np.zeros((1, 2)), np.zeros(1))
+LOSS = bundle_adjustment.BundleAdjustmentConfig(robust_px=1e3, noise_px=NOISE_PX, tolerance=1e-12)
 
 
-def given_poses(true: bundle.Problem, seed: int) -> bundle.GivenPoses:
+def given_poses(true: bundle_adjustment.Problem, seed: int) -> bundle_adjustment.GivenPoses:
     """Those of all cameras, as wrong as they are unsure."""
     generator, count = np.random.default_rng(seed), len(true.rotations)
     turns = Rotation.from_rotvec(generator.normal(size=(count, 3)) * SIGMAS[0]).as_matrix()
-    centres = bundle.centres(true) + generator.normal(size=(count, 3)) * SIGMAS[1]
-    return bundle.GivenPoses(turns @ true.rotations, centres, np.tile(SIGMAS, (count, 1)))
+    centres = bundle_adjustment.centres(true) + generator.normal(size=(count, 3)) * SIGMAS[1]
+    return bundle_adjustment.GivenPoses(turns @ true.rotations, centres, np.tile(SIGMAS, (count, 1)))
 
 
-def start(true: bundle.Problem, given: bundle.GivenPoses) -> bundle.Problem:
+def start(true: bundle_adjustment.Problem, given: bundle_adjustment.GivenPoses) -> bundle_adjustment.Problem:
     translations = -np.einsum("cij,cj->ci", given.rotations, given.centres)
     return replace(true, rotations=given.rotations.copy(), translations=translations, given=given)
 
 
-def adjusted(seed: int, false: tuple[int, float, float] | None = None) -> tuple[bundle.Problem, bundle.Problem]:
+def adjusted(
+    seed: int, false: tuple[int, float, float] | None = None
+) -> tuple[bundle_adjustment.Problem, bundle_adjustment.Problem]:
     """The true problem, and the adjusted one, in which the pose of a camera may be false by radians and a length."""
     true = problem(40, seed, NOISE_PX)
     given = given_poses(true, 100 + seed)
@@ -38,7 +40,7 @@ def adjusted(seed: int, false: tuple[int, float, float] | None = None) -> tuple[
         camera, turn, shift = false
         given.rotations[camera] = Rotation.from_rotvec([0.0, turn, 0.0]).as_matrix() @ given.rotations[camera]
         given.centres[camera] += [0.0, shift, 0.0]
-    return true, bundle.adjust(start(true, given), TOLD, LOSS)
+    return true, bundle_adjustment.adjust(start(true, given), TOLD, LOSS)
 
 
 def test_the_adjustment_is_that_of_scipy() -> None:
@@ -46,9 +48,9 @@ def test_the_adjustment_is_that_of_scipy() -> None:
     begun = start(true, given_poses(true, 4))
     given = begun.given
     assert given is not None
-    found = bundle.adjust(begun, TOLD, LOSS)
+    found = bundle_adjustment.adjust(begun, TOLD, LOSS)
 
-    def at(values: np.ndarray) -> bundle.Problem:
+    def at(values: np.ndarray) -> bundle_adjustment.Problem:
         poses, points = values[:24].reshape(4, 6), values[24:].reshape(-1, 3)
         rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ begun.rotations
         return replace(begun, rotations=rotations, translations=begun.translations + poses[:, 3:], points=points)
@@ -56,12 +58,12 @@ def test_the_adjustment_is_that_of_scipy() -> None:
     def errors(values: np.ndarray) -> np.ndarray:
         now = at(values)
         turns = Rotation.from_matrix(now.rotations @ np.swapaxes(given.rotations, 1, 2)).as_rotvec()
-        moves = bundle.centres(now) - given.centres
-        pixels = (bundle.project(now)[0] - now.pixels) / NOISE_PX
+        moves = bundle_adjustment.centres(now) - given.centres
+        pixels = (bundle_adjustment.project(now)[0] - now.pixels) / NOISE_PX
         return np.concatenate([pixels.ravel(), turns.ravel() / SIGMAS[0], moves.ravel() / SIGMAS[1]])
 
     best = at(least_squares(errors, np.concatenate([np.zeros(24), true.points.ravel()]), method="lm", xtol=1e-12).x)
-    np.testing.assert_allclose(bundle.centres(found), bundle.centres(best), atol=2e-5)
+    np.testing.assert_allclose(bundle_adjustment.centres(found), bundle_adjustment.centres(best), atol=2e-5)
     np.testing.assert_allclose(found.rotations, best.rotations, atol=2e-5)
 
 
@@ -70,10 +72,10 @@ def test_a_camera_without_observations_stays_where_its_pose_is_given_as_sure_as_
     begun = start(true, given_poses(true, 0))
     seen = true.camera_of != 3
     begun = replace(begun, camera_of=true.camera_of[seen], point_of=true.point_of[seen], pixels=true.pixels[seen])
-    found = bundle.adjust(begun, TOLD, LOSS)
+    found = bundle_adjustment.adjust(begun, TOLD, LOSS)
     assert begun.given is not None
     np.testing.assert_allclose(found.rotations[3], begun.given.rotations[3], atol=1e-9)
-    covariance = bundle.covariance(found, TOLD, LOSS).cameras[3]
+    covariance = bundle_adjustment.covariance(found, TOLD, LOSS).cameras[3]
     np.testing.assert_allclose(np.diag(covariance)[:3], SIGMAS[0] ** 2, rtol=1e-3)
 
 
@@ -81,17 +83,17 @@ def test_errors_are_as_large_as_the_covariance_says_and_smaller_than_those_of_th
     squares, given_squares = [], []
     for seed in range(20):
         true, found = adjusted(seed)
-        covariance = bundle.covariance(found, TOLD, LOSS)
+        covariance = bundle_adjustment.covariance(found, TOLD, LOSS)
         assert found.given is not None
         for camera in range(4):
             turn, shift, by_pose = pose_test.deviation(
-                found, replace(found.given, rotations=true.rotations, centres=bundle.centres(true)), camera
+                found, replace(found.given, rotations=true.rotations, centres=bundle_adjustment.centres(true)), camera
             )
             error = np.concatenate([turn, shift])
             known = by_pose @ covariance.cameras[camera] @ by_pose.T
             squares.append(error @ np.linalg.solve(known, error) / 6)
-        moved = bundle.centres(found) - bundle.centres(true)
-        given_squares.append([(moved**2).sum(), ((found.given.centres - bundle.centres(true)) ** 2).sum()])
+        moved = bundle_adjustment.centres(found) - bundle_adjustment.centres(true)
+        given_squares.append([(moved**2).sum(), ((found.given.centres - bundle_adjustment.centres(true)) ** 2).sum()])
     assert 0.75 < np.mean(squares) < 1.35
     ours, theirs = np.sum(given_squares, 0)
     assert ours < theirs
@@ -102,7 +104,7 @@ def test_true_poses_are_not_contradicted_and_their_residuals_are_what_chance_giv
     for seed in range(25):
         _, found = adjusted(seed)
         assert found.given is not None
-        residuals = pose_test.residuals(found, found.given, bundle.covariance(found, TOLD, LOSS))
+        residuals = pose_test.residuals(found, found.given, bundle_adjustment.covariance(found, TOLD, LOSS))
         probabilities += [each.probability for each in residuals.values()]
     assert len(probabilities) == 100
     assert min(probabilities) > pose_test.LEAST_PROBABILITY
@@ -113,7 +115,7 @@ def test_true_poses_are_not_contradicted_and_their_residuals_are_what_chance_giv
 def test_a_false_pose_is_the_most_contradicted(turn: float, shift: float) -> None:
     _, found = adjusted(1, (2, turn, shift))
     assert found.given is not None
-    residuals = pose_test.residuals(found, found.given, bundle.covariance(found, TOLD, LOSS))
+    residuals = pose_test.residuals(found, found.given, bundle_adjustment.covariance(found, TOLD, LOSS))
     worst = min(residuals, key=lambda camera: residuals[camera].probability)
     assert worst == 2
     assert residuals[worst].probability < pose_test.LEAST_PROBABILITY

@@ -10,14 +10,17 @@ import numpy.typing as npt
 import pytest
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.registration import lenses, register
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.registration import registration as registration_registration
+from splatnode.recon.registration import self_calibration
+from splatnode.recon.registration.registration import Registration
 from tests.support.synthetic import photographs, renumbered, view_graph
 
 
 def registered(images: list[npt.NDArray[np.uint8]]) -> Registration:
     graph = view_graph(renumbered(images))
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None and len(registration.cameras) == len(images)
     return registration
 
@@ -51,6 +54,6 @@ def test_frames_that_were_cropped_have_a_lens_of_their_own():
 def test_an_error_of_so_many_pixels_means_the_same_through_every_lens():
     sizes = [(3000, 4000), (720, 1280), (2250, 3000)]
     frames = [Frame(0, "a.png", 0, np.empty((*size, 3), np.uint8), None) for size in sizes]
-    grouping = lenses.group([SimpleNamespace(frame=frame) for frame in frames], across_sizes=True)
+    grouping = self_calibration.group([SimpleNamespace(frame=frame) for frame in frames], across_sizes=True)
     assert grouping.lens_of == (0, 1, 0) and grouping.longer_side == 4000
     assert grouping.scales == pytest.approx((1.0, 4000 / 1280, 4000 / 3000))

@@ -11,7 +11,14 @@ import pytest
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching import two_view
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, epipolar, focal, mapper, resection, tracks, triangulation
+from splatnode.recon.registration import (
+    bundle_adjustment,
+    epipolar,
+    incremental_mapper,
+    resection,
+    self_calibration,
+    triangulation,
+)
 from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
 
 FOCAL = 900.0
@@ -83,14 +90,16 @@ def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, i
     return pairs
 
 
-def built(taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tuple[float, ...]) -> mapper.Map:
+def built(
+    taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tuple[float, ...]
+) -> incremental_mapper.Map:
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
-    found = mapper.build_map(views, [Lens(focals, 0.3)], pairs, mapper.MapperConfig())
+    found = incremental_mapper.build_map(views, [Lens(focals, 0.3)], pairs, incremental_mapper.MapperConfig())
     assert found is not None
     return found
 
 
-def errors(taken: Photographed, found: mapper.Map) -> tuple[float, float]:
+def errors(taken: Photographed, found: incremental_mapper.Map) -> tuple[float, float]:
     """Largest error of a relative rotation, degrees, and the largest of a centre, relative to their spread."""
     members = sorted(found.views)
     state = found.estimate
@@ -156,7 +165,7 @@ def test_false_alarms_fall_with_every_match_that_agrees():
 
 
 def test_pairs_vote_for_the_focal_length(pairs):
-    votes = focal.vote(list(pairs.values()), num_candidates=3)
+    votes = self_calibration.vote(list(pairs.values()), num_candidates=3)
     assert min(abs(np.log(vote * SIZE[0] / FOCAL)) for vote in votes) < 0.08
 
 
@@ -197,7 +206,7 @@ def test_a_lens_of_which_little_is_told_is_taken_for_one_that_bends_no_lines(tak
 
 def test_what_is_known_of_a_lens_stays(taken, pairs):
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
-    found = mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, mapper.MapperConfig())
+    found = incremental_mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, incremental_mapper.MapperConfig())
     assert found is not None
     assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
     assert not found.estimate.radials.any() and np.abs(found.estimate.shifts).max() == 0.0
@@ -210,7 +219,7 @@ def test_a_pair_that_shows_a_double_does_not_bend_the_map(taken, pairs):
     points = [np.concatenate([own, other]) for own, other in zip(taken.pixels, elsewhere.pixels, strict=True)]
     spoiled = {**pairs, (0, 4): replace(lying, matches=lying.matches + len(taken.pixels[0]))}
     views = [MapperView(of_view, 0, max(SIZE)) for of_view in points]
-    found = mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, mapper.MapperConfig())
+    found = incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, incremental_mapper.MapperConfig())
     assert found is not None
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 0.3 and centre < 0.02
@@ -236,10 +245,10 @@ def test_a_view_is_placed_as_well_through_a_lens_that_is_known_to_bend_lines(rad
     (seen,) = np.nonzero(taken.visible[0])
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 3)) * [2.0, 1.4, 1.2]  # those of `photographed`
     still, lens = np.zeros((1, 3)), (np.log([FOCAL]), np.array([[radial, 0.0]]), np.zeros((1, 2)))
-    bare = bundle.make_empty_problem(np.eye(3)[None], still, np.zeros(1, int), *lens)
-    prior = bundle.focal_prior(lens[0], np.ones(1))
+    bare = bundle_adjustment.make_empty_problem(np.eye(3)[None], still, np.zeros(1, int), *lens)
+    prior = bundle_adjustment.focal_prior(lens[0], np.ones(1))
     partial = PartialMap((), replace(bare, points=points), prior, np.arange(400))
-    observed = tracks.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
+    observed = triangulation.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
     problem = MapperInput((), (), {}, np.ones(1), observed, observed)
     found = resection.resect(problem, partial, 0, resection.ResectionConfig())
     assert found is not None and found.inlier_ratio > 0.99
@@ -252,14 +261,14 @@ def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
     assert np.median(ahead) == pytest.approx(0.67 * NOISE_PX, rel=0.4)
     rotations, translations = found.estimate.rotations, found.estimate.translations
     towards = rotations[3] @ rotations[0].T @ translations[0]
-    flipped = bundle.replace_pose(found.estimate, 3, rotations[3], 2 * towards - translations[3])
+    flipped = bundle_adjustment.replace_pose(found.estimate, 3, rotations[3], 2 * towards - translations[3])
     behind = epipolar.sampson_errors(flipped, (0, 3), pairs[0, 3])
     assert np.isinf(behind).mean() > 0.9
 
 
 def test_no_pair_gives_no_map(taken):
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
-    assert mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, mapper.MapperConfig()) is None
+    assert incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, incremental_mapper.MapperConfig()) is None
 
 
 def test_tracks_join_matches_and_drop_what_contradicts_itself():
@@ -270,13 +279,13 @@ def test_tracks_join_matches_and_drop_what_contradicts_itself():
         return TwoView(index, points[0][index[:, 0]], points[0][index[:, 1]], 0, 0.0, 0, 0, 1.0, 1.0)
 
     matched = {(0, 1): pair((0, 0), (1, 1), (2, 2)), (1, 2): pair((0, 0), (1, 3)), (0, 2): pair((1, 1))}
-    joined = tracks.build(points, matched)
+    joined = triangulation.build(points, matched)
     members = [
         {int(camera) for camera in joined.camera_of[joined.track_of == track]} for track in range(joined.num_tracks)
     ]
     # 0-0-0 is whole; 1-1 reaches two features of view 2, which both go; 2-2 is seen twice.
     assert sorted(map(sorted, members)) == [[0, 1], [0, 1], [0, 1, 2]]
-    thinned = tracks.thin(joined, per_camera=1)
+    thinned = triangulation.thin(joined, per_camera=1)
     assert thinned.num_tracks == 1
     assert sorted(thinned.camera_of) == [0, 1, 2]
 

@@ -13,15 +13,14 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.evaluate.stability.case import make_frames, make_world
+from splatnode.recon.evaluate.dataset import TrueCamera
+from splatnode.recon.evaluate.stability.case import make_frames, make_world, score_cameras
 from splatnode.recon.evaluate.stability.lens_assumptions import KINDS, correct_keystone, set_intrinsics, zoom_image
-from splatnode.recon.evaluate.stability.outcome import score_cameras
-from splatnode.recon.evaluate.stability.own_cameras import list_registered_cameras
-from splatnode.recon.evaluate.stability.places import TrialImage
-from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.evaluate.stability.perturbations import TrialImage
+from splatnode.recon.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.registration import bundle, lenses
-from splatnode.recon.registration.register import register
+from splatnode.recon.registration import bundle_adjustment, self_calibration
+from splatnode.recon.registration.registration import register
 from tests.support.synthetic import view_graph
 
 pytestmark = pytest.mark.numerical
@@ -103,12 +102,12 @@ def test_tied_lenses_share_what_is_not_refuted():
     count = 3
     sigmas = np.zeros((count, 6))
     sigmas[1, 0] = 0.01
-    prior = bundle.LensPrior(
+    prior = bundle_adjustment.LensPrior(
         np.zeros(count),
         np.full(count, 0.5),
         np.zeros((count, 2)),
         np.zeros(count),
-        ties=bundle.LensTies(np.array([-1, 0, -1]), sigmas),
+        ties=bundle_adjustment.LensTies(np.array([-1, 0, -1]), sigmas),
     )
     covariance = np.linalg.inv(prior.information[::6, ::6])
     apart = np.array([1.0, -1.0, 0.0])
@@ -123,12 +122,12 @@ def test_a_group_has_the_covariance_of_common_and_own():
     count, own_sigma, common_sigma = 4, 0.02, 0.3
     common = np.zeros((count, 6))
     common[:, 0] = common_sigma
-    prior = bundle.LensPrior(
+    prior = bundle_adjustment.LensPrior(
         np.zeros(count),
         np.full(count, own_sigma),
         np.zeros((count, 2)),
         np.zeros(count),
-        common=bundle.CommonLensPrior(np.zeros(count, np.int64), common),
+        common=bundle_adjustment.CommonLensPrior(np.zeros(count, np.int64), common),
     )
     covariance = np.linalg.inv(prior.information[::6, ::6])
     assert np.allclose(covariance, own_sigma**2 * np.eye(count) + common_sigma**2)
@@ -151,5 +150,5 @@ def test_images_of_different_cameras_share_no_lens():
     cameras = ("a", "a", "", "b", "b", "")
     named = [replace(frame, camera=camera) for frame, camera in zip(make_frames(photographs()), cameras, strict=True)]
     keyframes = [Keyframe(frame, frame.image, Features(*(np.zeros(0),) * 4)) for frame in named]
-    lens_of = lenses.group(keyframes, across_sizes=True).lens_of
+    lens_of = self_calibration.group(keyframes, across_sizes=True).lens_of
     assert lens_of[0] == lens_of[1] == lens_of[2] and lens_of[3] == lens_of[4] != lens_of[0]

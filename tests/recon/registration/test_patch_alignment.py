@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.core import default_threads, set_threads
-from splatnode.recon.registration import patch_alignment
-from splatnode.recon.registration.patch_alignment import Patches
+from splatnode.recon.registration import subpixel
+from splatnode.recon.registration.subpixel import Patches
 
 MATRIX = np.array([[0.9, 0.15], [-0.1, 1.1]])
 SHIFT = np.array([30.3, 20.7])
@@ -52,7 +52,7 @@ def images() -> list[np.ndarray]:
 
 def test_a_known_warp_is_found_to_a_fiftieth_of_a_pixel(images):
     given = patches()
-    found = patch_alignment.align(images, given, patch_alignment.PatchAlignmentConfig())
+    found = subpixel.align(images, given, subpixel.PatchAlignmentConfig())
     aligned = found.correlation > 0.9
     assert aligned.mean() > 0.95
     errors = np.linalg.norm(found.target - true_target(given.reference), axis=1)[aligned]
@@ -67,7 +67,7 @@ def test_sigma_is_the_spread_under_noise(images):
     errors, sigmas = [], []
     for _ in range(12):
         noisy = [image + generator.normal(size=image.shape).astype(np.float32) * 4.0 for image in images]
-        found = patch_alignment.align(noisy, given, patch_alignment.PatchAlignmentConfig())
+        found = subpixel.align(noisy, given, subpixel.PatchAlignmentConfig())
         good = found.correlation > 0.8
         errors.append((found.target - true_target(given.reference))[good])
         sigmas.append(found.sigma[good])
@@ -79,12 +79,12 @@ def test_sigma_is_the_spread_under_noise(images):
 
 def test_without_iterations_nothing_moves_and_the_truth_correlates_best(images):
     given = patches(error_px=0.0)
-    right = patch_alignment.align(
+    right = subpixel.align(
         images,
         replace(given, affine=np.tile(MATRIX, (200, 1, 1))),
-        patch_alignment.PatchAlignmentConfig(max_iterations=0),
+        subpixel.PatchAlignmentConfig(max_iterations=0),
     )
-    wrong = patch_alignment.align(images, given, patch_alignment.PatchAlignmentConfig(max_iterations=0))
+    wrong = subpixel.align(images, given, subpixel.PatchAlignmentConfig(max_iterations=0))
     np.testing.assert_allclose(right.target, given.target, atol=1e-4)
     assert np.median(right.correlation) > 0.99
     assert np.median(wrong.correlation) < 0.96
@@ -93,11 +93,9 @@ def test_without_iterations_nothing_moves_and_the_truth_correlates_best(images):
 def test_what_shows_nothing_or_leaves_the_image_is_not_aligned(images):
     flat = np.full((300, 400), 90.0, np.float32)
     given = patches(count=20, error_px=0.0)
-    assert (
-        patch_alignment.align([flat, flat], given, patch_alignment.PatchAlignmentConfig()).correlation == -1.0
-    ).all()
+    assert (subpixel.align([flat, flat], given, subpixel.PatchAlignmentConfig()).correlation == -1.0).all()
     outside = replace(given, target=np.full((20, 2), 3.0))
-    found = patch_alignment.align(images, outside, patch_alignment.PatchAlignmentConfig())
+    found = subpixel.align(images, outside, subpixel.PatchAlignmentConfig())
     assert (found.correlation == -1.0).all()
     assert np.isinf(found.sigma).all()
     np.testing.assert_allclose(found.target, outside.target)
@@ -107,13 +105,13 @@ def test_the_number_of_threads_does_not_matter(images):
     results = []
     for threads in (3, 1):
         set_threads(threads)
-        results.append(patch_alignment.align(images, patches(), patch_alignment.PatchAlignmentConfig()).target)
+        results.append(subpixel.align(images, patches(), subpixel.PatchAlignmentConfig()).target)
     set_threads(default_threads())
     np.testing.assert_array_equal(results[0], results[1])
 
 
 def test_no_patch_is_no_problem(images):
-    assert patch_alignment.align(images, patches(count=0), patch_alignment.PatchAlignmentConfig()).target.shape == (
+    assert subpixel.align(images, patches(count=0), subpixel.PatchAlignmentConfig()).target.shape == (
         0,
         2,
     )
@@ -122,9 +120,9 @@ def test_no_patch_is_no_problem(images):
 @pytest.mark.parametrize("radius", [0, 13])
 def test_a_radius_out_of_range_is_refused(images, radius):
     with pytest.raises(ValueError, match="1 to 12"):
-        patch_alignment.align(images, patches(), patch_alignment.PatchAlignmentConfig(radius=radius))
+        subpixel.align(images, patches(), subpixel.PatchAlignmentConfig(radius=radius))
 
 
 def test_an_image_that_is_not_there_is_refused(images):
     with pytest.raises(ValueError, match="target images"):
-        patch_alignment.align(images[:1], patches(), patch_alignment.PatchAlignmentConfig())
+        subpixel.align(images[:1], patches(), subpixel.PatchAlignmentConfig())

@@ -11,21 +11,22 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
-from splatnode.recon.matching.match import match
-from splatnode.recon.registration import bundle, register
+from splatnode.recon.matching import view_graph as matching
+from splatnode.recon.matching.view_graph import match
+from splatnode.recon.registration import bundle_adjustment
+from splatnode.recon.registration import registration as registration_registration
 from tests.support.synthetic import photographs, renumbered, view_graph
 
 
 def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
     place = synthetic.Config(views=3, width=320, height=240)
     blank = np.full((200, 300, 3), 128, np.uint8)
-    config, settings = register.RegistrationConfig(), matching.MatchingConfig()
+    config, settings = registration_registration.RegistrationConfig(), matching.MatchingConfig()
     frames = [*synthetic.stream(place), Frame(3, "another size", 3, blank, None)]
     keyframes = [Keyframe(frame, frame.image, features.extract(frame.image, settings.features)) for frame in frames]
     graph = match(keyframes, settings)
-    registration = register.register(graph.keyframes, graph.pairs, config)
+    registration = registration_registration.register(graph.keyframes, graph.pairs, config)
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
     assert registration.focal_sigma < 0.5 * config.lenses.voted_sigma
 
@@ -34,14 +35,16 @@ def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
 def test_a_focal_length_without_a_variance_is_infinitely_uncertain(monkeypatch, variance):
     """The verdict refuses what is not finite."""
     graph = view_graph(photographs()[:3])
-    covariance = bundle.covariance
+    covariance = bundle_adjustment.covariance
 
-    def broken(*problem) -> bundle.Covariance:
+    def broken(*problem) -> bundle_adjustment.Covariance:
         found = covariance(*problem)
         return replace(found, log_focals=np.full_like(found.log_focals, variance))
 
-    monkeypatch.setattr(bundle, "covariance", broken)
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    monkeypatch.setattr(bundle_adjustment, "covariance", broken)
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None and registration.focal_sigma == np.inf
 
 

@@ -11,10 +11,10 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.matching import config as matching
+from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.register import Registration
-from splatnode.recon.registration.straightened import (
+from splatnode.recon.registration.registration import Registration
+from splatnode.recon.registration.undistortion import (
     LEAST_SHIFT,
     apply_known_lenses,
     corner_shift,

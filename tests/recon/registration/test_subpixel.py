@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.registration import bundle, patch_image, subpixel
-from splatnode.recon.registration.patch_image import PatchImage
+from splatnode.recon.registration import bundle_adjustment, subpixel
+from splatnode.recon.registration.subpixel import PatchImage
 from tests.recon.registration.test_patch_alignment import texture
 
 FOCAL = 300.0
@@ -39,14 +39,14 @@ def photographs() -> list[np.ndarray]:
     return images
 
 
-def problem(noise_px: float, views: tuple[int, ...] = (0, 1, 2)) -> bundle.Problem:
+def problem(noise_px: float, views: tuple[int, ...] = (0, 1, 2)) -> bundle_adjustment.Problem:
     """Points of the slope, observed by `views`; camera 1's observations are exact, the others' are not."""
     generator = np.random.default_rng(0)
     place = generator.uniform([120, 90], [280, 210], (80, 2))
     points = CORNER + place @ np.stack([ACROSS, DOWN])
     rotations, translations = cameras()
     camera_of, point_of = np.tile(views, len(points)), np.repeat(np.arange(len(points)), len(views))
-    true = bundle.Problem(
+    true = bundle_adjustment.Problem(
         rotations=rotations,
         translations=translations,
         lens_of_camera=np.zeros(3, np.int64),
@@ -58,7 +58,7 @@ def problem(noise_px: float, views: tuple[int, ...] = (0, 1, 2)) -> bundle.Probl
         point_of=point_of,
         pixels=np.zeros((len(camera_of), 2)),
     )
-    pixels, _ = bundle.project(true)
+    pixels, _ = bundle_adjustment.project(true)
     noise = generator.normal(size=pixels.shape) * noise_px * (camera_of != 1)[:, None]
     return replace(true, pixels=pixels + noise)
 
@@ -66,15 +66,15 @@ def problem(noise_px: float, views: tuple[int, ...] = (0, 1, 2)) -> bundle.Probl
 @pytest.fixture(scope="module")
 def images() -> list[PatchImage]:
     middle = np.array(SIZE) / 2.0
-    return [patch_image.patch_image(image, middle, patch_image.PatchImageConfig()) for image in photographs()]
+    return [subpixel.patch_image(image, middle, subpixel.PatchImageConfig()) for image in photographs()]
 
 
 def test_noisy_observations_become_exact(images):
     noisy = problem(noise_px=0.5)
     refined = subpixel.refine(noisy, (0, 1, 2), images, subpixel.SubpixelConfig())
     assert len(refined.points) > 70
-    assert np.median(bundle.reprojection_errors(noisy)[noisy.camera_of != 1]) > 0.4
-    aligned = bundle.reprojection_errors(refined)[refined.camera_of != 1]
+    assert np.median(bundle_adjustment.reprojection_errors(noisy)[noisy.camera_of != 1]) > 0.4
+    aligned = bundle_adjustment.reprojection_errors(refined)[refined.camera_of != 1]
     assert np.median(aligned) < 0.05
 
 
@@ -83,7 +83,7 @@ def test_points_are_found_in_a_view_that_had_not_matched_them(images):
     in_third = refined.camera_of == 2
     assert in_third.sum() > 60
     # The reference is camera 0 or 1: where that observation is noisy, the point itself is.
-    assert np.median(bundle.reprojection_errors(refined)[in_third]) < 0.5
+    assert np.median(bundle_adjustment.reprojection_errors(refined)[in_third]) < 0.5
     not_registered = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1), images, subpixel.SubpixelConfig())
     assert (not_registered.camera_of != 2).all()
 
@@ -94,7 +94,7 @@ def test_observations_of_something_else_are_left_out(images):
     wrong = (start.camera_of == 2) & (start.point_of < 40)
     pixels = np.where(wrong[:, None], generator.uniform(-80, 80, start.pixels.shape), start.pixels)
     refined = subpixel.refine(replace(start, pixels=pixels), (0, 1, 2), images, subpixel.SubpixelConfig())
-    assert (bundle.reprojection_errors(refined) < 1.0).mean() > 0.97
+    assert (bundle_adjustment.reprojection_errors(refined) < 1.0).mean() > 0.97
     assert (np.diff(refined.point_of) >= 0).all()
     assert np.bincount(refined.point_of).min() >= 2
 
@@ -122,7 +122,7 @@ def test_the_affine_of_a_plane_is_the_derivative_of_its_projection():
 
 def test_large_images_are_shrunk_and_pixels_with_them():
     image = np.zeros((1000, 2000, 3), np.uint8)
-    shrunk = patch_image.patch_image(image, np.array([990.0, 505.0]), patch_image.PatchImageConfig(max_longer_side=500))
+    shrunk = subpixel.patch_image(image, np.array([990.0, 505.0]), subpixel.PatchImageConfig(max_longer_side=500))
     assert shrunk.grey.shape == (250, 500)
     np.testing.assert_allclose(shrunk.map_to_grey(np.array([[10.0, -5.0]])), [[250.0, 125.0]])
     np.testing.assert_allclose(shrunk.map_from_grey(np.array([[250.0, 125.0]])), [[10.0, -5.0]])

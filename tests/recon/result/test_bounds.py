@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.result.bounds import Bounds, compute_axes, find_widest, make_ball
+from splatnode.recon.result.verdict import Bounds, compute_axes, find_widest, make_ball
 
 
 @pytest.mark.parametrize(

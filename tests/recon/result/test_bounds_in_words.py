@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.recon.result.bounds import Bounds, make_ball
-from splatnode.recon.result.bounds_in_words import format_camera_bounds, format_widest_bounds
-from splatnode.recon.result.scale import RELATIVE, Scale
+from splatnode.recon.result.snapshot import format_camera_bounds, format_widest_bounds
+from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale, make_ball
 from tests.support.exported import make_camera
 
 KNOWN = Bounds(0.3, 0.03, 1.2, 0.8, make_ball(0.03))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.result.coarser import concatenate_gaussians, make_detail_levels, merge_by_voxel
+from splatnode.recon.result.levels_of_detail import concatenate_gaussians, make_detail_levels, merge_by_voxel
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.recon.result.test_whole import random_gaussians

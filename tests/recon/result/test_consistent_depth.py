@@ -8,15 +8,15 @@ import msgspec
 import pytest
 
 from splatnode.capture.messaging.wire import Header, WireError, decode, encode
-from splatnode.recon.result.consistent_depth import (
-    ADVICE,
-    ConsistentDepthConfig,
-    append_consistent_depth,
-    format_percent,
-)
-from splatnode.recon.result.depth_message import DepthHeader, add_depth_shares, make_depth_header
 from splatnode.recon.result.export.cameras import decode_cameras, encode_cameras
-from splatnode.recon.result.message import SceneHeader, decode_snapshot
+from splatnode.recon.result.message import (
+    DepthHeader,
+    SceneHeader,
+    add_depth_shares,
+    decode_snapshot,
+    make_depth_header,
+)
+from splatnode.recon.result.npz_files import ADVICE, ConsistentDepthConfig, append_consistent_depth, format_percent
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

@@ -10,9 +10,9 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.landmarks import KnownLenses, Landmarks
-from splatnode.recon.result.landmarks_file import LANDMARKS, decode_landmarks, encode_landmarks, read_landmarks
+from splatnode.recon.result.export.limits import SceneFileError
+from splatnode.recon.result.npz_files import LANDMARKS, decode_landmarks, encode_landmarks, read_landmarks
+from splatnode.recon.result.snapshot import KnownLenses, Landmarks
 from tests.support.exported import make_landmarks
 
 

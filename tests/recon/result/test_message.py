@@ -8,11 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import DroppedFrame, Intrinsics
-from splatnode.capture.messaging.jpeg import make_jpeg_array
+from splatnode.capture.frame import Clock, DroppedFrame, Intrinsics, Stamp
+from splatnode.capture.messaging.messages import make_jpeg_array
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
-from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.message import (
     CameraRecord,
     SceneHeader,
@@ -20,9 +18,8 @@ from splatnode.recon.result.message import (
     encode_snapshot,
     make_camera_record,
 )
-from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.result.verdict import RELATIVE, Bounds, Code, Scale, Verdict
 from tests.support.schemas import without
 
 RANDOM = np.random.default_rng(0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatnode.recon.result.moving_in_words import describe_moving
+from splatnode.recon.result.snapshot import describe_moving
 
 
 def test_little_is_not_told():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.result.preview import make_contact_sheet, render_camera
+from splatnode.recon.result.report import make_contact_sheet, render_camera
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from splatnode.recon.result.sources import SHELL, decode_frame_id, encode_unconfirmed, find_confirmed
+from splatnode.recon.result.snapshot import SHELL, decode_frame_id, encode_unconfirmed, find_confirmed
 
 
 def test_the_frame_and_whether_two_photographs_confirm_it_come_back():

@@ -10,9 +10,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.scene.background import SHELL, BackgroundConfig, far_shell
-from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Gaussians
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 64, 48

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.completion import DepthCompletionConfig, complete, smooth_depth
+from splatnode.recon.scene.background import DepthCompletionConfig, complete, smooth_depth
 from tests.support.synthetic import plane_pointmap, without
 
 WIDTH, HEIGHT = 64, 48

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.scene.contrast_masking import MASKING_STD, visibility
+from splatnode.recon.scene.initialization import MASKING_STD, visibility
 
 
 def stripes(contrast: float) -> np.ndarray:

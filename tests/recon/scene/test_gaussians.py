@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
-from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate
+from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.scene.scene import SH_C0, Gaussians, concatenate
 from tests.support.synthetic import TinyScene, tiny_scene
 
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.recon.result.sources import decode_frame_id
-from splatnode.recon.scene import background, light
+from splatnode.capture.frame import ExposureSettings
+from splatnode.recon.result.snapshot import decode_frame_id
+from splatnode.recon.scene import background, exposure
 from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limit_gaussians, remove_views
-from splatnode.recon.scene.initialisation import SceneInitializationConfig
+from splatnode.recon.scene.initialization import SceneInitializationConfig
 from tests.support.row_of_views import STEP, WIDTH, graph_of, maps_of, registration_of, scene_of
 
 CONFIG = SceneInitializationConfig()
-LIGHT = light.ExposureConfig()
+LIGHT = exposure.ExposureConfig()
 
 
 def test_growing_adds_a_further_views_gaussians_and_leaves_all_others_as_they_are():

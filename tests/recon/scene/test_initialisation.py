@@ -10,18 +10,18 @@ import torch
 
 from splatnode.capture.process.config import parse_config
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.frames import border
+from splatnode.recon.frames import screening
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.result.sources import decode_frame_id
-from splatnode.recon.scene import background, initialisation, pixelwise
-from splatnode.recon.scene.initialisation import initialize_scene
+from splatnode.recon.result.snapshot import decode_frame_id
+from splatnode.recon.scene import background, initialization
+from splatnode.recon.scene.initialization import initialize_scene
 from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 32, 24
 
 
-def begun(max_gaussians: int | None = None, by_pixel: pixelwise.PixelwiseConfig | None = None) -> Scene:
+def begun(max_gaussians: int | None = None, by_pixel: initialization.PixelwiseConfig | None = None) -> Scene:
     """Two views of a wall of noise, one step apart."""
     step = np.eye(4)
     step[0, 3] = 0.3
@@ -32,11 +32,13 @@ def begun(max_gaussians: int | None = None, by_pixel: pixelwise.PixelwiseConfig 
 
 
 def scene_of(
-    pointmaps: tuple[Pointmap, ...], max_gaussians: int | None = None, by_pixel: pixelwise.PixelwiseConfig | None = None
+    pointmaps: tuple[Pointmap, ...],
+    max_gaussians: int | None = None,
+    by_pixel: initialization.PixelwiseConfig | None = None,
 ) -> Scene:
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     images = {pointmap.name: noise for pointmap in pointmaps}
-    config = initialisation.SceneInitializationConfig(pixelwise=by_pixel, max_gaussians=max_gaussians)
+    config = initialization.SceneInitializationConfig(pixelwise=by_pixel, max_gaussians=max_gaussians)
     return initialize_scene(pointmaps, images, config)
 
 
@@ -60,10 +62,10 @@ def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_sh
     assert torch.equal(scene_of(sure).gaussians.means, scene_of(doubtful).gaussians.means)
 
 
-@pytest.mark.parametrize("by_pixel", [None, pixelwise.PixelwiseConfig()])
+@pytest.mark.parametrize("by_pixel", [None, initialization.PixelwiseConfig()])
 def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkeypatch):
     right = np.broadcast_to(np.arange(WIDTH) >= 8, (HEIGHT, WIDTH))
-    monkeypatch.setattr(border, "valid_masks", lambda images: [right] * len(images))
+    monkeypatch.setattr(screening, "valid_masks", lambda images: [right] * len(images))
     scene = begun(by_pixel=by_pixel)
     for view in scene.views:
         assert view.pointmap is not None and not view.pointmap.depth[~right].any()
@@ -74,7 +76,7 @@ def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkey
 
 @pytest.mark.parametrize("most", [None, 100])
 def test_by_pixel_a_scene_has_what_stereo_knows_and_nothing_else(most):
-    scene = begun(most, pixelwise.PixelwiseConfig(opacity=0.1))
+    scene = begun(most, initialization.PixelwiseConfig(opacity=0.1))
     assert len(scene.views) == 2 and set(scene.gaussians.source_frame.tolist()) == {0, 1}
     assert len(scene.gaussians) == most or len(scene.gaussians) > WIDTH * HEIGHT
     torch.testing.assert_close(scene.gaussians.opacities, torch.full((len(scene.gaussians),), 0.1))
@@ -112,7 +114,7 @@ def test_a_gaussian_a_pixel_may_begin_with_our_surroundings():
     for pointmap in pointmaps:
         pointmap.confidence[:4] = 0.01
     begun = {
-        each: scene_of(pointmaps, None, pixelwise.PixelwiseConfig(surroundings=each))
+        each: scene_of(pointmaps, None, initialization.PixelwiseConfig(surroundings=each))
         for each in ("none", "shell", "fill")
     }
     shell = {each: int((scene.gaussians.source_frame == background.SHELL).sum()) for each, scene in begun.items()}
@@ -122,5 +124,5 @@ def test_a_gaussian_a_pixel_may_begin_with_our_surroundings():
     assert surfaces["fill"] == 24 * WIDTH
     filled = begun["fill"].views[0].pointmap
     assert filled is not None and (filled.depth[:4] > 0).all() and (filled.confidence[:4] > 0.05).all()
-    limited = scene_of(pointmaps, 200, pixelwise.PixelwiseConfig(surroundings="fill"))
+    limited = scene_of(pointmaps, 200, initialization.PixelwiseConfig(surroundings="fill"))
     assert len(limited.gaussians) <= 200

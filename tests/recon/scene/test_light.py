@@ -12,7 +12,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.light import (
+from splatnode.recon.scene.exposure import (
     ExposureConfig,
     apply_exposure,
     apply_headroom,

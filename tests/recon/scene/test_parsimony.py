@@ -11,14 +11,14 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.start import continue_reconstruction, find_start
-from splatnode.recon.optimize import refinement
+from splatnode.recon.evaluate.methods import continue_reconstruction, find_start
+from splatnode.recon.optimize import training
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene.initialization import initialize_gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
-from splatnode.recon.scene.seeding import initialize_gaussians
 from tests.support.synthetic import photographs, plane_pointmap, repeated
 
-SHORT = refinement.RefinementConfig(iterations=20, checkpoints=())
+SHORT = training.RefinementConfig(iterations=20, checkpoints=())
 CONFIG = ReconstructionConfig(size=160, optimize=SHORT)
 
 
@@ -77,7 +77,7 @@ def refined_wall(image: np.ndarray) -> int:
     T, K = torch.eye(4), torch.from_numpy(pointmap.K).float()
     view = TrainingView("0.png", 0, image, T, K)
     scene = Scene((view,), initialize_gaussians([pointmap], [image], CONFIG.seeding))
-    return len(list(refinement.refine(scene, SHORT, seed=0))[-1].gaussians)
+    return len(list(training.refine(scene, SHORT, seed=0))[-1].gaussians)
 
 
 def test_twice_the_detail_takes_clearly_more_and_a_blank_wall_next_to_nothing():

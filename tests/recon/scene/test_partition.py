@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.core import default_threads, set_threads
-from splatnode.recon.scene.partition import partition
+from splatnode.recon.scene.initialization import partition
 
 
 def cut(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.scene.pixelwise import PixelwiseConfig, pixelwise_gaussians
+from splatnode.recon.scene.initialization import PixelwiseConfig, pixelwise_gaussians
 from tests.support.synthetic import plane_pointmap, without
 
 

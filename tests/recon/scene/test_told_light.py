@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import ExposureSettings, Frame
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.scene.told_light import compute_exposure_priors
+from splatnode.recon.scene.exposure import compute_exposure_priors
 from tests.support.row_of_views import NO_FEATURES
 
 

@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.light import (
+from splatnode.recon.scene.exposure import (
     ExposureConfig,
+    SharedPixels,
     apply_exposure,
     compensate_image,
+    compute_squared_radius,
     estimate_exposures,
+    estimate_falloffs,
     estimate_further_exposures,
+    find_shared_pixels,
+    relative_illumination,
+    remove_falloff,
 )
-from splatnode.recon.scene.shared_pixels import SharedPixels, compute_squared_radius, find_shared_pixels
-from splatnode.recon.scene.vignetting import estimate_falloffs, relative_illumination, remove_falloff
 from tests.recon.scene.test_light import LIT, by_name, exposed, place
 
 FALLOFF = 0.9  # two fifths of the light reach the corners

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.register import Registration
-from splatnode.recon.registration.straightened import undistort_keyframe
-from splatnode.recon.scene.warping import registration_in_scene_world, replace_images, update_pointmaps, warp_scene
+from splatnode.recon.registration.registration import Registration
+from splatnode.recon.registration.undistortion import undistort_keyframe
+from splatnode.recon.scene.growth import registration_in_scene_world, replace_images, update_pointmaps, warp_scene
 from tests.support.row_of_views import HEIGHT, STEP, WIDTH, camera, graph_of, maps_of, registration_of, scene_of
 
 WORLD = Similarity(1.7, Rotation.from_euler("xyz", [20, -40, 10], degrees=True).as_matrix(), np.array([0.3, -1.0, 2.0]))

@@ -11,17 +11,14 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import pytest
 
-from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification import flatness, likelihood, refit, reflection, reversal
-from splatnode.recon.verification.checks import VerificationCase
-from splatnode.recon.verification.decision import CHECKS, DecisionConfig, decide
-from splatnode.recon.verification.errors import Errors
-from splatnode.recon.verification.evidence import Evidence
-from splatnode.recon.verification.finiteness import find_non_finite
+from splatnode.recon.verification import consistency, error_model, refit
+from splatnode.recon.verification import evidence as verification_evidence
+from splatnode.recon.verification.decision import CHECKS, WORDS, DecisionConfig, VerificationCase, check_finite, decide
+from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.lens import FreedLens
-from splatnode.recon.verification.undetermined import WORDS, check_finite
+from splatnode.recon.verification.refit import Errors, FreedLens
 from tests.recon.verification.test_refit import made_up
 from tests.support.verdicts import all_pairs, evidence, graph, registration, unsure
 
@@ -56,8 +53,8 @@ def with_number(record: Any, path: Path, value: float) -> Any:
     return replace(record, **{first: with_number(getattr(record, first), tuple(rest), value)})
 
 
-def weighed(seen: Evidence) -> likelihood.Odds:
-    return likelihood.compute_log_odds(seen, FITTED.many.claims, FITTED.many.odds)
+def weighed(seen: Evidence) -> error_model.Odds:
+    return error_model.compute_log_odds(seen, FITTED.many.claims, FITTED.many.odds)
 
 
 EVERY_NUMBER = tuple(numbers_of(Evidence))
@@ -148,7 +145,7 @@ def test_arrays_and_mappings_are_walked_too():
 @pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
 def test_what_is_not_finite_is_none_in_the_report(path, value):
     broken = with_number(GOOD, path, value)
-    written = json.loads(json.dumps(likelihood.make_evidence_record(broken, weighed(broken)), allow_nan=False))
+    written = json.loads(json.dumps(error_model.make_evidence_record(broken, weighed(broken)), allow_nan=False))
     found = written
     for step in path:
         found = found[step]
@@ -163,22 +160,22 @@ def test_a_mirrored_answer_that_could_not_be_computed_is_not_the_lack_of_a_rival
     broken = replace(fit, problem=replace(fit.problem, points=np.full_like(fit.problem.points, np.nan)))
     assert math.isnan(replace(fit, problem=replace(fit.problem, translations=np.full((4, 3), np.nan))).cost)
     adjusted = iter([fit, replace(broken, problem=replace(fit.problem, translations=np.full((4, 3), np.nan)))])
-    monkeypatch.setattr(refit, "adjust", lambda start: next(adjust))
-    assert math.isnan(reversal.compute_reversal_cost_ratio(fit))
+    monkeypatch.setattr(refit, "adjust", lambda start: next(adjusted))
+    assert math.isnan(refit.compute_reversal_cost_ratio(fit))
 
 
 def test_flatness_of_points_that_are_nowhere_is_not_known():
     points = np.random.default_rng(0).uniform(size=(50, 3))
     points[7, 2] = np.nan
-    assert math.isnan(flatness.compute_share_on_plane(points))
+    assert math.isnan(verification_evidence.compute_share_on_plane(points))
 
 
 def test_a_gain_by_mirroring_that_is_not_a_number_is_not_passed_over(monkeypatch):
     gains = iter([0.0, math.nan, 0.0])
-    monkeypatch.setattr(reflection, "_compute_gain", lambda *_: next(gains))
-    monkeypatch.setattr(reflection, "_select_descriptors", lambda features, count: np.zeros((4, 128), np.uint8))
+    monkeypatch.setattr(consistency, "_compute_gain", lambda *_: next(gains))
+    monkeypatch.setattr(consistency, "_select_descriptors", lambda features, count: np.zeros((4, 128), np.uint8))
     assert math.isnan(
-        reflection.measure_reflection(
-            graph(3, {}).keyframes, [(0, 1), (0, 2), (1, 2)], reflection.ReflectionConfig()
+        consistency.measure_reflection(
+            graph(3, {}).keyframes, [(0, 1), (0, 2), (1, 2)], consistency.ReflectionConfig()
         ).gain
     )

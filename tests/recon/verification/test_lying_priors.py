@@ -16,12 +16,12 @@ from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
-from splatnode.recon.matching.appearance_check import matches_look_alike
-from splatnode.recon.registration import register
+from splatnode.recon.matching import view_graph as matching
+from splatnode.recon.matching.pair_matching import matches_look_alike
+from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
-from splatnode.recon.verification.verify import VerificationConfig, verify
+from splatnode.recon.verification.evidence import VerificationConfig, verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 WIDTH, HEIGHT = 192, 144
@@ -104,7 +104,9 @@ LIARS = {"surface": SurfaceLiar(), "flat": SurfaceLiar(flat=True), "snapping": S
 @pytest.mark.parametrize("lie", LIARS)
 def test_what_a_prior_invents_is_refused(lie, photographed):
     graph = view_graph(photographed(), LIARS[lie], SETTINGS)
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     evidence = verify(graph, registration, VerificationConfig())
     verdict = refuse_before_registration(graph, (), DecisionConfig()) or decide(
         graph, registration, evidence, DecisionConfig()
@@ -114,10 +116,12 @@ def test_what_a_prior_invents_is_refused(lie, photographed):
 
 def test_the_best_lie_looks_right_to_all_but_the_photographs(monkeypatch):
     """The invented matches fit one set of cameras: the test above would be void if their geometry refused them."""
-    monkeypatch.setattr("splatnode.recon.matching.appearance_check.matches_look_alike", lambda *asked: True)
+    monkeypatch.setattr("splatnode.recon.matching.pair_matching.matches_look_alike", lambda *asked: True)
     graph = view_graph(noise(), SurfaceLiar(), SETTINGS)
     assert sorted(graph.pairs) == [(0, 1), (0, 2), (1, 2)]
-    registration = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    registration = registration_registration.register(
+        graph.keyframes, graph.pairs, registration_registration.RegistrationConfig()
+    )
     assert registration is not None and len(registration.cameras) == 3 and registration.rms_px < 1.0
 
 

@@ -7,17 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.fitting.odds import FOR
+from splatnode.recon.evaluate.stability.fitting.fit import FOR
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification.claims import predict_bounds
-from splatnode.recon.verification.cycles import CycleConsistency
+from splatnode.recon.verification.consistency import CycleConsistency, Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide
-from splatnode.recon.verification.errors import Errors
+from splatnode.recon.verification.error_model import OddsModel, VerdictModels, predict_bounds
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.likelihood import OddsModel
-from splatnode.recon.verification.models import VerdictModels
-from splatnode.recon.verification.reflection import Reflection
+from splatnode.recon.verification.refit import Errors
 from tests.support.verdicts import (
     all_pairs,
     evidence,

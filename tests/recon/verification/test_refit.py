@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.registration import bundle
-from splatnode.recon.verification import jackknife, lens, refit, reversal
+from splatnode.recon.registration import bundle_adjustment
+from splatnode.recon.verification import refit
 
 FOCAL = 900.0
 
@@ -24,7 +24,7 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
         rotations.append(rotation)
         translations.append(np.array([0.0, 0.0, 4.0]))
     observed = [(camera, point) for point in range(len(points)) for camera in range(4)]
-    exact = bundle.Problem(
+    exact = bundle_adjustment.Problem(
         rotations=np.stack(rotations),
         translations=np.stack(translations),
         lens_of_camera=np.zeros(4, np.int64),
@@ -36,12 +36,14 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
         point_of=np.array([point for _, point in observed]),
         pixels=np.zeros((len(observed), 2)),
     )
-    pixels = bundle.project(exact)[0]
+    pixels = bundle_adjustment.project(exact)[0]
     seen, pinhole = pixels + rng.normal(0, noise_px, pixels.shape), np.zeros((1, 2))
     problem = replace(exact, pixels=seen, log_focals=np.log([focal]), radials=pinhole)
-    prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros((1, 2)), np.zeros(1))
+    prior = bundle_adjustment.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros((1, 2)), np.zeros(1))
     unknown = np.full(1, np.nan), np.full(1, np.inf), np.zeros(1, bool)
-    return refit.BundleFit(problem, prior, bundle.BundleAdjustmentConfig(robust_px=1.0), 1.0, *unknown, np.ones(1))
+    return refit.BundleFit(
+        problem, prior, bundle_adjustment.BundleAdjustmentConfig(robust_px=1.0), 1.0, *unknown, np.ones(1)
+    )
 
 
 def given(fit: refit.BundleFit) -> refit.BundleFit:
@@ -86,14 +88,12 @@ def test_without_points_only_their_observations_go():
     smaller = refit.remove_points(fit, left_out).problem
     assert len(smaller.points) == 133 and len(smaller.pixels) == 4 * 133
     assert np.allclose(smaller.points, fit.problem.points[~left_out])
-    assert np.abs(bundle.reprojection_errors(smaller)).max() < 1.5
+    assert np.abs(bundle_adjustment.reprojection_errors(smaller)).max() < 1.5
 
 
 def test_the_spread_grows_with_what_the_model_leaves_out():
     """Four times the noise, or distortion that is not modelled: both must show."""
-    quiet, noisy, bent = (
-        jackknife.estimate_spread(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1))
-    )
+    quiet, noisy, bent = (refit.estimate_spread(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1)))
     assert max(quiet.rotation_deg) < 0.1 and max(quiet.centre) < 0.01
     assert max(noisy.centre) > 2 * max(quiet.centre)
     assert max(bent.rotation_deg) > 3 * max(quiet.rotation_deg) and max(bent.centre) > 2 * max(quiet.centre)
@@ -101,7 +101,7 @@ def test_the_spread_grows_with_what_the_model_leaves_out():
 
 
 def test_perspective_tells_a_scene_from_its_mirror_image():
-    assert reversal.compute_reversal_cost_ratio(made_up(depth=1.0)) > 5.0
+    assert refit.compute_reversal_cost_ratio(made_up(depth=1.0)) > 5.0
 
 
 def test_the_mirrored_scene_of_a_camera_far_away_cannot_be_told():
@@ -112,31 +112,31 @@ def test_the_mirrored_scene_of_a_camera_far_away_cannot_be_told():
         translations=near.problem.translations * (1.0, 1.0, 100.0),
         log_focals=near.problem.log_focals + np.log(100.0),
     )
-    pixels = bundle.project(far)[0] + np.random.default_rng(1).normal(0, 0.5, near.problem.pixels.shape)
-    assert reversal.compute_reversal_cost_ratio(given(replace(near, problem=replace(far, pixels=pixels)))) < 1.2
+    pixels = bundle_adjustment.project(far)[0] + np.random.default_rng(1).normal(0, 0.5, near.problem.pixels.shape)
+    assert refit.compute_reversal_cost_ratio(given(replace(near, problem=replace(far, pixels=pixels)))) < 1.2
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])
 def test_a_given_focal_length_is_found_right_or_wrong(factor):
-    (freed,) = lens.free_lenses(given(made_up(focal=factor * FOCAL)))
+    (freed,) = refit.free_lenses(given(made_up(focal=factor * FOCAL)))
     assert freed.trusted and freed.given == pytest.approx(factor * FOCAL)
     assert freed.found == pytest.approx(FOCAL, rel=0.02)
     assert (freed.cost_ratio < 0.5) == (factor != 1.0)
 
 
 def test_a_nominal_focal_length_is_doubted_too():
-    (freed,) = lens.free_lenses(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
+    (freed,) = refit.free_lenses(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
     assert not freed.trusted and freed.found == pytest.approx(FOCAL, rel=0.02) and freed.cost_ratio < 0.5
 
 
 def test_no_lens_is_freed_that_did_not_come_with_the_frames():
-    assert lens.free_lenses(made_up()) == ()
+    assert refit.free_lenses(made_up()) == ()
 
 
 def test_distortion_that_the_observations_ask_for():
-    bent = lens.measure_distortion(made_up(radial=-0.2))
+    bent = refit.measure_distortion(made_up(radial=-0.2))
     # A corner is 0.6 * 1024 pixels from the middle.
     assert bent.corner_shift == pytest.approx(0.2 * (0.6 * 1024 / FOCAL) ** 2, rel=0.1)
     assert bent.cost_ratio < 0.6
-    straight = lens.measure_distortion(made_up())
+    straight = refit.measure_distortion(made_up())
     assert straight.corner_shift < 0.01 and straight.cost_ratio > 0.97

@@ -9,8 +9,7 @@ import pytest
 
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification.config import DecisionConfig
-from splatnode.recon.verification.decision import decide
-from splatnode.recon.verification.strong_lens import STRONG
+from splatnode.recon.verification.decision import STRONG, decide
 from tests.support.verdicts import all_pairs, evidence, graph, registration
 
 ALL = (0, 1, 2)

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration import register
-from splatnode.recon.registration.register import Registration
-from splatnode.recon.result.bounds import find_widest
-from splatnode.recon.verification import flatness, likelihood, verify, weakest_link
-from splatnode.recon.verification.claims import predict_bounds
+from splatnode.recon.registration import registration
+from splatnode.recon.registration.registration import Registration
+from splatnode.recon.result.verdict import find_widest
+from splatnode.recon.verification import error_model
+from splatnode.recon.verification import evidence as verification_evidence
+from splatnode.recon.verification.error_model import predict_bounds
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
 from tests.support.synthetic import photographs, view_graph
 
-CONFIG = verify.VerificationConfig()
+CONFIG = verification_evidence.VerificationConfig()
 VIEWS = 4
 
 
@@ -27,14 +28,14 @@ VIEWS = 4
 def placed() -> tuple[ViewGraph, Registration]:
     """Four photographs, registered."""
     graph = view_graph(photographs()[:VIEWS])
-    found = register.register(graph.keyframes, graph.pairs, register.RegistrationConfig())
+    found = registration.register(graph.keyframes, graph.pairs, registration.RegistrationConfig())
     assert found is not None and len(found.cameras) == VIEWS
     return graph, found
 
 
 @lru_cache(maxsize=1)
 def good() -> Evidence:
-    found = verify.verify(*placed(), CONFIG)
+    found = verification_evidence.verify(*placed(), CONFIG)
     assert found is not None
     return found
 
@@ -54,7 +55,7 @@ def turned(degrees: float, index: int = 1) -> Registration:
 
 def test_a_right_answer_has_evidence_from_every_source():
     evidence = good()
-    odds = likelihood.compute_log_odds(evidence, FITTED.many.claims, FITTED.many.odds)
+    odds = error_model.compute_log_odds(evidence, FITTED.many.claims, FITTED.many.odds)
     assert odds.total > 1.5
     assert evidence.inlier_ratio > 0.9 and evidence.weakest_link.shared_points > 100
     assert all(camera.confirmed > 50 and not camera.own_lens for camera in evidence.cameras)
@@ -71,7 +72,7 @@ def test_a_right_answer_has_evidence_from_every_source():
 
 @pytest.mark.filterwarnings("error")
 def test_where_no_camera_is_further_those_that_are_known_keep_their_evidence():
-    again = verify.verify_further(*placed(), good(), CONFIG)
+    again = verification_evidence.verify_further(*placed(), good(), CONFIG)
     assert again is not None
     assert [camera.gain for camera in again.cameras] == [camera.gain for camera in good().cameras]
 
@@ -81,7 +82,7 @@ def test_the_larger_uncertainty_of_a_focal_length_counts():
     for known, continued in ((0.01, 0.05), (0.05, 0.01), (np.nan, 0.01), (0.01, np.nan)):
         before = [replace(camera, focal=replace(camera.focal, sigma=known)) for camera in good().cameras]
         after = [replace(camera, focal_sigma=continued) for camera in found.cameras]
-        seen = verify.verify_further(
+        seen = verification_evidence.verify_further(
             graph, replace(found, cameras=tuple(after)), replace(good(), cameras=tuple(before)), CONFIG
         )
         assert seen is not None
@@ -92,8 +93,8 @@ def test_the_larger_uncertainty_of_a_focal_length_counts():
 
 def test_one_camera_confirms_nothing():
     graph, found = placed()
-    assert verify.verify(graph, replace(found, cameras=found.cameras[:1]), CONFIG) is None
-    assert verify.verify(graph, None, CONFIG) is None
+    assert verification_evidence.verify(graph, replace(found, cameras=found.cameras[:1]), CONFIG) is None
+    assert verification_evidence.verify(graph, None, CONFIG) is None
 
 
 def test_two_places_that_share_no_points_are_found_as_two_parts():
@@ -107,7 +108,7 @@ def test_two_places_that_share_no_points_are_found_as_two_parts():
         observed_point=found.observed_point[kept],
         observed_pixels=found.observed_pixels[kept],
     )
-    link = weakest_link.measure_weakest_link(apart, graph.names, graph.pairs)
+    link = verification_evidence.measure_weakest_link(apart, graph.names, graph.pairs)
     assert link.shared_points == 0 and link.smaller_part in (tuple(graph.names[:2]), tuple(graph.names[2:]))
 
 
@@ -119,21 +120,21 @@ def test_points_shared_by_two_frames_are_counted():
         observed_by=np.array([0, 1, 2, 0, 1, 3]),
         observed_point=np.array([0, 0, 0, 1, 1, 2]),
     )
-    shared = weakest_link.count_shared_points(few)
+    shared = verification_evidence.count_shared_points(few)
     assert shared[0, 1] == 2 and shared[0, 2] == 1 and shared[0, 3] == 0
 
 
 def test_frames_that_pairs_contradict_are_disconnected():
     graph, found = placed()
-    assert weakest_link.find_disconnected_frames(found, graph.pairs) == ()
+    assert verification_evidence.find_disconnected_frames(found, graph.pairs) == ()
     doubted = {key: 0.4 if 3 in key else share for key, share in found.inlier_ratios.items()}
-    assert weakest_link.find_disconnected_frames(replace(found, inlier_ratios=doubted), graph.pairs) == (3,)
+    assert verification_evidence.find_disconnected_frames(replace(found, inlier_ratios=doubted), graph.pairs) == (3,)
 
 
 def test_the_share_of_points_on_a_plane():
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.ones(300)])
-    assert flatness.compute_share_on_plane(wall) == 1.0
+    assert verification_evidence.compute_share_on_plane(wall) == 1.0
     relief = wall + (0.0, 0.0, 1.0) * rng.choice([0.0, 0.2], (300, 1), p=[0.7, 0.3])
-    assert flatness.compute_share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
-    assert flatness.compute_share_on_plane(wall[:2]) == 0.0
+    assert verification_evidence.compute_share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
+    assert verification_evidence.compute_share_on_plane(wall[:2]) == 0.0

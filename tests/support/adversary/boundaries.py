@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture import recording
-from splatnode.capture.config import CaptureConfig
+from splatnode.capture.config import CaptureConfig, PreviewHeader, decode_preview
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.commands import Answer
-from splatnode.capture.messaging.keyframe_messages import (
+from splatnode.capture.messaging.messages import (
     ConsumerStatus,
     Delivery,
     DroppedHeader,
@@ -22,25 +21,22 @@ from splatnode.capture.messaging.keyframe_messages import (
     Request,
     decode_frame,
 )
-from splatnode.capture.messaging.message_file import read_message
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Key, Spool
-from splatnode.capture.messaging.state import Want
+from splatnode.capture.messaging.pubsub import Answer, Want
+from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, read_message
 from splatnode.capture.messaging.wire import Limits, WireError, decode
-from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.process.config import ConfigError, load_config
 from splatnode.capture.status import CaptureStatus, Heartbeat
-from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger
+from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
-from splatnode.recon.daemon.control import Command
+from splatnode.recon.daemon.node import Command
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.evaluate.json_file import EvaluationFileError
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.colmap_model import EvaluationFileError
+from splatnode.recon.evaluate.dataset import load_scene
 from splatnode.recon.occupancy.message import MapHeader
 from splatnode.recon.occupancy.message import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
-from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.viewer.sources import load_result
 from tests.support.adversary import cameras, documents, images, messages, scenes, stored
@@ -197,7 +193,7 @@ _MESSAGING, _EXPORT = "splatnode.capture.messaging", "splatnode.recon.result.exp
 _TRUE, _CAPTURE_ROOM = "splatnode.recon.evaluate", "splatnode.capture"
 _WIRE = Reader((WireError,), (f"{_MESSAGING}.wire", f"{_MESSAGING}.values"))
 _FRAMES = Reader((WireError,), (*_WIRE.modules, f"{_MESSAGING}.keyframe_messages"))
-_PREVIEWS = Reader((WireError,), ("splatnode.capture.preview", f"{_MESSAGING}.jpeg"))
+_PREVIEWS = Reader((WireError,), ("splatnode.capture.config", f"{_MESSAGING}.jpeg"))
 _SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
 _IMAGES = Reader(
     (UnusableImage,),
@@ -209,7 +205,7 @@ _CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
 _RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.recon.result.stored_snapshot",))
 _TRUTH = Reader((EvaluationFileError, SceneFileError, FileNotFoundError), (f"{_TRUE}.truth", f"{_TRUE}.true_cameras"))
 _RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
-_YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.capture.process.config_text"))
+_YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.capture.process.config"))
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
 _SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
 _CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))

@@ -19,31 +19,28 @@ import msgspec
 import numpy as np
 
 from splatnode.capture import film
-from splatnode.capture.last_run import LastRun
-from splatnode.capture.messaging.quarantine import Config as QuarantineConfig
-from splatnode.capture.messaging.quarantine import Quarantine
-from splatnode.capture.name_time import name_time
-from splatnode.capture.process.printable import is_printable, sanitize_name
-from splatnode.capture.process.private import NotOwnerOnly
+from splatnode.capture.daemon import LastRun
+from splatnode.capture.exif import name_time
+from splatnode.capture.messaging.spool import Quarantine, QuarantineConfig
+from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.capture.process.records import record_in
+from splatnode.capture.process.text import is_printable, sanitize_name
 from splatnode.command_line import build_parser
-from splatnode.recon.batch import answer, ledger
-from splatnode.recon.batch.sources import BatchRecording, read_list
+from splatnode.recon.batch import batch
+from splatnode.recon.batch.batch import BatchRecording, read_list
 from splatnode.recon.jobs.child import End
-from splatnode.recon.result import whole
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.manifest import read_digests
+from splatnode.recon.result import submap_index
+from splatnode.recon.result.export.limits import SceneFileError
+from splatnode.recon.result.export.result import read_digests
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.viewer import words
-from splatnode.viewer.ground import ground
-from splatnode.viewer.moment import Moment
+from splatnode.viewer import text as viewer_text
+from splatnode.viewer.shapes import ground
 from splatnode.viewer.sources import _sanitize_snapshot
+from splatnode.viewer.state import Moment
 from splatnode.viewer.web import server as web
-from splatnode.viewer.web.access import load_or_create_key
-from splatnode.viewer.web.board import Board
-from splatnode.viewer.web.content import Content
+from splatnode.viewer.web.server import Board, Content, load_or_create_key
 from tests.support.adversary import documents, edges, images, messages, requests, stored
 from tests.support.adversary.boundary import Boundary, Reader
 from tests.support.adversary.schema_values import value
@@ -79,18 +76,18 @@ def _written(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path
 
 
 def _read_whole(path: Path) -> object:
-    return whole.read_map_set(path.parent)
+    return submap_index.read_map_set(path.parent)
 
 
 def _read_report(path: Path) -> object:
-    found = answer.read_outcome(_RECORDING, path.parent, _END)
+    found = batch.read_outcome(_RECORDING, path.parent, _END)
     if not is_printable(found.message) or not is_printable(found.verdict):
         raise AssertionError(f"a row that is not printable: {found.message!a}")
     return found
 
 
 def _read_ledger(path: Path) -> object:
-    with ledger.Ledger(path.parent, ["replay"]) as opened:
+    with batch.Ledger(path.parent, ["replay"]) as opened:
         return [opened.verdict(_RECORDING), *opened.rows([_RECORDING])]
 
 
@@ -266,14 +263,14 @@ def _read_shown(parts: messages.Parts, folder: Path) -> object:
     moment = Moment(_sanitize_snapshot(snapshot), time.monotonic(), "scene-1")
     content = Content(moment, None)
     lines = [
-        *words.verdict_lines(moment),
-        *words.bounds_lines(moment),
-        *words.depth_lines(moment),
-        *words.view_depth_lines(moment, 100),
-        *words.count_lines(moment),
-        *words.place_lines(moment),
-        *words.rejection_lines(moment, 200),
-        *words.scale_lines(moment, ground(moment)),
+        *viewer_text.verdict_lines(moment),
+        *viewer_text.bounds_lines(moment),
+        *viewer_text.depth_lines(moment),
+        *viewer_text.view_depth_lines(moment, 100),
+        *viewer_text.count_lines(moment),
+        *viewer_text.place_lines(moment),
+        *viewer_text.rejection_lines(moment, 200),
+        *viewer_text.scale_lines(moment, ground(moment)),
     ]
     shapes = np.frombuffer(content.shapes, np.uint8).size + len(content.gaussians)
     return lines, shapes
@@ -302,23 +299,23 @@ def _draw_key(rng: random.Random) -> bytes:
 
 
 _BATCH, _WEB = "splatnode.recon.batch", "splatnode.viewer.web"
-_WHOLE = Reader((SceneFileError,), ("splatnode.recon.result.whole",))
+_WHOLE = Reader((SceneFileError,), ("splatnode.recon.result.submap_index",))
 _REPORTS = Reader((), (f"{_BATCH}.answer",))
-_LEDGERS = Reader((ledger.OtherBatch,), (f"{_BATCH}.ledger",))
-_QUARANTINES = Reader((), ("splatnode.capture.messaging.quarantine",))
-_LAST_RUNS = Reader((Refused,), ("splatnode.capture.last_run",))
-_MANIFESTS = Reader((), ("splatnode.recon.result.export.manifest",))
+_LEDGERS = Reader((batch.OtherBatch,), (f"{_BATCH}.ledger",))
+_QUARANTINES = Reader((), ("splatnode.capture.messaging.spool",))
+_LAST_RUNS = Reader((Refused,), ("splatnode.capture.daemon",))
+_MANIFESTS = Reader((), ("splatnode.recon.result.export.result",))
 _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))
-_NAMES = Reader((ValueError,), ("splatnode.capture.name_time", "splatnode.capture.film"))
-_ARGUMENTS = Reader((Refused,), ("splatnode.capture.process.arguments", "splatnode.capture.process.lengths"))
+_NAMES = Reader((ValueError,), ("splatnode.capture.exif", "splatnode.capture.film"))
+_ARGUMENTS = Reader((Refused,), ("splatnode.capture.process.arguments", "splatnode.capture.process.text"))
 _REQUESTS = Reader((Refused,), (f"{_WEB}.server", f"{_WEB}.access"))
-_SHOWN = Reader((ValueError,), (f"{_WEB}.content", "splatnode.viewer.words"))
+_SHOWN = Reader((ValueError,), (f"{_WEB}.content", "splatnode.viewer.text"))
 _KEYS = Reader((ValueError, NotOwnerOnly), (f"{_WEB}.access",))
 
 DOCUMENTS = (
     Boundary(
         "places.json",
-        of_schema(whole._File),
+        of_schema(submap_index._File),
         _written("places.json", _read_whole),
         _WHOLE,
         50,
@@ -329,7 +326,7 @@ DOCUMENTS = (
     ),
     Boundary(
         "reports of a batch",
-        of_schema(answer._Report),
+        of_schema(batch._Report),
         _written("report.json", _read_report),
         _REPORTS,
         20,

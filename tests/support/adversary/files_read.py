@@ -9,26 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture import exif, jpeg2000
+from splatnode.capture import exif, image_header
 from splatnode.capture.cameras import mcap
-from splatnode.capture.exif_time import exif_time
-from splatnode.capture.frame import Frame
-from splatnode.capture.image_file import check_whole, measure_values, upright_size
+from splatnode.capture.exif import exif_time
+from splatnode.capture.frame import Clock, Frame, Stamp
+from splatnode.capture.image_file import ORIENTATION, check_whole, measure_values, upright_size
 from splatnode.capture.image_header import UnusableImage
 from splatnode.capture.lens_file import UnusableLens, read_lens
 from splatnode.capture.lerobot import data_set
-from splatnode.capture.logged.calibration import lens
-from splatnode.capture.logged.message import Calibration, UnusableMessage
-from splatnode.capture.logged.pixels import rgb
-from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES
+from splatnode.capture.logged.messages import CALIBRATIONS, PICTURES, Calibration, UnusableMessage, lens, rgb
 from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
-from splatnode.capture.orientation import ORIENTATION
-from splatnode.capture.poses_file import PosesFileError, read_poses
-from splatnode.capture.process.foreign import guard_untrusted
-from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.result.depth_file import decode_depths
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.landmarks_file import decode_landmarks
+from splatnode.capture.pose_files import PosesFileError, read_poses
+from splatnode.capture.process.text import guard_untrusted
+from splatnode.recon.result.export.limits import SceneFileError
+from splatnode.recon.result.npz_files import decode_depths, decode_landmarks
 from tests.support.adversary import archives, images, lenses, logs, poses, stored
 from tests.support.adversary.boundary import Boundary, Reader
 
@@ -78,8 +72,8 @@ def _read_exif(tiff: bytes, folder: Path) -> object:
 def _read_header(data: bytes, folder: Path) -> object:
     check_whole(data)
     size = upright_size(data)
-    if size is None and jpeg2000.is_jpeg2000(data):
-        return jpeg2000.read_size(data)
+    if size is None and image_header.is_jpeg2000(data):
+        return image_header.read_size(data)
     return size
 
 
@@ -125,7 +119,7 @@ def _read_data_set(files: stored.Files, folder: Path) -> object:
 
 
 def _read_weights(files: stored.Files, folder: Path) -> object:
-    from splatnode.recon.networks.weight_loading import read_weights
+    from splatnode.recon.networks.weights import read_weights
 
     stored.lay(files, folder)
     return [tuple(tensor.shape) for tensor in read_weights(folder / next(iter(files))).values()]
@@ -155,7 +149,7 @@ _DATA_SETS = Reader((data_set.UnusableDataSet,), _modules("lerobot.data_set"))
 _MASKS = Reader((UnusableMask,), _modules("masks"))
 _LANDMARKS = Reader((SceneFileError,), (f"{_RESULT}.landmarks_file", f"{_RESULT}.npz_file"))
 _DEPTHS = Reader((SceneFileError,), (f"{_RESULT}.depth_file",))
-_WEIGHTS = Reader((ValueError,), ("splatnode.recon.networks.weight_loading",))
+_WEIGHTS = Reader((ValueError,), ("splatnode.recon.networks.weights",))
 
 
 def _read_landmarks(data: bytes, folder: Path) -> object:

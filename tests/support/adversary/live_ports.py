@@ -18,27 +18,25 @@ from typing import Any
 import msgspec
 import zmq
 
+from splatnode.capture.config import PreviewHeader
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.commands import Answer, CommandServer
-from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Request
-from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
-from splatnode.capture.messaging.network import Network, runtime_directory
-from splatnode.capture.messaging.services import (
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.messages import Delivery, FrameHeader, Request
+from splatnode.capture.messaging.network import (
     CAPTURE_KEYFRAMES,
     CAPTURE_PREVIEW,
     CAPTURE_STATUS,
     RECON_CONTROL,
     RECON_SCENE,
+    Network,
     Service,
+    runtime_directory,
 )
-from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Spool
-from splatnode.capture.messaging.state import StateClient, StateServer, Want
+from splatnode.capture.messaging.pubsub import Answer, CommandServer, StateClient, StateServer, Subscriber, Want
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.messaging.wire import MAGIC, plain_header
-from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import CaptureStatus, _Listener
-from splatnode.recon.daemon.control import Command
+from splatnode.recon.daemon.node import Command
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.attacked import shout
 from tests.support.adversary import images, messages

@@ -8,8 +8,8 @@ import stat
 
 import pytest
 
-from splatnode.capture.process.private import NotOwnerOnly
-from splatnode.viewer.web.access import Access, load_or_create_key, new_key
+from splatnode.capture.process.files import NotOwnerOnly
+from splatnode.viewer.web.server import Access, load_or_create_key, new_key
 from splatnode.viewer.web.stage import invitation, resolve_address
 
 KEY = "k" * 43

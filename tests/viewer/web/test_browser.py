@@ -12,12 +12,11 @@ import pytest
 
 from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
-from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.paint import paint_gaussians
 from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import Viewpoint, look_at, move_to_camera, orbit, pan, zoom
-from splatnode.viewer.web.said import describe_session
+from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint, look_at, move_to_camera, orbit, pan, zoom
+from splatnode.viewer.web.server import describe_session
 from splatnode.viewer.web.stage import ListenAddress, make_content, open_server
 from tests.bench.viewer.drive_web import WINDOW, drive, fact, settle, watched
 from tests.support.chromium import NAMES, browser, chromium

@@ -16,17 +16,12 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.recon.result.bounds import Bounds, make_ball
 from splatnode.recon.result.export.formats.splat import decode
-from splatnode.recon.result.scale import Scale
-from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.viewer.moment import Moment
+from splatnode.recon.result.verdict import Bounds, Code, Scale, Verdict, make_ball
 from splatnode.viewer.sources import FixedSource
+from splatnode.viewer.state import Moment
 from splatnode.viewer.web import server as server_module
-from splatnode.viewer.web.board import Board
-from splatnode.viewer.web.content import Content
-from splatnode.viewer.web.said import describe_session
-from splatnode.viewer.web.server import Server
+from splatnode.viewer.web.server import Board, Content, Server, describe_session
 from splatnode.viewer.web.stage import ListenAddress, make_content, open_server
 from tests.capture.messaging.test_sockets import wait_for
 from tests.viewer.test_scene import camera, moment, wall

@@ -11,12 +11,11 @@ from struct import pack
 
 import numpy as np
 
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.prepare import compute_base_rgb, format_number_row, format_text_file
 from splatnode.recon.result.export.quaternions import quats_from_matrices
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.export.text import format_number_row, format_text_file
-from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.recon.result.verdict import RELATIVE, Scale
 
 DEFAULT_NAME = "colmap"
 

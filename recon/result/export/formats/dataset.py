@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from splatnode.capture.image_file import (
     UnusableImage,
+    ValueRange,
     decode_any_image,
     encode_jpeg,
     encode_png,
@@ -22,10 +23,9 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.lenses.undistort import undistort_image
-from splatnode.capture.value_range import ValueRange
-from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
+from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.stored_snapshot import find_image, list_image_folders

@@ -14,8 +14,8 @@ import numpy as np
 from splatnode.recon.result.export.cameras import BOUNDS_MEANING, STAMP_MEANING, make_stamp_dict
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import RELATIVE, Scale
 
 DEFAULT_NAME = "transforms.json"
 GAUSSIANS = False  # cameras alone

@@ -10,12 +10,11 @@ import re
 
 import numpy as np
 
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.limits import check_count
+from splatnode.recon.result.export.limits import SceneFileError, check_count
 from splatnode.recon.result.export.prepare import make_unknown_source
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import GaussianArrays
+from splatnode.recon.result.verdict import RELATIVE, Scale
 
 DEFAULT_NAME = "scene.ply"
 

@@ -19,10 +19,8 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.axes import minimize_rotations
-from splatnode.recon.result.export.error import SceneFileError
-from splatnode.recon.result.export.limits import check_count
-from splatnode.recon.result.export.prepare import make_unknown_source, select_gaussians
+from splatnode.recon.result.export.limits import SceneFileError, check_count
+from splatnode.recon.result.export.prepare import make_unknown_source, minimize_rotations, select_gaussians
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
 

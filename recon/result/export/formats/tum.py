@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from splatnode.capture.stamp import Stamp
+from splatnode.capture.frame import Stamp
+from splatnode.recon.result.export.prepare import format_number_row, format_text_file
 from splatnode.recon.result.export.quaternions import quats_from_matrices
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.export.text import format_number_row, format_text_file
-from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import RELATIVE, Scale
 
 DEFAULT_NAME = "trajectory.tum"
 GAUSSIANS = False  # cameras alone

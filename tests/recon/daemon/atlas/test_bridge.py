@@ -13,21 +13,22 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.atlas import bridge as module
-from splatnode.recon.daemon.atlas.bridge import LoopSide, VerifiedLoop, verify_loop
-from splatnode.recon.daemon.atlas.links import EdgeKind, make_loop_edge
-from splatnode.recon.daemon.atlas.recognition import (
+from splatnode.recon.daemon.atlas import loop_closure as module
+from splatnode.recon.daemon.atlas.loop_closure import (
+    LoopSide,
+    VerifiedLoop,
     centre_descriptors,
     compute_global_descriptors,
     compute_mean_descriptor,
     make_descriptors_message,
     parse_descriptors,
     rank_similar_scenes,
+    verify_loop,
 )
+from splatnode.recon.daemon.atlas.pose_graph import EdgeKind, make_loop_edge
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.camera_errors import compare_cameras
-from splatnode.recon.matching.match import match
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.preparation import prepare
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import SMALL

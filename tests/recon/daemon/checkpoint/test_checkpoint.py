@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
-from splatnode.recon.daemon.checkpoint import checkpoint, saved_estimate
-from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
-from splatnode.recon.daemon.checkpoint.saved import GraphRecord
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint import store as checkpoint_store
+from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
+from splatnode.recon.daemon.checkpoint.store import GraphRecord, Store
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
-from splatnode.recon.registration.register import RegisteredCamera
+from splatnode.recon.registration.registration import RegisteredCamera
 from tests.support.synthetic import photographs
 
 CONFIG = ReconstructionConfig(size=160, preview=replace(PREVIEW, iterations=1))
@@ -53,8 +53,8 @@ def store(saved, tmp_path):
 
 
 def test_cameras_of_before_lenses_had_a_second_radial_coefficient_come_back(work):
-    known = work.remembered()
-    record, arrays = saved_estimate.make_reconstruction_message(known, ())
+    known = work.find_reconstruction()
+    record, arrays = checkpoint_store.make_reconstruction_message(known, ())
     of_one = [field.name for field in fields(RegisteredCamera) if field.name not in record.cameras[0]]
     radial = of_one.index("radial")
     cameras = [{**numbers, "radial": -0.1} for numbers in record.cameras]
@@ -62,7 +62,7 @@ def test_cameras_of_before_lenses_had_a_second_radial_coefficient_come_back(work
     kept = [array for index, array in enumerate(arrays[:first]) if index % len(of_one) != radial]
     message = Message(replace(record, cameras=cameras), (*kept, *arrays[first:]))
     for one, other in zip(
-        saved_estimate.parse_reconstruction(message, known.graph).registration.cameras,
+        checkpoint_store.parse_reconstruction(message, known.graph).registration.cameras,
         known.registration.cameras,
         strict=True,
     ):
@@ -78,7 +78,7 @@ def test_what_was_estimated_and_measured_comes_back_and_is_not_made_anew(store, 
         raise AssertionError("estimated thoroughly again")
 
     monkeypatch.setattr(again, "estimate_thoroughly", refuse)
-    before, after = work.remembered(), again.find_reconstruction()
+    before, after = work.find_reconstruction(), again.find_reconstruction()
     assert (
         after.verdict == before.verdict and after.evidence == before.evidence and again.publishable_names == work.proven
     )
@@ -106,7 +106,7 @@ def test_what_another_version_wrote_is_made_anew(store, caplog):
 
 def test_evidence_of_an_older_version_is_weighed_anew_and_no_frame_is_lost(store, work, caplog):
     """Before, the weakest link was the weakest joint, inlier ratios were agreements."""
-    record, arrays = saved_estimate.make_reconstruction_message(work.remembered(), work.proven)
+    record, arrays = checkpoint_store.make_reconstruction_message(work.find_reconstruction(), work.proven)
     older = msgspec.to_builtins(record)
     evidence = older["evidence"]
     evidence["joint"], evidence["loose"] = evidence.pop("weakest_link"), evidence.pop("disconnected")
@@ -117,7 +117,7 @@ def test_evidence_of_an_older_version_is_weighed_anew_and_no_frame_is_lost(store
     assert "judgement of the checkpoint is made anew" in caplog.text
     assert found.keyframes == 3 and len(again.scene.views) == 3
     assert again.names + [keyframe.name for keyframe in found.new] == work.names
-    assert again.estimate_soon().verdict == work.remembered().verdict
+    assert again.estimate_soon().verdict == work.find_reconstruction().verdict
 
 
 @pytest.mark.parametrize("lost", MADE_ANEW)

@@ -10,7 +10,7 @@ import torch
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.messaging.wire import Message, decode, encode
-from splatnode.recon.daemon.checkpoint.saved import (
+from splatnode.recon.daemon.checkpoint.store import (
     GraphRecord,
     SceneRecord,
     make_graph_message,
@@ -19,10 +19,9 @@ from splatnode.recon.daemon.checkpoint.saved import (
     parse_scene,
 )
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration.straightened import undistort_keyframe
-from splatnode.recon.scene import light
-from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.registration.undistortion import undistort_keyframe
+from splatnode.recon.scene import exposure as scene_exposure
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 from tests.support.synthetic import photographs, tiny_scene, view_graph
 
 
@@ -116,7 +115,7 @@ def test_what_another_version_wrote_is_told(graph, scene):
 
 def test_the_gains_of_a_scenes_photographs_come_back(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
-    image, exposure = light.compensate_image(graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7)
+    image, exposure = scene_exposure.compensate_image(graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7)
     first, second, third = scene.views
     lit = replace(scene, views=(first, replace(second, image=image, exposure=exposure), third))
     header, arrays = make_scene_message(lit, final=False)

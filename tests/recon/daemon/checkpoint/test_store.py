@@ -13,17 +13,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
-from splatnode.capture.messaging.message_file import write_message
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
+from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.messaging.spool import write_message
 from splatnode.capture.messaging.wire import MAGIC, encode
-from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.daemon.checkpoint import ledger as ledger_module
-from splatnode.recon.daemon.checkpoint import left
-from splatnode.recon.daemon.checkpoint import stored_frame as stored_frame_module
-from splatnode.recon.daemon.checkpoint.ledger import VERSION, CheckpointError, Ledger, read_ledger
+from splatnode.recon.daemon.checkpoint import records as ledger_module
+from splatnode.recon.daemon.checkpoint.records import (
+    VERSION,
+    CheckpointError,
+    Ledger,
+    StoredFrame,
+    file_name,
+    read_ledger,
+)
 from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, Store
-from splatnode.recon.daemon.checkpoint.stored_frame import StoredFrame, file_name
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
@@ -211,7 +214,7 @@ def test_a_full_disk_is_told_and_nothing_has_changed(open_store, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        for module in (stored_frame_module, ledger_module):
+        for module in (ledger_module, ledger_module):
             patched.setattr(module, "write_message", full)
         for frame in (received(1), ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred"))):
             with pytest.raises(OSError, match="No space"):
@@ -320,7 +323,7 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
     store.leave_submap(2)
     assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"} and not store.frames_dropped
     assert not (store.directory / "graph").exists()
-    (folder,) = left.list_left_folders(store.directory)
+    (folder,) = ledger_module.list_left_folders(store.directory)
     kept = Store(folder)
     assert kept.scene_id == "scene-0001" and [each.frame.name for each in kept.frames()] == ["0.png"]
     assert kept.frames_dropped == [DroppedFrame("1.png", "blurred")] and kept.load("graph", Ledger) is not None
@@ -328,9 +331,9 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
 
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["2.png", "3.png"]
-    assert (SESSION, 0) in store.frame_keys and left.list_left_folders(store.directory) == [folder]
-    left.remove(folder)
-    assert left.list_left_folders(store.directory) == []
+    assert (SESSION, 0) in store.frame_keys and ledger_module.list_left_folders(store.directory) == [folder]
+    ledger_module.remove_left_checkpoint(folder)
+    assert ledger_module.list_left_folders(store.directory) == []
 
 
 def test_a_place_goes_on_from_the_one_that_it_shares_frames_with(open_store):
@@ -338,7 +341,7 @@ def test_a_place_goes_on_from_the_one_that_it_shares_frames_with(open_store):
     for sequence in range(4):
         store.add_frame(received(sequence))
     store.leave_submap(2, shared=("2.png", "3.png"))
-    (folder,) = left.list_left_folders(store.directory)
+    (folder,) = ledger_module.list_left_folders(store.directory)
     kept = Store(folder)
     assert (kept.ledger.follows, kept.ledger.shared) == ("", ()) and kept.names == {f"{i}.png" for i in range(4)}
     kept.close()
@@ -354,26 +357,28 @@ def test_a_finished_place_is_kept_and_taken_back(open_store):
         store.add_frame(received(sequence))
     store.save("scene", Ledger(), [])
     store.leave_submap(2)
-    (folder,) = left.list_left_folders(store.directory)
+    (folder,) = ledger_module.list_left_folders(store.directory)
     kept = Store(folder)
     kept.remove_scene_files()
     kept.finalize()
     kept.close()
     assert (
-        left.list_left_folders(store.directory) == []
-        and left.list_finished_folders(store.directory)[0].name == "scene-0001"
+        ledger_module.list_left_folders(store.directory) == []
+        and ledger_module.list_finished_folders(store.directory)[0].name == "scene-0001"
     )
-    assert not (left.make_finished_path(store.directory, "scene-0001") / "scene").exists()
+    assert not (ledger_module.make_finished_path(store.directory, "scene-0001") / "scene").exists()
 
     store = open_store()
     store.request_removal("0.png", ["scene-0001"])
     store.request_removal("0.png", ["scene-0001"])
     store = open_store()
     assert store.ledger.retracted == (("scene-0001", "0.png"),)
-    assert left.reopen(store.directory, "scene-0007") is None
-    again = left.reopen(store.directory, "scene-0001")
-    assert again == folder and left.reopen(store.directory, "scene-0001") == folder
-    assert left.list_finished_folders(store.directory) == [] and left.list_left_folders(store.directory) == [folder]
+    assert ledger_module.reopen(store.directory, "scene-0007") is None
+    again = ledger_module.reopen(store.directory, "scene-0001")
+    assert again == folder and ledger_module.reopen(store.directory, "scene-0001") == folder
+    assert ledger_module.list_finished_folders(store.directory) == [] and ledger_module.list_left_folders(
+        store.directory
+    ) == [folder]
     store.confirm_removal("scene-0001", "0.png")
     assert open_store().ledger.retracted == ()
 
@@ -385,10 +390,10 @@ def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypat
     monkeypatch.setattr(Store, "begin_submap", lambda *_: (_ for _ in ()).throw(SystemExit))
     with pytest.raises(SystemExit):
         store.leave_submap(2)
-    assert left.list_left_folders(store.directory) != []
+    assert ledger_module.list_left_folders(store.directory) != []
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["0.png", "1.png", "2.png"]
-    assert left.list_left_folders(store.directory) == [] and store.scene_id == "scene-0001"
+    assert ledger_module.list_left_folders(store.directory) == [] and store.scene_id == "scene-0001"
 
 
 def place_that_was_left(open_store, count: int) -> Path:
@@ -407,7 +412,10 @@ def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_p
     assert {each.reason for each in place.frames_dropped} == {"it shows another place: scene-0001-3"}
     place.close()
     open_store()  # whose start removes what was not left yet
-    assert [each.name for each in left.list_left_folders(tmp_path / "checkpoint")] == ["scene-0001", "scene-0001-3"]
+    assert [each.name for each in ledger_module.list_left_folders(tmp_path / "checkpoint")] == [
+        "scene-0001",
+        "scene-0001-3",
+    ]
     part = Store(folder.with_name("scene-0001-3"))
     assert [each.frame.name for each in part.frames()] == ["2.png", "3.png"] and part.scene_id == "scene-0001-3"
     part.close()
@@ -430,4 +438,4 @@ def test_a_part_whose_making_was_interrupted_is_made_once(open_store, tmp_path, 
     assert place.names == {"0.png", "1.png", "2.png", "3.png"}
     assert place.split_off(["2.png", "3.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
     place.close()
-    assert len(left.list_left_folders(tmp_path / "checkpoint")) == 2
+    assert len(ledger_module.list_left_folders(tmp_path / "checkpoint")) == 2

@@ -10,15 +10,24 @@ import pytest
 import torch
 from torch import nn
 
-from splatnode.recon.evaluate.appearance import FieldSnapshot
+from splatnode.recon.evaluate.protocol import find_test_pose
+from splatnode.recon.evaluate.regions import FieldSnapshot
 from splatnode.recon.evaluate.rivals import nerfmm, nope_nerf
-from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
-from splatnode.recon.evaluate.rivals.nerf import fit
-from splatnode.recon.evaluate.rivals.nerf.appearance import FieldAppearance, sample_pixels
-from splatnode.recon.evaluate.rivals.nerf.cameras import Cameras, Focal
-from splatnode.recon.evaluate.rivals.nerf.field import Field, encode_frequencies
-from splatnode.recon.evaluate.rivals.nerf.volume_rendering import FAR, NEAR, SAMPLES, RenderedRays, render_rays
-from splatnode.recon.evaluate.test_pose import find_test_pose
+from splatnode.recon.evaluate.rivals.nerf import radiance_field
+from splatnode.recon.evaluate.rivals.nerf.radiance_field import (
+    FAR,
+    NEAR,
+    SAMPLES,
+    Cameras,
+    Field,
+    FieldAppearance,
+    Focal,
+    RenderedRays,
+    encode_frequencies,
+    render_rays,
+    sample_pixels,
+)
+from splatnode.recon.evaluate.rivals.outcome import FrameWithDepth
 from tests.support.synthetic import photographs
 
 K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
@@ -120,10 +129,10 @@ def test_colours_that_are_not_used_do_not_count():
     for image in spoilt:
         image[:, 8:] = 1.0
     used = (torch.arange(16) < 8).expand(12, 16)
-    config = fit.FitConfig(iterations=60, checkpoints=(), rays=64)
+    config = radiance_field.FitConfig(iterations=60, checkpoints=(), rays=64)
     looks = []
     for masks in ([used, used], [None, None]):
-        (learnt,) = fit.fit_field(spoilt, masks, Focal(1.0), config, seed=0)
+        (learnt,) = radiance_field.fit_field(spoilt, masks, Focal(1.0), config, seed=0)
         looks.append(
             FieldAppearance(learnt.field).render(np.eye(4), np.array([[16.0, 0, 8], [0, 16, 6], [0, 0, 1]]), 16, 12)
         )
@@ -134,7 +143,9 @@ def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
     frames = list(photographs()[:3])
     half = np.tile(np.arange(frames[0].width) < frames[0].width // 2, (frames[0].height, 1))
     frames[1], given = replace(frames[1], mask=half), []
-    monkeypatch.setattr(fit, "fit_field", lambda images, used, *rest, **named: given.extend(used) or iter(()))
+    monkeypatch.setattr(
+        radiance_field, "fit_field", lambda images, used, *rest, **named: given.extend(used) or iter(())
+    )
     with pytest.raises(AssertionError):  # without an end there is no last snapshot
         list(nerfmm.reconstruct(frames, 0))
     assert [used is None for used in given] == [True, False, True] and 0.4 < given[1].float().mean() < 0.6
@@ -144,7 +155,7 @@ def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
 
 
 def test_nerfmm_learns_a_place_and_its_cameras():
-    config = fit.FitConfig(iterations=80, checkpoints=(10,), rays=128)
+    config = radiance_field.FitConfig(iterations=80, checkpoints=(10,), rays=128)
     snapshots = list(nerfmm.reconstruct(list(photographs()[:3]), 0, config))
     assert [snapshot.iterations for snapshot in snapshots] == [10, 80, 80]
     assert [snapshot.final for snapshot in snapshots] == [False, False, True]
@@ -191,7 +202,7 @@ def test_the_next_view_shows_the_same_colours_from_where_it_stands():
 def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
     terms = nope_nerf.ExtraLosses([wall(0.0), wall(0.1)], Focal(40 / 32))
     seen = RenderedRays(torch.zeros(1, 3), torch.tensor([3.0]))
-    late = fit.FitStep(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
+    late = radiance_field.FitStep(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
     loss = terms(late)
     assert float(loss.detach()) == pytest.approx(0.04 * 2.0)
     loss.backward()
@@ -199,7 +210,7 @@ def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
 
 
 def test_nope_nerf_learns_a_place_from_its_depths():
-    config = fit.FitConfig(iterations=20, checkpoints=(), rays=64)
+    config = radiance_field.FitConfig(iterations=20, checkpoints=(), rays=64)
     frames = list(photographs()[:3])
     once, final = nope_nerf.reconstruct(frames, 0, config)
     assert not once.final and final.final and final.verdict.publishable

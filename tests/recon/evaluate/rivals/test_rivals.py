@@ -10,15 +10,15 @@ pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.stability import stock
-from splatnode.recon.evaluate.stability.outcome import score_cameras
-from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.evaluate.dataset import TrueCamera
+from splatnode.recon.evaluate.stability import trial
+from splatnode.recon.evaluate.stability.case import score_cameras
 from splatnode.recon.result.verdict import Code
 
 PLACE = synthetic.Config(views=3, width=320, height=240)
 
 
-@pytest.mark.parametrize("method", [stock.colmap, stock.glomap])
+@pytest.mark.parametrize("method", [trial.colmap, trial.glomap])
 def test_cameras_of_the_built_in_place_are_right(method):
     cameras = synthetic.scene_cameras(PLACE)
     truth = {synthetic.frame_name(i): TrueCamera(T, K, PLACE.width, PLACE.height) for i, (T, K) in enumerate(cameras)}
@@ -32,6 +32,6 @@ def test_what_shares_nothing_is_no_scene():
     rng = np.random.default_rng(0)
     noise = [Frame(i, f"{i}.png", i, rng.integers(0, 256, (120, 160, 3), dtype=np.uint8), None) for i in range(3)]
     for frames in (noise, noise[:1], []):
-        snapshot = stock.colmap(frames, ReconstructionConfig())
+        snapshot = trial.colmap(frames, ReconstructionConfig())
         assert not snapshot.verdict.publishable and snapshot.cameras == ()
         assert snapshot.verdict.frames == tuple(frame.name for frame in frames)

@@ -14,14 +14,14 @@ pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
-from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, known_depth
+from splatnode.recon.evaluate.protocol import psnr
+from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, outcome
 from splatnode.recon.evaluate.rivals.colmap import reconstruct_sparse_model
 from splatnode.recon.frames.keyframe import resize_image
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support.synthetic import errors
 
@@ -40,7 +40,7 @@ def model(frames):
     return found
 
 
-def short(config: refinement.RefinementConfig, iterations: int) -> refinement.RefinementConfig:
+def short(config: training.RefinementConfig, iterations: int) -> training.RefinementConfig:
     """Without resets, from which opacities would have no time to come back."""
     adapting = adaptive.Config(every=20, start=0.0, reset_every=adaptive.NEVER)
     adapting = adapting if config.control.kind == "adaptive" else proximity.Config(adapting)
@@ -112,7 +112,7 @@ def test_what_a_mask_hides_is_not_fitted_by_colmap_s_rivals(model):
 
 def test_what_a_mask_hides_is_neither_a_start_nor_fitted_by_cf_3dgs(frames):
     masked = [replace(frame, mask=half_of(frame)) if i == 1 else frame for i, frame in enumerate(frames)]
-    known = known_depth.estimate_frame_depths(masked, 0)
+    known = outcome.estimate_frame_depths(masked, 0)
     assert [each.mask is None for each in known] == [True, False, True]
     frame, T = known[1], np.eye(4)
     assert cf_3dgs._make_training_view(frame, T).mask is frame.mask

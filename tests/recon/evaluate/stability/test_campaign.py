@@ -19,8 +19,8 @@ from splatnode.capture.frame import Frame
 from splatnode.command_line import build_parser
 from splatnode.recon.evaluate.stability.campaign import Plan, run_campaign
 from splatnode.recon.evaluate.stability.case import Demand, MatrixRow, TrialCase, make_accept_case
-from splatnode.recon.evaluate.stability.methods import find_method
-from splatnode.recon.evaluate.stability.places import ScenesByMotion, TrialImage
+from splatnode.recon.evaluate.stability.perturbations import ScenesByMotion, TrialImage
+from splatnode.recon.evaluate.stability.trial import find_method
 from splatnode.recon.jobs.calls import engine
 from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.result.verdict import Code

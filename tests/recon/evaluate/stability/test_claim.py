@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.claim import (
+from splatnode.recon.evaluate.dataset import TrueCamera
+from splatnode.recon.evaluate.stability.case import (
     CameraError,
     FiniteBounds,
     has_only_right_cameras,
     measure_camera_errors,
 )
-from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.result.bounds import Bounds, make_ball
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import Bounds, make_ball
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
 BOUNDS = FiniteBounds(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)

@@ -8,7 +8,7 @@ import pytest
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.stability.case import Demand
 from splatnode.recon.evaluate.stability.matrix import ROWS, select_rows
-from splatnode.recon.evaluate.stability.places import (
+from splatnode.recon.evaluate.stability.perturbations import (
     Sampler,
     ScenesByMotion,
     classify_motion,

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.case import Demand
-from splatnode.recon.evaluate.stability.outcome import Outcome, classify_outcome, score_cameras
-from splatnode.recon.evaluate.stability.summary import compute_rate, make_report, summarise
-from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.result.bounds import Bounds, make_ball
+from splatnode.recon.evaluate.dataset import TrueCamera
+from splatnode.recon.evaluate.stability.case import Demand, Outcome, classify_outcome, score_cameras
+from splatnode.recon.evaluate.stability.report import compute_rate, make_report, summarise
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import Bounds, make_ball
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
 
@@ -159,7 +158,7 @@ def test_the_report_s_rates_are_those_of_the_first_method():
 
 def test_the_chart_has_a_cell_for_every_trial(tmp_path):
     pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
-    from splatnode.recon.evaluate.stability.chart import draw, make_figure
+    from splatnode.recon.evaluate.stability.report import draw, make_figure
 
     trials = [{**trial, "seed": number % 3, "verdict": f"CODE_{number}"} for number, trial in enumerate(TRIALS)]
     figure = make_figure({"trials": trials, **make_report(trials)})

@@ -10,10 +10,10 @@ import torch
 
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import OptimizerStep
-from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training_image import TrainingImage
 from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Gaussians
 from tests.support.synthetic import tiny_scene
 
 K = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])

@@ -12,13 +12,12 @@ from msgspec import structs
 from splatnode.recon.optimize.control.control import ControlChoice, OptimizerStep
 from splatnode.recon.optimize.control.prune import Config, estimate_removal_changes, load, select_most_worthwhile
 from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
-from splatnode.recon.optimize.refinement import refine
+from splatnode.recon.optimize.training import refine
 from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
-from splatnode.recon.rasterize.gaussian_render import Camera
+from splatnode.recon.rasterize.dispatch import Camera
 from splatnode.recon.scene.background import SHELL
-from splatnode.recon.scene.contrast_masking import visibility
-from splatnode.recon.scene.gaussians import Gaussians, concatenate
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.scene.initialization import visibility
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, concatenate
 from tests.recon.optimize.test_refinement import plain, render, truth  # noqa: F401  a fixture
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians
-from splatnode.recon.result.export.selection import Box, Selection
-from splatnode.recon.result.export.sources import SOURCES
-from splatnode.recon.result.only_seen import remove_unconfirmed
-from splatnode.recon.result.sources import SHELL, encode_unconfirmed
-from splatnode.recon.result.write import write_result_folder
+from splatnode.recon.result.export.prepare import Box, Selection
+from splatnode.recon.result.export.stored import SOURCES
+from splatnode.recon.result.levels_of_detail import remove_unconfirmed
+from splatnode.recon.result.report import write_result_folder
+from splatnode.recon.result.snapshot import SHELL, encode_unconfirmed
 from tests.support.exported import make_gaussians, make_snapshot, write
 
 SEEN = Selection(only_seen=True)

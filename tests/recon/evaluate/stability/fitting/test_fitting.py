@@ -9,20 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.claim import CameraError
-from splatnode.recon.evaluate.stability.fitting import bounds, odds
-from splatnode.recon.evaluate.stability.fitting.cross_validation import (
+from splatnode.recon.evaluate.stability.case import CameraError
+from splatnode.recon.evaluate.stability.fitting import fit
+from splatnode.recon.evaluate.stability.fitting.fit import (
     count_judgements,
     fit_models,
     fit_without_each_scene,
+    format_module,
     pair_held_out_models,
 )
-from splatnode.recon.evaluate.stability.fitting.judge import exceeds_bounds, is_published, is_wrong
-from splatnode.recon.evaluate.stability.fitting.module import format_module
-from splatnode.recon.evaluate.stability.fitting.samples import Sample, read_samples
-from splatnode.recon.verification.errors import Errors, PoseErrors
+from splatnode.recon.evaluate.stability.fitting.samples import (
+    Sample,
+    exceeds_bounds,
+    is_published,
+    is_wrong,
+    read_samples,
+)
+from splatnode.recon.verification.error_model import VerdictModels
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.models import VerdictModels
+from splatnode.recon.verification.refit import Errors, PoseErrors
 from tests.support.verdicts import evidence
 
 RANDOM = np.random.default_rng(0)
@@ -61,7 +66,7 @@ def test_the_bounds_hold_for_as_many_errors_as_they_should(samples):
 
 
 def test_a_bound_grows_with_what_the_sources_say(samples):
-    model = bounds.fit(samples).rotation
+    model = fit.fit_bounds(samples).rotation
     narrow, wide = (model.predict_bound(Errors(size, size, 0.0), 3) for size in (0.2, 2.0))
     assert 4.0 * narrow < wide
     assert model.predict_bound(Errors(0.2, 0.2, 50.0), 3) == 100.0  # what the focal length leaves open, twice
@@ -75,9 +80,9 @@ def test_wrong_registrations_are_refused_by_numbers_that_did_not_see_their_scene
 
 
 def test_a_measure_never_counts_the_wrong_way(samples):
-    found = odds.fit(samples, bounds.fit(samples)).terms
-    assert set(found) == {*odds.FOR, *odds.AGAINST, "own_lens"} and found["own_lens"].slope <= 0
-    assert all(found[name].slope >= 0 for name in odds.FOR) and all(found[name].slope <= 0 for name in odds.AGAINST)
+    found = fit.fit_odds(samples, fit.fit_bounds(samples)).terms
+    assert set(found) == {*fit.FOR, *fit.AGAINST, "own_lens"} and found["own_lens"].slope <= 0
+    assert all(found[name].slope >= 0 for name in fit.FOR) and all(found[name].slope <= 0 for name in fit.AGAINST)
     assert found["inlier_ratio"].slope > 0 or found["camera_inlier_ratio"].slope > 0
 
 
@@ -93,7 +98,7 @@ def with_own_lens(of: Sample, broken: bool, times: float = 1.0) -> Sample:
 
 def test_sets_that_break_the_assumption_of_one_lens_widen_the_bounds_of_such_sets_alone(samples):
     broken = [with_own_lens(each, broken=True, times=2.0) for each in samples if each.right]
-    without, found = bounds.fit(samples), bounds.fit([*samples, *broken])
+    without, found = fit.fit_bounds(samples), fit.fit_bounds([*samples, *broken])
     assert found.rotation.factor == without.rotation.factor and found.centre.factor == without.centre.factor
     assert without.rotation.own_lens == 1.0
     assert 1.4 < found.rotation.own_lens < 3.0 and 1.4 < found.centre.own_lens < 3.0
@@ -105,8 +110,8 @@ def test_more_must_speak_for_poses_with_a_lens_of_its_own_where_such_were_wrong(
     convincing = [
         replace(s, broken=True, evidence=replace(s.evidence, cameras=tuple(good), inlier_ratio=0.95)) for s in seen
     ]
-    claims = bounds.fit(samples)
-    without, found = odds.fit(samples, claims), odds.fit([*samples, *convincing], claims)
+    claims = fit.fit_bounds(samples)
+    without, found = fit.fit_odds(samples, claims), fit.fit_odds([*samples, *convincing], claims)
     assert without.terms["own_lens"].slope == 0.0
     assert found.prior == without.prior and found.terms["own_lens"].slope < -1.0
 

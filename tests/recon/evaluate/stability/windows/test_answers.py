@@ -13,18 +13,25 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
 from splatnode.recon import estimation
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.evaluate.dataset import load_scene
 from splatnode.recon.evaluate.demo import write_capture
-from splatnode.recon.evaluate.stability.own_cameras import list_registered_cameras
-from splatnode.recon.evaluate.stability.places import TrialScene
-from splatnode.recon.evaluate.stability.windows import ours, store
-from splatnode.recon.evaluate.stability.windows.row import WindowAnswer, WindowOutcome, judge_window
-from splatnode.recon.evaluate.stability.windows.store import Key, select_keys
-from splatnode.recon.evaluate.stability.windows.window import Window, compute_angle_deg
-from splatnode.recon.evaluate.timing import Timing
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.report import Timing
+from splatnode.recon.evaluate.stability.perturbations import TrialScene
+from splatnode.recon.evaluate.stability.trial import list_registered_cameras
+from splatnode.recon.evaluate.stability.windows import campaign
+from splatnode.recon.evaluate.stability.windows import windows as windows_windows
+from splatnode.recon.evaluate.stability.windows.windows import (
+    PieceKey,
+    Window,
+    WindowAnswer,
+    WindowOutcome,
+    compute_angle_deg,
+    judge_window,
+    select_keys,
+)
 from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.matching import pair_matching
-from splatnode.recon.matching.match import match
+from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import prepare
 from splatnode.recon.result.verdict import Code, Verdict
 
@@ -44,10 +51,10 @@ def window(place: TrialScene, start: int, stride: int, count: int = 3) -> Window
 
 
 def answered(
-    place: TrialScene, each: Window, known: dict[Key, bytes], config: ReconstructionConfig, **asked
+    place: TrialScene, each: Window, known: dict[PieceKey, bytes], config: ReconstructionConfig, **asked
 ) -> WindowAnswer:
     """What splatnode answers; what it finds is known from then on."""
-    answer, found = ours.answer_window(place, each, config, asked.get("fresh", False), "nothing", known)
+    answer, found = campaign.reconstruct_window(place, each, config, asked.get("fresh", False), "nothing", known)
     known |= found
     return answer
 
@@ -55,10 +62,10 @@ def answered(
 def test_what_is_known_of_a_scene_changes_no_answer(place):
     config = ReconstructionConfig()
     windows = [window(place, 0, 2), window(place, 1, 1, 4)]  # which share a pair
-    known: dict[Key, bytes] = {}
+    known: dict[PieceKey, bytes] = {}
     found = [answered(place, each, known, config) for each in windows]
     for each, answer in zip(windows, found, strict=True):
-        estimate = ours.estimate_without_store(ours.load_window_frames(place, each), config)
+        estimate = campaign.estimate_without_store(campaign.load_window_frames(place, each), config)
         assert answer.verdict == estimate.verdict
         cameras = list_registered_cameras(estimate)
         assert [camera.name for camera in answer.cameras] == [camera.name for camera in cameras]
@@ -76,8 +83,8 @@ def test_masks_hide_what_they_hide_in_windows_too(place, tmp_path):
     (tmp_path / f"{each.names[1]}.png").write_bytes(encode_png(hidden))
     scene = dataclasses.replace(place.scene, masks=tmp_path)
     plain, frames = (
-        ours.load_window_frames(place, each, True),
-        ours.load_window_frames(TrialScene(scene, place.names), each, True),
+        campaign.load_window_frames(place, each, True),
+        campaign.load_window_frames(TrialScene(scene, place.names), each, True),
     )
     assert [(frame.frame_id, frame.stamp_ns, frame.intrinsics is None) for frame in frames] == [
         (1, 1, False),
@@ -101,10 +108,10 @@ def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkey
     few = replace(config.matching.features, num_features=1000)
     matching = replace(config.matching, features=few, tilting=replace(config.matching.tilting, firm_matches=100))
     config = replace(config, matching=matching)
-    keyframes = [prepare(frame, config) for frame in ours.load_window_frames(place, window(place, 0, 1, 6))]
-    known: dict[Key, bytes] = {}
+    keyframes = [prepare(frame, config) for frame in campaign.load_window_frames(place, window(place, 0, 1, 6))]
+    known: dict[PieceKey, bytes] = {}
     for some in (keyframes[:4], keyframes[2:], keyframes[1::2], keyframes):
-        graph, found = store.match_keyframes(
+        graph, found = windows_windows.match_keyframes(
             some, {key: known[key] for key in select_keys(known, [k.name for k in some])}, matching, None
         )
         known |= found
@@ -117,7 +124,7 @@ def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkey
     assert 0 < len(graph.tilted) < len(graph.plain), "else there was nothing to choose"
     for work in ("match_plain", "match_affine"):
         monkeypatch.setattr(pair_matching, work, None)
-    assert store.match_keyframes(keyframes, known, matching, None)[1] == {}, "nothing is matched twice"
+    assert windows_windows.match_keyframes(keyframes, known, matching, None)[1] == {}, "nothing is matched twice"
 
 
 def test_a_refusal_keeps_its_cameras_and_evidence(place, monkeypatch):
@@ -146,19 +153,19 @@ def test_seconds_are_those_of_a_window_that_had_its_cores_alone(place):
 
 def test_rivals_map_what_is_known_of_the_scene(place):
     pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install 'splatnode[bench]')")
-    from splatnode.recon.evaluate.stability.windows import rivals
+    from splatnode.recon.evaluate.stability.windows import campaign
 
     jobs = [("colmap", window(place, 0, 1, 4)), ("glomap", window(place, 1, 1)), ("colmap", window(place, 2, 1, 4))]
-    known: dict[Key, bytes] = {}
+    known: dict[PieceKey, bytes] = {}
     for number, (method, each) in enumerate(jobs):
-        answer, found = rivals.answer_window(place, each, method, 0, number == 0, known)
+        answer, found = campaign.run_rival_on_window(place, each, method, 0, number == 0, known)
         assert len(found) == (10, 0, 7)[number], "what is known is not found again"
         known |= found
         row = judge_window(each, method, answer, place.scene.cameras)
         assert row.outcome is WindowOutcome.RIGHT and {camera.name for camera in row.cameras} == set(each.names)
         assert all(camera.bounds is None for camera in row.cameras)
         assert answer.seconds > 0 and (answer.fresh_seconds is not None) == (number == 0)
-        _, found = rivals.answer_window(place, each, method, 0, False, {})
+        _, found = campaign.run_rival_on_window(place, each, method, 0, False, {})
         for key in (key for key in found if len(key) == 3):
             one, other = (pickle.loads(pieces[key]) for pieces in (known, found))
             np.testing.assert_array_equal(one.matches, other.matches)

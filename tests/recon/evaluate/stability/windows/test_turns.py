@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from splatnode.recon.evaluate.stability.places import TrialScene
-from splatnode.recon.evaluate.stability.windows.turns import Job, WindowScheduler
-from splatnode.recon.evaluate.stability.windows.window import Window
-from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.evaluate.dataset import EvaluationScene
+from splatnode.recon.evaluate.stability.perturbations import TrialScene
+from splatnode.recon.evaluate.stability.windows.campaign import Job, WindowScheduler
+from splatnode.recon.evaluate.stability.windows.windows import Window
 
 EAST, WEST = (TrialScene(EvaluationScene("pole", {}, {}), ("a", "b", "c", "d")) for _ in range(2))  # of one name, even
 

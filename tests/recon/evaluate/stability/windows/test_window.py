@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.places import TrialScene
-from splatnode.recon.evaluate.stability.windows.window import compute_angle_deg, draw_windows, select_moving_scenes
-from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera
+from splatnode.recon.evaluate.dataset import EvaluationScene, TrueCamera
+from splatnode.recon.evaluate.stability.perturbations import TrialScene
+from splatnode.recon.evaluate.stability.windows.windows import compute_angle_deg, draw_windows, select_moving_scenes
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc, three_places
 
 

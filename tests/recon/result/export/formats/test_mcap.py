@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from splatnode.capture.process.packages import remedy
-from splatnode.recon.result.export.convert import export_scene
-from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
+from splatnode.capture.process.system import remedy
+from splatnode.recon.result.export.format import export_scene
+from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
 from tests.support.exported import make_gaussians, make_landmarks, make_snapshot, stamped, write
 
 BEGAN_NS = 1_714_989_607_250_000_001

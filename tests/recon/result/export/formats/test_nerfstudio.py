@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
-from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.verdict import Scale
 from tests.support.exported import make_camera
 
 

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture.process.packages import remedy
+from splatnode.capture.process.system import remedy
 from splatnode.recon.result import export
-from splatnode.recon.result.export.convert import export_scene
-from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
+from splatnode.recon.result.export.format import export_scene
+from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
 from tests.support.exported import make_gaussians, make_landmarks, make_snapshot, write
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture.frame import Clock, Stamp
 from splatnode.recon.result.export.formats.tum import encode_tum
 from tests.support.exported import make_camera
 

@@ -1,0 +1,304 @@
+"""Keyframe selection: a frame of a stream is taken if it is usable and adds parallax or coverage; the reason is given.
+
+Corners of the last keyframe are tracked through the stream, in small images. They tell what share of that view has left
+the image (coverage), how far it has moved (motion), and how much of the motion no homography explains (parallax). The
+first of these that exceeds its limit makes the frame a candidate; only candidates are examined for blur and exposure.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import DroppedFrame, Frame, reduce_image
+from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
+
+TRACKED_SIDE = 320  # pixels: the longer side of the images in which corners are tracked is at least this
+MAX_CORNERS = 100
+CORNER_QUALITY = 0.01  # of the strongest corner's response, Shi and Tomasi's
+CORNER_DISTANCE = 8  # pixels between corners, so that they spread over the image
+MIN_CORNERS = 12  # with fewer the motion is not measured; a homography alone takes 4
+FORWARD_BACKWARD_PX = 1.0  # a corner tracked to the new image and back must end within this of its start
+LUCAS_KANADE = {
+    "winSize": (11, 11),
+    "maxLevel": 3,
+    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),  # iterations, pixels
+}
+HOMOGRAPHY_PX, HOMOGRAPHY_TRIALS = 1.5, 100  # of RANSAC: an inlier's error, and the number of samples at most
+MAX_COVERAGE = 0.9  # share of lost corners that is always enough, however many frames wait
+REMEMBERED_VIEWS = 64  # newest keyframes of which a new one must not be a copy
+REMEMBERED_FILES = 100_000  # newest keyframes that came as a file, which may come again: a folder may be read anew
+REMEMBERED_BLURS = 8  # candidates with which blur is compared: a soft place after a crisp one is usable soon
+THUMBNAIL = 16, 12  # width and height in pixels
+MAX_THUMBNAIL_DIFFERENCE = 0.3  # mean; copies have 0.05. Others are no copies, which saves a closer comparison
+RETRY_S = 1.0  # after a keyframe that could not be kept
+
+Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
+Image = npt.NDArray  # (h, w) or (h, w, 3) uint8
+Points = npt.NDArray  # (P, 1, 2) float32, as OpenCV has them
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    # Take all but unusable frames and copies: for photographs, each of which was taken on purpose
+    every_frame: bool = False
+    coverage: Share = 0.25  # take a frame when this share of the last keyframe's corners has left the image
+    motion: Share = 0.08  # or when they have moved so far in the median, in longer sides of the image
+    # Or when no homography explains so much of their motion, in longer sides of the image (median)
+    parallax: Share = 0.01
+    # Frames that are examined; the others become no keyframes. Higher: more work, finer choice
+    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0
+    # Until the next frame is examined, after one that would have been taken but is unusable
+    patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3
+    # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
+    backlog: Annotated[int, msgspec.Meta(ge=1)] = 8
+
+
+@dataclass(frozen=True)
+class Decision:
+    take: bool
+    reason: str
+    candidate: bool  # it would have added something; not taken: it was unusable
+
+
+@dataclass(frozen=True)
+class CornerMotion:
+    """How the corners of the last keyframe have moved since."""
+
+    lost: float  # share that has left the image, or could not be tracked
+    median: float  # displacement, in longer sides
+    parallax: float  # median residual after the best homography, in longer sides
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A candidate as it is compared with others, and remembered where it becomes a keyframe."""
+
+    name: str
+    small: Image
+    thumbnail: Image
+    file: bytes | None  # digest of the file that it came as
+
+
+class Selector:
+    """Remembers the keyframes so far. Frames are given in the order of their stamps."""
+
+    def __init__(self, config: Config, limits: Limits) -> None:
+        self.config = config
+        self.limits = limits
+        self._views: list[_Candidate] = []  # newest last
+        self._files: dict[bytes, None] = {}  # digests of the keyframes' files, newest last
+        self._start: Image | None = None  # the last keyframe, small and grey
+        self._corners: Points = np.zeros((0, 1, 2), np.float32)
+        self._now: Points = self._corners
+        # Size and blur of the candidates that were examined, newest last
+        self._blurs_px: deque[tuple[tuple[int, int], float]] = deque(maxlen=REMEMBERED_BLURS)
+        self._next_ns = 0  # nothing is examined before
+
+    def decide(self, frame: Frame, waiting: int = 0) -> Decision:
+        """Whether this frame becomes a keyframe; `waiting` frames are not acknowledged by recon yet.
+
+        Where it fails, for want of memory, the frame may be given again.
+        """
+        if frame.stamp_ns < self._next_ns and not self.config.every_frame:
+            return Decision(False, "between two examinations", False)
+        before_ns = self._next_ns
+        try:
+            return self._examine(frame, waiting)
+        except BaseException:
+            self._next_ns = before_ns
+            raise
+
+    def _examine(self, frame: Frame, waiting: int) -> Decision:
+        self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
+        small = reduce_image(frame.image, TRACKED_SIDE)
+        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        reason, adds = self._explain_decision(grey, strictness=1 + waiting / self.config.backlog)
+        if not adds:
+            return Decision(False, reason, False)
+        view = _Candidate(frame.name, small, _thumbnail(small), _digest(frame.encoded))
+        fault = self._find_fault(frame, view)
+        if fault is not None:
+            self._next_ns = frame.stamp_ns + round(1e9 * self.config.patience_s)
+            return Decision(False, fault, True)
+        self._remember(view, grey)
+        return Decision(True, reason, True)
+
+    def forget_last(self) -> None:
+        """Forgets the last keyframe, which could not be kept: a frame that shows the same may be taken."""
+        for view in self._views[-1:]:
+            self._files.pop(view.file or b"", None)
+        self._views = self._views[:-1]
+        self._start = None
+        self._next_ns += round(1e9 * RETRY_S)
+
+    def _explain_decision(self, grey: Image, strictness: float) -> tuple[str, bool]:
+        if self.config.every_frame:
+            return "every frame is taken", True
+        if self._start is None or self._start.shape != grey.shape:
+            return "first view of this stream", True
+        if len(self._corners) < MIN_CORNERS:
+            return "the last keyframe has too few corners to track", True
+        self._now, tracked = track(self._start, grey, self._corners, self._now)
+        motion = measure(self._corners, self._now, tracked, max(grey.shape))
+        return explain_decision(motion, self.config, strictness)
+
+    def _find_fault(self, frame: Frame, seen: _Candidate) -> str | None:
+        """Why the frame is unusable, or a copy of a keyframe; None where it is neither."""
+        if seen.file in self._files:
+            return "duplicate: this very file came before"
+        for view in reversed(self._views):
+            difference = np.abs(seen.thumbnail - view.thumbnail).mean()
+            if difference > MAX_THUMBNAIL_DIFFERENCE or view.small.shape != seen.small.shape:
+                continue
+            if why_redundant(novelty(seen.small, view.small), self.limits):
+                return f"duplicate: it shows what {view.name} shows"
+        quality, size = assess(frame.image), (frame.width, frame.height)
+        of_this_size = [blur_px for each, blur_px in self._blurs_px if each == size]  # others are of another camera
+        fault = why_unusable(quality, self.limits, min(of_this_size, default=None))
+        if quality.blur_px is not None:
+            self._blurs_px.append((size, quality.blur_px))
+        return fault
+
+    def _remember(self, view: _Candidate, grey: Image) -> None:
+        found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, qualityLevel=CORNER_QUALITY, minDistance=CORNER_DISTANCE)
+        self._views = [*self._views[1 - REMEMBERED_VIEWS :], view]
+        if view.file is not None:
+            self._files[view.file] = None
+            if len(self._files) > REMEMBERED_FILES:
+                del self._files[next(iter(self._files))]
+        self._start = grey
+        self._corners = self._now = np.zeros((0, 1, 2), np.float32) if found is None else found
+
+
+def _digest(file: bytes | None) -> bytes | None:
+    return None if file is None else hashlib.blake2b(file, digest_size=16).digest()
+
+
+def track(
+    start: Image,  # (h, w) grey
+    now: Image,  # (h, w) grey
+    corners: Points,  # in `start`
+    guess: Points,  # where they were in the frame before
+) -> tuple[Points, npt.NDArray[np.bool_]]:
+    """Tracks the corners into the new image; returns their positions, and which were found there and back."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **LUCAS_KANADE)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(now, start, there, corners.copy(), **LUCAS_KANADE)
+    consistent = np.linalg.norm(back - corners, axis=2).ravel() < FORWARD_BACKWARD_PX
+    inside = np.all((there >= 0) & (there < (start.shape[1], start.shape[0])), axis=2).ravel()
+    tracked = (found[:, 0] == 1) & (returned[:, 0] == 1) & consistent & inside
+    return np.where(tracked[:, None, None], there, guess), tracked
+
+
+def measure(corners: Points, now: Points, tracked: npt.NDArray[np.bool_], longer_side: int) -> CornerMotion:
+    """Displacement and parallax of the corners that were tracked; with too few of them the view counts as lost."""
+    lost = 1 - float(tracked.mean())
+    if tracked.sum() < MIN_CORNERS:
+        return CornerMotion(1.0, 0.0, 0.0)
+    before, after = corners[tracked], now[tracked]
+    displacement = np.linalg.norm(after - before, axis=2)
+    homography, _ = cv2.findHomography(before, after, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_TRIALS)
+    if homography is None:
+        return CornerMotion(lost, float(np.median(displacement)) / longer_side, 0.0)
+    residuals = np.linalg.norm(after - cv2.perspectiveTransform(before, homography), axis=2)
+    return CornerMotion(lost, float(np.median(displacement)) / longer_side, float(np.median(residuals)) / longer_side)
+
+
+def explain_decision(motion: CornerMotion, config: Config, strictness: float = 1.0) -> tuple[str, bool]:
+    """The reason to take a frame, or not to, and which of the two it is. Limits are multiplied by `strictness`."""
+    measured = {
+        "coverage": (
+            motion.lost,
+            min(config.coverage * strictness, MAX_COVERAGE),
+            "of the last view is out of the image",
+        ),
+        "parallax": (motion.parallax, config.parallax * strictness, "of the longer side is parallax"),
+        "motion": (motion.median, config.motion * strictness, "of the longer side is the median motion"),
+    }
+    for what, (value, limit, text) in measured.items():
+        if value >= limit:
+            return f"{what}: {value:.1%} {text}, {limit:.1%} are required", True
+    values = ", ".join(f"{what} {value:.1%} of {limit:.1%}" for what, (value, limit, _) in measured.items())
+    return f"adds too little since the last keyframe: {values}", False
+
+
+def _thumbnail(small: Image) -> Image:
+    """(12, 16) grey levels of unit contrast."""
+    grey = cv2.cvtColor(cv2.resize(small, THUMBNAIL, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(float)
+    return (grey - grey.mean()) / (grey.std() + 1)
+
+
+# Keyframes of a recording: chosen as a live camera's are, and thinned evenly where they are more than can be used.
+
+THINNED = "thinned out"  # why a keyframe was given up again
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The keyframes of a recording, in its order, and what became of its other frames."""
+
+    names: tuple[str, ...]  # of the keyframes
+    keyframes: tuple[Frame, ...]  # none where all that there are were asked for
+    dropped: tuple[DroppedFrame, ...]  # what the recording could not give
+    examined: int  # frames
+    taken: Mapping[str, int]  # of the keyframes, by what they add: "coverage", "parallax", ...
+    left_out: Mapping[str, int]  # of the other frames, by the reason
+    what: str = "frame"  # one of those that were examined: "photograph"
+
+    def record(self) -> dict[str, object]:
+        """For report.json."""
+        counts = {"taken": dict(self.taken), "left_out": dict(self.left_out)}
+        return {"frames": self.examined, "keyframes": len(self.names), **counts}
+
+    def __str__(self) -> str:
+        """For people: how many, and why."""
+        taken = ", ".join(f"{count} {reason}" for reason, count in self.taken.items())
+        others = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
+        told = f"{len(self.names)} of {self.examined} {self.what}s are keyframes ({taken})"
+        return f"{told}; the others: {others}" if others else told
+
+
+def choose(
+    recording: Iterable[Frame | DroppedFrame], config: Config, limits: Limits, most: int | None, what: str = "frame"
+) -> Choice:
+    """At most `most` keyframes, evenly along the way; only they are held in memory. None: the names of all.
+
+    When there are more, every second one is given up, and from then on every second one is taken: so the camera's way
+    stays covered whatever its length.
+    """
+    selector = Selector(config, limits)
+    kept: list[tuple[str, Frame | None, str]] = []
+    dropped: list[DroppedFrame] = []
+    left_out: Counter[str] = Counter()
+    examined = found = 0
+    step = 1  # one in so many of the frames that the selector takes is kept
+    for frame in recording:
+        if isinstance(frame, DroppedFrame):
+            dropped.append(frame)
+            continue
+        examined += 1
+        decision = selector.decide(frame)
+        reason = decision.reason.split(":")[0]
+        if not decision.take:
+            left_out[reason] += 1
+            continue
+        if found % step == 0:
+            kept.append((frame.name, None if most is None else frame, reason))
+        else:
+            left_out[THINNED] += 1
+        found += 1
+        if most is not None and len(kept) > most:
+            left_out[THINNED] += len(kept) // 2
+            kept, step = kept[::2], 2 * step
+    taken = Counter(reason for *_, reason in kept)
+    names = tuple(name for name, *_ in kept)
+    frames = tuple(frame for _, frame, _ in kept if frame is not None)
+    return Choice(names, frames, tuple(dropped), examined, taken, left_out, what)

@@ -1,0 +1,398 @@
+"""Keyframes from capture to recon, none of which is lost once it is offered.
+
+    capture                                      recon
+      offer: to the spool on disk     <------    Ready(capacity, holding, limits): at start and every half second
+      which recon is served           ------>    Served(served, limits)
+      send while there is capacity    ------>    receive: each frame once
+                                                 checkpoint
+      remove from the spool           <------    Acknowledge(session, sequence)
+      move to the quarantine          <------    Refuse(session, sequence, reason): what it cannot take, now or later
+
+Either process may die at any moment. A frame without an answer stays in the spool and is sent to the next connection
+that is ready and does not hold it. An acknowledged one is in recon's checkpoint; if it comes again, because capture
+died before it removed it, it is acknowledged again and not delivered. What is larger than recon allows is not sent: it
+goes to the quarantine at once. Answers of a recon that is not served (turns.py) do not count.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import time
+import uuid
+from collections import deque
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+
+import zmq
+
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.messaging.messages import (
+    DELIVERY_PARTS,
+    Acknowledge,
+    ConsumerStatus,
+    Delivery,
+    Ready,
+    ReceivedFrame,
+    Refuse,
+    Request,
+    add_delivery,
+    decode_frame,
+    encode_frame,
+    name_in,
+)
+from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, REQUEST_LIMITS, Endpoint, Network
+from splatnode.capture.messaging.spool import Key, Spool
+from splatnode.capture.messaging.wire import Numbering, Part, WireError, decode, encode, size_bytes
+from splatnode.capture.process.system import is_shortage, may_be_shortage
+from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
+
+# Which recon gets capture's keyframes: one at a time, for each frame is given away once.
+#
+# The one that is served stays until it has been silent for a while. Its own next process takes over at once: both have
+# the id of their checkpoint. Of two processes with one id, which are a checkpoint and its copy, the later one stays.
+
+SILENT_S = 5.0  # after which another recon is served; one that lives asks twice a second
+FORGET_S = 20.0  # without a request, a connection counts as gone
+MOST_CONNECTIONS = 64
+_ENDED = 16  # processes whose successor has come
+
+
+@dataclass
+class Connection:
+    """One connection. What was sent over it arrives, or the connection ends."""
+
+    identity: bytes
+    recon: str
+    process: str
+    heard_s: float  # monotonic
+    capacity: int = 0
+    message_bytes: int = 0
+    outstanding: set[Key] = field(default_factory=set)  # sent or held, neither acknowledged nor refused
+
+
+class ConsumerArbiter:
+    """The connections, and which of them is served."""
+
+    def __init__(self) -> None:
+        self._connections: dict[bytes, Connection] = {}
+        self._served: Connection | None = None
+        self._ended: deque[str] = deque(maxlen=_ENDED)
+
+    @property
+    def active(self) -> Connection | None:
+        return self._served
+
+    @property
+    def num_rejected(self) -> int:
+        """Recons that ask and are not served."""
+        return len({each.process for each in self._connections.values() if not self._is_active(each)})
+
+    def is_active(self, identity: bytes) -> bool:
+        return self._served is not None and self._served.identity == identity
+
+    def handle_ready(self, identity: bytes, request: Ready, spooled: Collection[Key], now_s: float) -> bool:
+        """A recon asks for keyframes: whether it gets them."""
+        known = self._connections.get(identity)
+        if known is None and len(self._connections) >= MOST_CONNECTIONS:
+            self.remove_connection(min(self._connections.values(), key=self._eviction_rank).identity)
+        asking = known or Connection(identity, request.recon, request.process, now_s)
+        self._connections[identity] = asking
+        asking.recon, asking.process, asking.heard_s = request.recon, request.process, now_s
+        asking.capacity, asking.message_bytes = request.capacity, request.message_bytes
+        asking.outstanding |= {key for pair in request.holding if (key := Key(*pair)) in spooled}
+        if self._takes_over(asking, now_s):
+            before, self._served = self._served, asking
+            if before is not None and before.process != asking.process:
+                self._handle_takeover(before, asking)
+        return self._served is asking
+
+    def record_keep_alive(self, identity: bytes, now_s: float) -> None:
+        """The connection has said something."""
+        if identity in self._connections:
+            self._connections[identity].heard_s = now_s
+
+    def mark_answered(self, key: Key) -> None:
+        """The frame is no longer on its way."""
+        for each in self._connections.values():
+            each.outstanding.discard(key)
+
+    def forget_silent(self, now_s: float) -> None:
+        for identity in [name for name, each in self._connections.items() if now_s - each.heard_s > FORGET_S]:
+            self.remove_connection(identity)
+
+    def remove_connection(self, identity: bytes) -> None:
+        """The connection has ended."""
+        self._connections.pop(identity, None)
+        if self.is_active(identity):
+            self._served = None
+
+    def _handle_takeover(self, before: Connection, after: Connection) -> None:
+        """Another process is served now. One with the same checkpoint has ended: if it is a copy, it asks again."""
+        self._ended.append(before.process)
+        if before.recon == after.recon:
+            for identity in [name for name, each in self._connections.items() if each.process == before.process]:
+                self.remove_connection(identity)
+
+    def _eviction_rank(self, connection: Connection) -> tuple[bool, float]:
+        """The least goes where there are too many, so that nobody can keep others out by asking often."""
+        return self.is_active(connection.identity), connection.heard_s
+
+    def _is_active(self, connection: Connection) -> bool:
+        return self._served is not None and self._served.process == connection.process
+
+    def _takes_over(self, asking: Connection, now_s: float) -> bool:
+        served = self._served
+        if served is None or served is asking:
+            return True
+        if now_s - served.heard_s > SILENT_S or served.process == asking.process:
+            return True
+        return served.recon == asking.recon and asking.process not in self._ended
+
+
+log = logging.getLogger(__name__)
+
+READY_EVERY_S = 0.5
+REMEMBERED = 10_000  # acknowledged frames that recon recognises if they come again
+REMEMBERED_REFUSED = 1000
+QUEUE = 64  # messages in a socket; as many as a client may hold (Ready.capacity)
+MAX_REQUESTS = 1000  # that one call of `serve` reads
+
+
+class KeyframeServer(Endpoint):
+    """Capture's end: sends what lies in the spool until it is answered."""
+
+    def __init__(self, network: Network, spool: Spool) -> None:
+        """Takes the spool over and closes it. Raises AlreadyRunning where another process offers keyframes."""
+        with contextlib.ExitStack() as taken:
+            taken.callback(spool.close)
+            super().__init__(network, offers=CAPTURE_KEYFRAMES)
+            self._resources.push(taken.pop_all())
+        self.spool = spool
+        self.numbering = Numbering()
+        self.acknowledged = 0
+        self.set_aside = 0  # by this process
+        self.ignored = 0  # answers of recons that are not served
+        self._turns = ConsumerArbiter()
+        self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=QUEUE)
+        self._router.router_mandatory = True  # a connection that is gone says so
+
+    @property
+    def num_queued(self) -> int:
+        """Frames that nobody has answered."""
+        return len(self.spool)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._turns.active is not None
+
+    @property
+    def num_rejected_consumers(self) -> int:
+        """Recons that ask for keyframes while another one is served."""
+        return self._turns.num_rejected
+
+    def offer(self, frame: Frame | DroppedFrame) -> Key:
+        """Takes the frame over: on the disk when this returns. Raises SpoolFull, OSError, WireError (too large)."""
+        message = encode_frame(frame, self.numbering)
+        if size_bytes(message) > self.network.limits.total_bytes:
+            raise WireError(f"{frame.name}: {size_bytes(message) >> 20} MB; network.max_message_mb allows less")
+        key = Key(self.numbering.session, self.numbering.sequence - 1)
+        self.spool.store(key, message)
+        self._send_due()
+        return key
+
+    def serve(self, timeout_s: float) -> None:
+        """Handles the requests that came, waiting at most `timeout_s` for the first."""
+        if self._router.poll(max(0, math.ceil(timeout_s * 1000))):
+            for _ in range(MAX_REQUESTS):
+                try:
+                    identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
+                except zmq.Again:
+                    break
+                try:
+                    self._handle(identity, decode(parts, Request, REQUEST_LIMITS).header)
+                except WireError as error:
+                    self._refuse("a request for keyframes", error)
+        self._turns.forget_silent(time.monotonic())
+        self._send_due()
+
+    def _handle(self, identity: bytes, request: Request) -> None:
+        now_s = time.monotonic()
+        if isinstance(request, Ready):
+            served = self._turns.handle_ready(identity, request, self.spool, now_s)
+            self._say(identity, encode(ConsumerStatus(served, self.network.limits.total_bytes)))
+            return
+        self._turns.record_keep_alive(identity, now_s)
+        if not self._turns.is_active(identity):
+            self.ignored += 1
+            return
+        key = Key(request.session, request.sequence)
+        if key not in self.spool:
+            return
+        if isinstance(request, Refuse):
+            self._quarantine_frame(key, f"refused by recon: {request.reason}")
+            return
+        self.spool.remove(key)
+        self.acknowledged += 1
+        self._turns.mark_answered(key)
+
+    def _quarantine_frame(self, key: Key, reason: str, parts: list[Part] | None = None) -> None:
+        """Takes the frame out of the queue for good; says once which one it is, and why."""
+        try:
+            parts = parts or self.spool.get(key)
+            name = name_in(parts)
+        except (OSError, ValueError):  # for whatever reason: without its name it is set aside all the same
+            name = "?"
+        log.warning("set aside %s: %s", name, reason)
+        self.spool.move_to_quarantine(key, name, reason)
+        self.set_aside += 1
+        self._turns.mark_answered(key)
+
+    def _send_due(self) -> None:
+        client = self._turns.active
+        if client is None:
+            return
+        for key in self.spool:
+            if len(client.outstanding) >= client.capacity:
+                break
+            if key not in client.outstanding and not self._send(client, key):
+                break
+
+    def _send(self, client: Connection, key: Key) -> bool:
+        """False where this client cannot take more now."""
+        try:
+            parts = self.spool.get(key)
+        except (OSError, ValueError, MemoryError) as error:
+            if is_shortage(error):  # no fault of the keyframe, which waits
+                return False
+            self._quarantine_frame(key, f"lost on the disk: {error}")
+            return True
+        size = size_bytes(parts)
+        if size > client.message_bytes:
+            allowed = f"{client.message_bytes / 1e6:.1f} MB; raise network.max_message_mb there"
+            self._quarantine_frame(key, f"it has {size / 1e6:.1f} MB, and recon takes at most {allowed}", parts)
+            return True
+        if not self._say(client.identity, add_delivery(key, parts)):
+            return False
+        client.outstanding.add(key)
+        return True
+
+    def _say(self, identity: bytes, parts: list[Part]) -> bool:
+        """Sends a message; returns whether it could be sent."""
+        try:
+            self._router.send_multipart([identity, *parts], zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return False
+        except zmq.ZMQError:  # that connection has ended
+            self._turns.remove_connection(identity)
+            return False
+        return True
+
+
+class KeyframeClient(Endpoint):
+    """Recon's end: receives each keyframe once, and acknowledges or refuses it."""
+
+    def __init__(
+        self, network: Network, seen: Iterable[tuple[str, int]] = (), capacity: int = 4, recon: str | None = None
+    ) -> None:
+        """`seen`: what the checkpoint holds, whose id is `recon`. `capacity`: frames that may be here unanswered."""
+        super().__init__(network)
+        self.capacity = capacity
+        self.duplicates = 0
+        self.served: bool | None = None  # whether capture sends its keyframes here; None before it says so
+        self._recon, self._process = recon or uuid.uuid4().hex, uuid.uuid4().hex
+        self._held: dict[Key, None] = {}  # delivered, not answered
+        self._seen: dict[Key, None] = dict.fromkeys(Key(*pair) for pair in seen)
+        self._refused: dict[Key, str] = {}  # and why
+        self._received: deque[ReceivedFrame] = deque()
+        self._ready_said = -math.inf
+        self._dealer = self._connect(CAPTURE_KEYFRAMES, zmq.DEALER, queue=QUEUE)
+
+    def receive(self, timeout_s: float) -> ReceivedFrame | None:
+        """The next frame, oldest first, each once; None where none comes in `timeout_s`. Raises NotAllowed."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._check_links()
+            self.say_ready()
+            self._receive_all()
+            if self._received:
+                return self._received.popleft()
+            remaining = deadline - time.monotonic()
+            if remaining <= 0:
+                return None
+            self._dealer.poll(math.ceil(1000 * min(remaining, READY_EVERY_S)))
+
+    def acknowledge(self, frame: ReceivedFrame) -> None:
+        """To be called once the frame is on the disk, so that it survives this process."""
+        self._held.pop(frame.key, None)
+        _remember(self._seen, frame.key, None, REMEMBERED)
+        self._say(Acknowledge(*frame.key))
+
+    def refuse(self, key: Key, reason: str) -> None:
+        """To be called where the frame cannot be taken, now or later: capture sets it aside."""
+        self._held.pop(key, None)
+        _remember(self._refused, key, sanitize_text(reason, LONGEST_TEXT), REMEMBERED_REFUSED)
+        self._refuse("a keyframe", reason)
+        self._say(Refuse(*key, self._refused[key]))
+
+    def say_ready(self) -> None:
+        """Says that this recon lives, when that is due. To be called where handling a frame takes seconds."""
+        if time.monotonic() - self._ready_said < READY_EVERY_S:
+            return
+        self._ready_said = time.monotonic()
+        held = [(key.session, key.sequence) for key in self._held]
+        self._say(Ready(self._recon, self._process, self.capacity, held, self.network.limits.total_bytes))
+
+    def _receive_all(self) -> None:
+        for _ in range(self.capacity + 2):
+            try:
+                parts = self._dealer.recv_multipart(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            try:
+                first = decode(parts[:DELIVERY_PARTS], Delivery | ConsumerStatus, REQUEST_LIMITS).header
+            except WireError as error:  # it does not say which frame it is, if it is one
+                self._refuse("a keyframe without a number", error)
+                continue
+            if isinstance(first, Delivery):
+                self._take(Key(first.session, first.sequence), parts[DELIVERY_PARTS:])
+            else:
+                self._update_status(first)
+
+    def _take(self, key: Key, parts: list[zmq.Frame]) -> None:
+        if key in self._seen:
+            self.duplicates += 1
+            self._say(Acknowledge(*key))
+        elif key in self._refused:
+            self._say(Refuse(*key, self._refused[key]))
+        elif key not in self._held:
+            try:
+                frame = decode_frame(key, parts, self.network.limits)
+            except WireError as error:
+                if may_be_shortage(error):  # the connection is made anew, and the frame comes again
+                    raise
+                self.refuse(key, str(error))
+            else:
+                self._held[key] = None
+                self._received.append(frame)
+
+    def _update_status(self, answer: ConsumerStatus) -> None:
+        """Updates the consumer status: where another recon is active, the keyframes that wait here are its."""
+        self.served = answer.served
+        if not answer.served:
+            self._received.clear()
+            self._held.clear()
+
+    def _say(self, request: Request) -> None:
+        """Sends a request. Where an answer to a frame cannot be sent, the frame comes again and is recognised."""
+        try:
+            self._dealer.send_multipart(encode(request), zmq.NOBLOCK)
+        except zmq.Again:
+            log.debug("capture is not there")
+
+
+def _remember(known: dict, key: Key, value: str | None, most: int) -> None:
+    known[key] = value
+    while len(known) > most:
+        del known[next(iter(known))]

@@ -1,0 +1,337 @@
+"""`splatnode recon CONFIG`: the process. The main thread has the sockets below; other threads do the work.
+
+intake    capture.keyframes -> checkpoint, acknowledged -> inbox
+worker    inbox -> scenes, saved and exported
+watcher   capture.preview -> has the camera moved?
+main      recon.scene, recon.depth, recon.map, recon.status, recon.control; the service manager; signals
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+
+from splatnode.capture.messaging.network import (
+    RECON_CONTROL,
+    RECON_DEPTH,
+    RECON_MAP,
+    RECON_SCENE,
+    RECON_STATUS,
+    files_for_strangers,
+)
+from splatnode.capture.messaging.pubsub import Answer, CommandServer, MarkProblemsSeen, Publisher, StateServer, ask
+from splatnode.capture.messaging.wire import Name, Numbering
+from splatnode.capture.process.config import load_config
+from splatnode.capture.process.files import state_directory
+from splatnode.capture.process.logs import Problems, event, is_logged, use_structured_lines
+from splatnode.capture.process.system import (
+    ServiceManager,
+    handle_first_signal,
+    make_sure_of_room,
+    raise_file_limit,
+    resident_mb,
+    wrap_late_errors,
+)
+from splatnode.capture.process.terminal import say
+from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.process.unfailing import Unfailing
+from splatnode.recon.config import apply_changes
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.disk_space import DiskSpace
+from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
+from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
+from splatnode.recon.daemon.relocalization import Watcher
+from splatnode.recon.daemon.status import ReconState, ReconStatus
+from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.metric.arguments import collect_marker_changes
+from splatnode.recon.result import snapshot as result_snapshot
+from splatnode.recon.result.export.staged import finish_interrupted_write
+from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record, make_depth_header
+from splatnode.recon.result.snapshot import CameraEstimate
+
+# Commands to the running daemon, and the verb `retract` that sends one.
+
+EXIT_GOOD, EXIT_UNKNOWN_NAME = 0, 2
+
+
+class RemoveKeyframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):
+    """Remove the keyframe with this name."""
+
+    name: Name
+
+
+Command = RemoveKeyframe | MarkProblemsSeen
+
+
+def remove_keyframe(args: argparse.Namespace) -> int:
+    """Asks the daemon to remove a keyframe; returns 2 where there is none of that name."""
+    config = load_config(args.config, DaemonConfig) if args.config else DaemonConfig()
+    answer = ask(RECON_CONTROL, config.network, RemoveKeyframe(args.name), Answer)
+    say(answer.message)
+    return EXIT_GOOD if answer.done else EXIT_UNKNOWN_NAME
+
+
+log = logging.getLogger(__name__)
+
+SERVE_S = 0.05  # between looks at what the threads have produced
+_SOCKETS = 8  # that it binds: of states two
+_FILES, _THREADS = 128, 28  # of which the daemon has need: six endpoints, its own threads, those that compute
+END_S = 20.0  # for the threads to end; an export takes seconds
+STUCK_S = (
+    300.0  # without progress the worker counts as stuck; its longest step, verifying all views, takes tens of seconds
+)
+
+
+def recon(args: argparse.Namespace) -> int:
+    """Runs until SIGTERM or SIGINT and returns 0. A second signal ends the process at once."""
+    use_structured_lines()
+    config = load_config(args.config, DaemonConfig) if args.config else DaemonConfig()
+    if args.checkpoint:
+        config = msgspec.structs.replace(config, checkpoint=args.checkpoint)
+    if args.out:
+        config = msgspec.structs.replace(config, out=args.out)
+    if args.marker:
+        recipe = apply_changes(config.reconstruction, {"metric": collect_marker_changes(args)})
+        config = msgspec.structs.replace(config, reconstruction=recipe)
+    stopping = threading.Event()
+    handle_first_signal((signal.SIGTERM, signal.SIGINT), stopping.set)
+    with Daemon(config, stopping) as daemon:
+        daemon.run()
+    return 0
+
+
+class Daemon:
+    def __init__(self, config: DaemonConfig, stopping: threading.Event) -> None:
+        """Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
+        self._config, self._stopping = config, stopping
+        self._resources = contextlib.ExitStack()
+        with self._close_on_error():
+            raise_file_limit()
+            network = config.network
+            make_sure_of_room(_FILES + files_for_strangers(network, _SOCKETS), _THREADS)
+            self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
+            self._depths = self._resources.enter_context(StateServer(RECON_DEPTH, network))
+            maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.map.live else None
+            self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
+            self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
+            self._store = Store(config.checkpoint or state_directory() / "recon")
+            self._resources.callback(self._store.close)
+            self._resources.enter_context(hold_result_folder(config.out))
+            for folder in config.out.glob("scene-*"):
+                finish_interrupted_write(folder, [folder / "colmap"])
+        self._disk_space = DiskSpace(config, self._store)
+        self._inbox = Inbox()
+        self._newest = _NewestSnapshot()
+        self._problems = Problems()
+        self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
+        self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping)
+        self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
+        self._scene_numbers = Numbering()
+        session = self._scene_numbers.session
+        self._depth_numbers = Numbering(session)
+        self._status_numbers = Numbering(session)
+        self._maps = None if maps is None else OccupancyPublisher(maps, Numbering(session))
+        self._sequence = 0  # of the last scene's message
+        self._started_s = time.monotonic()
+        self._shown: PublishedSnapshot | None = None
+        self._errors: list[BaseException] = []
+        self._heart, self._told = Unfailing("the heartbeat"), ReconState.LOADING.value  # the service manager's
+
+    def __enter__(self) -> Daemon:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._resources.close()
+
+    def run(self) -> None:
+        """Runs until the daemon is stopped. Raises Failed where one of its threads ended."""
+        manager = ServiceManager()
+        with wrap_late_errors(manager):
+            self._run(manager)
+
+    def _run(self, manager: ServiceManager) -> None:
+        threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher)]
+        manager.ready()
+        event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
+        next_status_s = 0.0
+        try:
+            while not self._stopping.is_set():
+                self._scenes.serve(SERVE_S)
+                self._depths.serve(0)
+                self._commands.serve(0, self._answer)
+                if self._maps is not None:
+                    self._maps.serve()
+                self._publish()
+                self._publish_map(self._worker.current_map)
+                if time.monotonic() >= next_status_s:
+                    next_status_s = time.monotonic() + self._config.status_every_s
+                    self._heart.do(self._beat)
+                    if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager restarts it
+                        manager.alive(self._told)
+        finally:
+            self._stopping.set()
+            manager.stopping()
+            self._join_threads(threads)
+        if self._errors:
+            raise self._errors[0]
+        event(log, logging.INFO, "stopped")
+
+    def _beat(self) -> None:
+        status = self._make_status()
+        self._told = f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}"
+        self._heartbeat.send(status)
+
+    def _start_thread(self, run: Callable[[], None]) -> threading.Thread:
+        def run_and_record_error() -> None:
+            try:
+                run()
+            except BaseException as error:
+                self._errors.append(error)
+                self._stopping.set()
+
+        thread = threading.Thread(target=run_and_record_error, name=type(run).__name__, daemon=True)
+        thread.start()
+        return thread
+
+    def _join_threads(self, threads: list[threading.Thread]) -> None:
+        """Waits until the threads have written what they are writing: an export, a keyframe."""
+        deadline = time.monotonic() + END_S
+        for thread in threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+        if any(thread.is_alive() for thread in threads):
+            log.error("a thread did not end within %d s; the file that it was writing is not there", END_S)
+
+    def _publish(self) -> None:
+        shown = self._newest.take()
+        if shown is None:
+            return
+        self._shown = shown
+        self._publish_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
+        numbers = self._scene_numbers.next()
+        self._sequence = int(numbers["sequence"])
+        try:
+            header, arrays = encode_snapshot(shown.snapshot, shown.scene_id, numbers)
+            depth = self._depth_numbers.next()
+            self._depths.publish(make_depth_header(shown.snapshot, shown.scene_id, self._sequence, depth))
+            self._scenes.publish(header, arrays)
+        except Exception as error:  # of one snapshot; the next one may do
+            if is_logged(self._problems.add("scenes that could not be shown", f"{type(error).__name__}: {error}")):
+                log.exception("a scene could not be shown")
+
+    def _publish_map(self, found: OccupancyResult | str) -> None:
+        if self._maps is not None:
+            self._maps.publish(found, self._shown, self._sequence)
+
+    def _answer(self, command: Command) -> Answer:
+        if isinstance(command, MarkProblemsSeen):
+            self._problems.mark_seen()
+            return Answer(True, "the problems are not told again")
+        left, here = self._worker.find_inactive_scenes(command.name), command.name in self._store.names
+        if not left and not here:
+            known = ", ".join(sorted(self._store.names)) or "none yet"
+            return Answer(False, sanitize_text(f"no keyframe {command.name!r}; there are: {known}"))
+        try:
+            if left:
+                self._store.request_removal(command.name, left)
+            if here:
+                self._store.forget(command.name, "retracted")
+        except OSError as error:
+            return Answer(
+                False, sanitize_text(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
+            )
+        if here:
+            self._inbox.enqueue_now(RemovedFrame(command.name))
+        event(log, logging.INFO, "retracted", frame=command.name, left=",".join(left))
+        those = f"{', '.join(left)}, which the camera has left, is built anew without it when no keyframe waits"
+        told = [*(["the scene is built anew without it"] if here else []), *([those] if left else [])]
+        return Answer(True, sanitize_text(f"{command.name} is removed; {'; '.join(told)}"))
+
+    def _make_status(self) -> ReconStatus:
+        snapshot = self._shown.snapshot if self._shown else None
+        intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked
+        delay_s, delay = worker.delay
+        scenes, maps, loops = worker.map_counts
+        return ReconStatus(
+            **self._status_numbers.next(),
+            state=ReconState.FULL if intake.full else ReconState.LOADING if worker.loading else worker.place.state,
+            uptime_s=time.monotonic() - self._started_s,
+            scene_id=self._store.scene_id,
+            keyframe=intake.newest,
+            queue=len(self._inbox),
+            keyframes=len(snapshot.cameras) if snapshot else 0,
+            num_gaussians=len(snapshot.gaussians) if snapshot else 0,
+            iterations=snapshot.iterations if snapshot else 0,
+            final=bool(snapshot and snapshot.final),
+            verdict=snapshot.verdict.code.value if snapshot else "",
+            message=sanitize_text(snapshot.verdict.message) if snapshot else "",
+            bounds=sanitize_text(result_snapshot.format_widest_bounds(snapshot.cameras, snapshot.scale))
+            if snapshot
+            else "",
+            keyframe_s=worker.place.keyframe_s,
+            delay_s=delay_s,
+            delay=delay,
+            unfinished=worker.num_unfinished,
+            scenes=scenes,
+            maps=maps,
+            loops=loops,
+            newest_places=worker.newest_places,
+            refused=intake.refused + self._commands.refused + self._scenes.refused,
+            duplicates=intake.duplicates,
+            rss_mb=resident_mb(),
+            camera_moved=motion.moved if motion else None,
+            moved=str(motion) if motion and motion.moved else "",
+            tracked=_make_live_camera_record(tracked),
+            problem=self._describe_problem(),
+        )
+
+    def _describe_problem(self) -> str:
+        """Describes what keeps the node from working now, and problems that nobody has acknowledged yet."""
+        for what, endpoint in (("commands", self._commands), ("requests for scenes", self._scenes)):
+            self._problems.count(f"{what} that were refused", endpoint.refused, endpoint.why_refused)
+        intake = self._intake
+        now = intake.full or intake.unconnected or self._worker.problem or self._disk_space.describe_problem()
+        return sanitize_text("; ".join(filter(None, (now, str(self._problems)))))
+
+    @contextlib.contextmanager
+    def _close_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._resources.close()
+            raise
+
+
+def _make_live_camera_record(tracked: CameraEstimate | None) -> CameraRecord | None:
+    """None, too, for one that nothing can be seen through: tracking went astray."""
+    try:
+        return None if tracked is None else make_camera_record(tracked)
+    except ValueError as error:
+        log.debug("where the live camera is cannot be told: %s", error)
+        return None
+
+
+class _NewestSnapshot:
+    """Holds the newest snapshot that has not been published, between two threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._shown: PublishedSnapshot | None = None
+
+    def update(self, shown: PublishedSnapshot) -> None:
+        with self._lock:
+            self._shown = shown
+
+    def take(self) -> PublishedSnapshot | None:
+        with self._lock:
+            shown, self._shown = self._shown, None
+            return shown

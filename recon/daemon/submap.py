@@ -1,0 +1,384 @@
+"""The place where the camera is: keyframes are worked in, the scene grows, is shown, and becomes as good as it gets."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+
+from splatnode.capture.process.logs import event
+from splatnode.capture.process.system import is_shortage
+from splatnode.recon.config import ReconstructionConfig as Recipe
+from splatnode.recon.core import give_back_memory
+from splatnode.recon.daemon import membership, submap_index
+from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.ingest import ArrivedKeyframe
+from splatnode.recon.daemon.output import Output
+from splatnode.recon.daemon.relocalization import FinalScene
+from splatnode.recon.daemon.status import ReconState
+from splatnode.recon.daemon.submap_index import SubmapState
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.modelling import SceneWithVerdict
+from splatnode.recon.result import snapshot as result_snapshot
+from splatnode.recon.result.snapshot import Snapshot
+
+# The result of the present place's finished scene: written when the scene is, or when the disk takes it again.
+
+AGAIN_S = 60.0  # after the disk did not take it
+
+
+class FinalResult:
+    def __init__(self, store: Store, output: Output) -> None:
+        self._store, self._output = store, output
+        self._not_before_s = -math.inf  # monotonic
+        self.names: frozenset[str] = frozenset()  # the keyframes whose scene was written as final
+
+    def write(self, snapshot: Snapshot, work: IncrementalReconstruction) -> bool:
+        """Writes the scene as the final one of its keyframes; False where the disk does not take it."""
+        written = self._output.export(snapshot, work, self._store, SubmapState.HERE, sorted(self._store.names))
+        # What is kept as final is not exported after a restart.
+        self._output.save(self._store, work, final=written)
+        self.names = frozenset(work.names) if written else frozenset()
+        self._not_before_s = time.monotonic() + AGAIN_S
+        return written
+
+    def retry_write(self, shown: Snapshot | None, work: IncrementalReconstruction, at_once: bool) -> bool:
+        """Writes a final scene that is shown and that the disk did not take; False where there is none, or not now."""
+        if shown is None or not shown.final or self.names == frozenset(work.names):
+            return False
+        return (at_once or time.monotonic() >= self._not_before_s) and self.write(shown, work)
+
+
+log = logging.getLogger(__name__)
+
+PATIENCE_S = 3.0  # that a thorough judgement of a keyframe that does not fit may keep others waiting
+MOST_ASIDE = 8  # keyframes that may still find their place
+SHARED_PART = 3  # of the views of a scene that is full, one in so many is in the next one, too: the newest
+
+
+class Abandoned(Exception):
+    """Something more urgent has come."""
+
+
+class ActiveSubmap:
+    def __init__(
+        self, config: DaemonConfig, recipe: Recipe, store: Store, output: Output, pause: Callable[[float], None]
+    ) -> None:
+        """`pause` raises Abandoned if the daemon stops, and from a time (monotonic) on if something has come."""
+        self._config, self._recipe, self._store, self._output = config, recipe, store, output
+        self._pause_until = pause
+        self._work = IncrementalReconstruction(recipe)
+        self._final = FinalResult(store, output)
+        self._compared: frozenset[str] = frozenset()  # those of the scene that was compared with the finished ones
+        self._exported_s = time.monotonic()
+        self._fallbacks: tuple[tuple[str, str], ...] = ()  # those without a gain that the checkpoint has
+        self._shown: Snapshot | None = None  # last
+        self.settled = True  # nothing can be made better before the next keyframe
+        self.under_way: list[ArrivedKeyframe] = []  # keyframes that are being worked in, and that no scene shows yet
+        self.owed: list[ArrivedKeyframe] = []  # keyframes that a step that failed did not work in
+        self.state = ReconState.WAITING
+        self.keyframe_s: float | None = None  # from the last keyframe's arrival until the scene showed it
+        self.finished: FinalScene | None = None  # while no keyframe waits
+
+    def resume(self, found: checkpoint.RestoredReconstruction) -> None:
+        """Goes on where an earlier process was. Keyframes that it did not work in come as if they had just arrived."""
+        self._work = found.work
+        self.settled = found.final or not found.keyframes
+        self._final.names = frozenset(self._work.names) if found.final else frozenset()
+        if not found.keyframes:
+            return
+        event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=found.keyframes, new=len(found.new))
+        self.settled = self.settled and not found.new
+        self.state = ReconState.IDLE if self.settled else ReconState.GROWING
+        if self._work.scene is not None:
+            self._show(final=self.settled)
+        elif not found.new:
+            self.add_keyframes([])
+
+    def add_keyframes(self, arrived: Sequence[ArrivedKeyframe]) -> None:
+        """Keyframes that have come, shown together where all belong to one place, else one after the other.
+
+        So the same places come of them as if each had come by itself: of keyframes that waited, those of the next
+        places would else begin one together.
+        """
+        self.state, self.settled, self.finished = ReconState.GROWING, False, None
+        self.owed = self.under_way = self._prepend_retries(arrived)
+        try:
+            apart = self._add_together(self.owed)
+            self.owed = self.under_way = apart
+            while self.owed:
+                one, *later = self.owed
+                self._add_one(one, later)
+        finally:
+            self.under_way = self.owed
+            self._save_fallbacks()
+        self.state = ReconState.LOST if self._find_untracked() else ReconState.GROWING
+
+    def _add_together(self, arrived: Sequence[ArrivedKeyframe]) -> list[ArrivedKeyframe]:
+        """Works in keyframes, and returns those that are to be worked in one after the other, which it leaves out."""
+        if len(arrived) == 1:
+            return list(arrived)
+        keyframes = membership.screen_keyframes(self._work, (each.keyframe for each in arrived), self._forget)
+        standing = self._work.scene is not None
+        strangers = self._add_to_graph(keyframes)
+        if not standing and keyframes and membership.is_split(self._work, self._check_stopping):
+            strangers = {keyframe.name for keyframe in keyframes}
+        self._work.remove_keyframes(strangers)  # they are screened again
+        apart = [each for each in arrived if each.keyframe.name in strangers]
+        self.owed = apart
+        if not strangers or len(strangers) < len(keyframes):
+            self._update_and_show(arrived)
+        return apart
+
+    def _add_one(self, arrived: ArrivedKeyframe, later: list[ArrivedKeyframe]) -> None:
+        """Works a keyframe in; `later` are those that follow it."""
+        keyframes = membership.screen_keyframes(self._work, [arrived.keyframe], self._forget)
+        strangers = self._add_to_graph(keyframes)
+        self.owed = later
+        if not strangers or self._rejoin_deferred(strangers):
+            self._update_and_show([arrived])
+        self.under_way = later
+
+    def _prepend_retries(self, arrived: Sequence[ArrivedKeyframe]) -> list[ArrivedKeyframe]:
+        """Also those keyframes that a step that failed left out, and that nobody has removed since."""
+        there = {*self._work.names, *(keyframe.name for keyframe in self._work.keyframes_deferred)}
+        owed = [each for each in self.owed if each.keyframe.name in self._store.names - there]
+        self._work.remove_keyframes([each.keyframe.name for each in owed])  # they were screened, and are screened again
+        return [*owed, *arrived]
+
+    def _update_and_show(self, arrived: Sequence[ArrivedKeyframe]) -> None:
+        """The scene with the keyframes that have come to belong to it."""
+        self._limit_views()
+        self._work.update(self._check_stopping)
+        snapshot = self._show()
+        if arrived:
+            self.keyframe_s = time.monotonic() - arrived[0].at_s
+        event(
+            log, logging.INFO, "keyframes", names=",".join(each.keyframe.name for each in arrived),
+            verdict=snapshot.verdict.code.value, gaussians=len(snapshot.gaussians), seconds=self.keyframe_s or 0.0,
+            bounds=result_snapshot.format_widest_bounds(snapshot.cameras, snapshot.scale),
+        )  # fmt: skip
+        self._output.save(self._store, self._work, final=False)
+        if time.monotonic() - self._exported_s >= self._config.export_every_s:
+            self.export_provisionally()
+        give_back_memory()
+
+    def _add_to_graph(self, keyframes: list[Keyframe]) -> set[str]:
+        """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
+        try:
+            return membership.add(self._work, keyframes, self._check_stopping)
+        except Abandoned:
+            raise
+        except Exception as error:  # one bad frame must not keep others out
+            if is_shortage(error):
+                raise
+            self._work.remove_keyframes([keyframe.name for keyframe in keyframes])
+            if len(keyframes) > 1:
+                return set().union(*(self._add_to_graph([keyframe]) for keyframe in keyframes))
+            log.exception("%s cannot be worked in", keyframes[0].name)
+            self._forget(keyframes[0].name, f"cannot be worked in: {error}")
+            return set()
+
+    def _rejoin_deferred(self, newest: set[str]) -> bool:
+        """Whether the scene changes by keyframes that did not fit at once. Raises Abandoned.
+
+        They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
+        If that does not help them, another place begins with them.
+        """
+        lost = len(self._find_untracked()) >= self._config.lost_after
+        pause = partial(self._pause_until, math.inf if lost else time.monotonic() + PATIENCE_S)
+        aside = [keyframe.name for keyframe in self._work.keyframes_deferred]
+        joined = membership.has_links_to_deferred(self._work, pause) and (
+            membership.join(self._work, aside, pause) or (not lost and membership.join(self._work, newest, pause))
+        )
+        if self._check_lost(newest):
+            return True
+        for keyframe in self._work.keyframes_deferred[: -max(MOST_ASIDE, self._config.lost_after)]:
+            self._forget(keyframe.name, "it does not fit the scene")
+        return joined
+
+    def _check_lost(self, newest: Collection[str]) -> bool:
+        """Says which of the newest keyframes do not fit; where too many in a row do not, another place begins."""
+        strangers = self._find_untracked()
+        for keyframe in strangers:
+            if keyframe.name in newest:
+                event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+        if len(strangers) < self._config.lost_after:
+            return False
+        self._begin_submap(strangers)
+        return True
+
+    def _begin_submap(self, strangers: Sequence[Keyframe]) -> None:
+        """Another scene begins with the frames that do not belong to the present one, which is finished later."""
+        self.state = ReconState.LOST
+        before = self._leave_submap(strangers[0].frame.frame_id)
+        event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
+        self._work = IncrementalReconstruction(self._recipe)
+        for keyframe in strangers:
+            self._work.add_keyframe(keyframe, self._check_stopping)
+
+    def _leave_submap(self, first: int, shared: Collection[str] = ()) -> str:
+        """Begins another scene with frame `first`; the present one, whose id is returned, is finished later.
+
+        The frames before it belong to the present scene alone, those that are `shared` to both.
+        """
+        before, kept = self._store.scene_id, self._store.names_before(first).union(shared)
+        if self._final.names != kept:
+            self._output.save(self._store, self._work, final=False)
+            self._export_provisionally(submap_index.SubmapState.LEFT, kept)
+        else:
+            self._output.mark_finished(before)
+        self._store.leave_submap(first, shared)
+        self._final.names, self._compared, self._shown = frozenset(), frozenset(), None
+        return before
+
+    def export_provisionally(self) -> None:
+        """Writes what is shown, unless it was written as final."""
+        if not self.retry_write(at_once=True):
+            self._export_provisionally(submap_index.SubmapState.HERE, self._store.names)
+
+    def retry_write(self, at_once: bool = False) -> bool:
+        """Writes the finished scene that the disk did not take; False where there is none, or it was tried just now."""
+        return self._final.retry_write(self._shown, self._work, at_once)
+
+    def _export_provisionally(self, state: submap_index.SubmapState, names: Collection[str]) -> None:
+        """`names` are those of the place's keyframes."""
+        self._exported_s = time.monotonic()
+        if self._shown is None or self._shown.final:
+            return
+        kept = sorted(names)
+        if self._shown.verdict.publishable:
+            self._output.export(self._shown, self._work, self._store, state, kept)
+        else:
+            self._output.update_index(self._shown, state, kept)
+
+    def _begin_overlapping_submap(self) -> None:
+        """Begins the next scene of the same place with the newest views, which both scenes have; the first is left.
+
+        Not where the newest alone make no scene.
+        """
+        newest = membership.select_newest(self._work, self._config.max_views // SHARED_PART)
+        first = min(each.frame.frame_id for each in newest)
+        work = IncrementalReconstruction(self._recipe, self._work.state)
+        # Also what was set aside before: it stays with the scene that is left.
+        work.remove_keyframes(
+            [each.name for each in (*work.graph.keyframes, *work.keyframes_deferred) if each.frame.frame_id < first]
+        )
+        if len(work.estimate_thoroughly(self._check_stopping).publishable_camera_names) < len(newest):
+            return
+        shared = {each.name for each in newest}
+        before = self._leave_submap(first, shared=shared)
+        event(log, logging.INFO, "next_scene", before=before, now=self._store.scene_id, shared=len(newest))
+        self._work = work
+
+    def _limit_views(self) -> None:
+        """Sees to it that there are not more views than configured: goes on with the newest, else gives up others."""
+        if len(self._work.names) > self._config.max_views:
+            self._begin_overlapping_submap()
+        while len(self._work.names) > max(self._config.max_views, membership.NEWEST):
+            name = membership.find_most_redundant(self._work.graph)
+            event(log, logging.INFO, "given_up", frame=name)
+            self._forget(name, "given up for newer views that show the same")
+
+    def detect_loops(self, atlas: LoopDetector) -> bool:
+        """Links the scene with finished ones that show the same, if it is final and was not compared before.
+
+        False where there was nothing to compare. Raises Abandoned.
+        """
+        names = frozenset(self._work.names)
+        if not names or self._final.names != names or self._compared == names:
+            return False
+        state, self.state, self._compared = self.state, ReconState.REFINING, names
+        try:
+            atlas.detect_loops(self._store.scene_id, self._work.graph, self._pause)
+        except Abandoned:
+            self._compared = frozenset()  # only this is worth another time
+            raise
+        finally:
+            self.state = state
+        return True
+
+    def remove_frames(self, names: Sequence[str]) -> None:
+        """The checkpoint no longer has these frames; the scene forgets them, too."""
+        known = [name for name in names if name in self._work.names]
+        self._work.remove_keyframes(names)
+        if known:
+            self.settled, self.finished, self.state = False, None, ReconState.GROWING
+        self._show(final=self.settled and self._work.scene is not None)
+        if known:
+            self._output.save(self._store, self._work, final=False)
+
+    def _forget(self, name: str, reason: str) -> None:
+        self._store.forget(name, reason)
+        self._work.remove_keyframes([name])
+
+    def finalize(self) -> None:
+        """Makes the scene afresh from all keyframes and refines it. Raises Abandoned when something comes."""
+        self.state = ReconState.REFINING
+        self._verify()
+        self._refine_verified()
+
+    def _verify(self) -> None:
+        """Weighs all evidence; what shows other places begins others, or becomes places of its own that wait."""
+        more = True
+        while more:
+            fitted = set(self._work.names)
+            with self._work.fallback_budget(self._config.fallback_s):
+                try:
+                    membership.verify_keyframes(self._work, self._forget, self._pause)
+                finally:
+                    self._save_fallbacks()
+            more = self._check_lost(fitted)
+        for keyframes in membership.find_separate_groups(self._work, self._pause):
+            names = [keyframe.name for keyframe in keyframes]
+            scene = self._store.split_off(names, present=True)
+            self._output.add_split_submap(scene, names)
+            event(log, logging.INFO, "parted", scene=self._store.scene_id, part=scene, keyframes=len(names))
+            self._work.remove_keyframes(names)
+
+    def _save_fallbacks(self) -> None:
+        """Writes into the checkpoint which fallbacks gained nothing, where there are others than before."""
+        if self._work.state.memory.fruitless != self._fallbacks:
+            self._fallbacks = self._work.state.memory.fruitless
+            self._output.save_fallbacks(self._store, self._work)
+
+    def _refine_verified(self) -> None:
+        refined = SceneWithVerdict()
+        for refined in membership.refine(self._work, self._recipe, self._pause):
+            if refined.scene is not None and refined.scene.iterations in self._recipe.optimize.checkpoints:
+                self._work.show(refined)
+                self._show()
+        self.settled = True
+        self._work.show(refined)
+        shown = self._work.scene is not None
+        snapshot = self._show(final=shown)
+        if shown:
+            self._final.write(snapshot, self._work)
+        else:
+            self._output.update_index(snapshot, submap_index.SubmapState.HERE, sorted(self._store.names))
+        self.state = ReconState.WAITING if not shown else ReconState.LOST if self._find_untracked() else ReconState.IDLE
+        give_back_memory()
+
+    def _pause(self) -> None:
+        """Raises Abandoned if the daemon stops, or something has come."""
+        self._pause_until(-math.inf)
+
+    def _check_stopping(self) -> None:
+        """Raises Abandoned if the daemon stops: what may be shown soon is not abandoned for what comes next."""
+        self._pause_until(math.inf)
+
+    def _find_untracked(self) -> list[Keyframe]:
+        return membership.find_untracked(self._work, self._check_stopping)
+
+    def _show(self, final: bool = False) -> Snapshot:
+        self._work.estimate_soon(self._check_stopping)
+        snapshot = self._work.snapshot(self._store.frames_dropped, final)
+        measured = self._output.publish(snapshot, self._work)
+        self.finished, self._shown = FinalScene(measured, self._work.graph.keyframes) if final else None, snapshot
+        return snapshot

@@ -1,0 +1,396 @@
+"""The pose and the lens that fit correspondences best, and how well these determine them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.frames.keyframe import PLAIN, Features
+from splatnode.recon.geometry import cross_matrix, distortion
+from splatnode.recon.geometry import undistort_rays as straight
+from splatnode.recon.matching import features as matching_features
+from splatnode.recon.result.snapshot import Landmarks
+from splatnode.recon.verification.consistency import ReflectionConfig, mirror_descriptors
+
+# A camera with an uncertain lens: where it sees points, and how that changes with its pose and its lens.
+
+Array = npt.NDArray[np.float64]
+
+# A small turn (3) and move (3) of the world in the camera, log focal, first radial, shift (2), log aspect.
+NUM_PARAMETERS = 11
+POSE = 6  # of them, the pose's
+PINHOLE = 0.0, 0.0  # its radial coefficients
+_MIN_DEPTH = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A lens with what is known of it: standard deviations; 0 where a number is certain."""
+
+    focal: float  # pixels, the geometric mean of those across and down
+    radial: tuple[
+        float, float
+    ]  # radial coefficients, as recon/registration/bundle_adjustment.py has them; the second is held
+    shift: Array  # (2,) of the principal point, pixels
+    log_focal_sigma: float
+    radial_sigma: float  # of the first
+    shift_sigma: float  # pixels
+    log_aspect: float = 0.0  # logarithm of the focal length across over that down
+    log_aspect_sigma: float = 0.0
+
+    @property
+    def values(self) -> Array:
+        """(5,) as parameters."""
+        return np.array([np.log(self.focal), self.radial[0], *self.shift, self.log_aspect])
+
+    @property
+    def sigmas(self) -> Array:
+        """(5,)"""
+        return np.array(
+            [self.log_focal_sigma, self.radial_sigma, self.shift_sigma, self.shift_sigma, self.log_aspect_sigma]
+        )
+
+    @property
+    def focals(self) -> Array:
+        """(2,) focal lengths across and down, pixels."""
+        half = 0.5 * self.log_aspect
+        return self.focal * np.exp([half, -half])
+
+    def copy_shape(self, other: Lens) -> Lens:
+        """This lens with the radial coefficients and the aspect of `other`, known as well as these are."""
+        return replace(
+            self,
+            radial=other.radial,
+            radial_sigma=other.radial_sigma,
+            log_aspect=other.log_aspect,
+            log_aspect_sigma=other.log_aspect_sigma,
+        )
+
+    def copy_sigmas(self, other: Lens) -> Lens:
+        """This lens, known as well as `other`."""
+        return replace(
+            self,
+            log_focal_sigma=other.log_focal_sigma,
+            radial_sigma=other.radial_sigma,
+            shift_sigma=other.shift_sigma,
+            log_aspect_sigma=other.log_aspect_sigma,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A pose, world to camera, and a lens."""
+
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,)
+    lens: Lens
+
+    def apply_step(self, step: Array) -> CameraModel:
+        """Returns the camera with its parameters changed by `step` (NUM_PARAMETERS,)."""
+        lens = self.lens
+        return CameraModel(
+            np.asarray(cv2.Rodrigues(step[:3])[0]) @ self.rotation,
+            self.translation + step[3:POSE],
+            replace(
+                lens,
+                focal=lens.focal * float(np.exp(step[6])),
+                radial=(lens.radial[0] + float(step[7]), lens.radial[1]),
+                shift=lens.shift + step[8:10],
+                log_aspect=lens.log_aspect + float(step[10]),
+            ),
+        )
+
+    @property
+    def T_world_camera(self) -> Array:
+        """(4, 4)"""
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.rotation.T, -self.rotation.T @ self.translation
+        return T
+
+    def errors(self, points: Array, pixels: Array) -> Array:
+        """(M,) reprojection errors of points (M, 3), pixels; infinite behind the camera."""
+        seen, depth = self.project(points)
+        return np.where(depth > 0, np.linalg.norm(seen - pixels, axis=1), np.inf)
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (M, 2) of world points (M, 3), relative to the nominal principal point, and depths (M,)."""
+        in_camera = points @ self.rotation.T + self.translation
+        rays = in_camera[:, :2] / _safe(in_camera[:, 2])[:, None]
+        bent = distortion((rays**2).sum(1), np.array(self.lens.radial))
+        return self.lens.focals * bent[:, None] * rays + self.lens.shift, in_camera[:, 2]
+
+    def derivatives(self, points: Array) -> tuple[Array, Array]:
+        """Differentiates pixels of points (M, 3): (M, 2, NUM_PARAMETERS) by parameters, (M, 2, 3) by points."""
+        # A row of memory is a derivative of all points: so NumPy's loops are long ones.
+        turned = np.ascontiguousarray((points @ self.rotation.T).T)
+        z = _safe(turned[2] + self.translation[2])
+        x, y = (turned[0] + self.translation[0]) / z, (turned[1] + self.translation[1]) / z
+        (across, down), (first, second), squared = self.lens.focals, self.lens.radial, x * x + y * y
+        bent = distortion(squared, np.array(self.lens.radial))
+        twice = 2.0 * (first + 2.0 * second * squared)
+        # By the ray (x, y), which is the point over its depth; then by the point in the camera.
+        xx, yy = across * (bent + twice * x * x), down * (bent + twice * y * y)
+        xy, yx = across * twice * x * y, down * twice * x * y
+        by_camera = np.stack([[xx, xy, -(xx * x + xy * y)], [yx, yy, -(yx * x + yy * y)]]) / z  # (2, 3, M)
+        by_parameters = np.zeros((2, NUM_PARAMETERS, len(points)))
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # turned x by_camera
+            by_parameters[:, i] = turned[j] * by_camera[:, k] - turned[k] * by_camera[:, j]
+        by_parameters[:, 3:POSE] = by_camera
+        by_parameters[:, 6] = across * bent * x, down * bent * y
+        by_parameters[:, 7] = across * squared * x, down * squared * y
+        by_parameters[0, 8] = by_parameters[1, 9] = 1.0
+        by_parameters[:, 10] = 0.5 * by_parameters[0, 6], -0.5 * by_parameters[1, 6]
+        return by_parameters.transpose(2, 0, 1), (self.rotation.T @ by_camera).transpose(2, 0, 1)
+
+
+def undistort_pixels(pixels: Array, lens: Lens) -> Array:
+    """(M, 2) where a pinhole of the same focal length sees what `lens` sees at `pixels` (M, 2)."""
+    distorted = (pixels - lens.shift) / lens.focals
+    return lens.focal * straight(distorted, np.array(lens.radial))
+
+
+def _safe(depth: Array) -> Array:
+    return np.where(np.abs(depth) < _MIN_DEPTH, _MIN_DEPTH, depth)
+
+
+# Which pixels of a photograph may show which landmarks: its features matched with those of each known photograph.
+
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+LEAST_COSINE = 0.5  # between two directions from which a feature looks alike: 60 degrees are beyond SIFT's reach
+_NEAREST = 4  # photographs of the scene that one is compared with whose camera is nearly known
+_MARGIN = 0.15  # of the longer side, around the picture: what is there may be in it
+_MIN_LENGTH = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """M pixels of a photograph with the landmarks that they may show. A pixel may have several of them."""
+
+    pixels: Array  # (M, 2) relative to the nominal principal point
+    feature_of: Index  # (M,) the photograph's feature
+    points: Array  # (M, 3) world
+    covariances: Array  # (M, 3, 3) of the points
+    landmark_of: Index  # (M,)
+    photograph_of: Index  # (M,) a known photograph that says so
+    seen_along: Array  # (M, 3) the mean direction in which those that say so see the landmark, of unit length, world
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def select(self, chosen: Flags | Index) -> Correspondences:
+        """The chosen ones."""
+        return Correspondences(
+            *(getattr(self, name)[chosen] for name in Correspondences.__dataclass_fields__),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrior:
+    """A prior on the camera's pose."""
+
+    camera: CameraModel
+    size: tuple[int, int]  # (width, height) of its picture, pixels
+    reach_px: float | None = None  # a landmark is at most so far from where the camera sees it; None: anywhere
+
+
+def match_landmarks(
+    features: Features,
+    principal: Array,
+    landmarks: Landmarks,
+    config: matching_features.NearestNeighbourConfig,
+    near: PosePrior | None = None,
+) -> Correspondences:
+    """The matches of the plain `features` with the descriptors of each known photograph by itself.
+
+    In the photographs together a landmark is its own second-nearest neighbour, and the ratio test would fail. Where the
+    camera is nearly known, the photographs are those that look most alike, and the landmarks those that it sees, from
+    nearly the same side.
+    """
+    count = len(landmarks.Ts_world_camera)
+    photographs = range(count) if near is None else _nearest(landmarks, near.camera.T_world_camera)
+    in_view, shown = (None, None) if near is None else _find_visible(landmarks, principal, near)
+    at = features.points[features.point_of]
+    ours, theirs = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for photograph in photographs:
+        (own,) = np.nonzero(landmarks.photograph_of == photograph)
+        if near is not None and in_view is not None:
+            own = own[in_view[own]]
+        described = landmarks.descriptors[own]
+        if near is None or near.reach_px is None or shown is None:
+            matches = matching_features.match(features.descriptors, described, config)
+        else:
+            there = shown[landmarks.point_of[own]]
+            matches = matching_features.match_near(features.descriptors, at, described, there, near.reach_px, config)
+        ours.append(features.point_of[matches[:, 0]])
+        theirs.append(own[matches[:, 1]])
+    return _each_once(np.concatenate(ours), np.concatenate(theirs), features.points - principal, landmarks)
+
+
+def measure_mirror_gain(features: Features, landmarks: Landmarks, config: ReflectionConfig) -> float:
+    """How much better the plain `features` match the scene when the image is turned left to right.
+
+    It is the logarithm of the matches mirrored over those as it is (recon/verification/consistency.py), each with those
+    images of the scene with which it has most. In a symmetric place these are not the same.
+    """
+    plain = features.select_tilt(PLAIN).descriptors[: config.num_features]
+    counts = np.zeros((len(landmarks.names), 2))  # as it is, and mirrored
+    for photograph in range(len(counts)):
+        theirs = landmarks.descriptors[landmarks.photograph_of == photograph]
+        for way, ours in enumerate((plain, mirror_descriptors(plain))):
+            counts[photograph, way] = len(matching_features.match(theirs, ours, config.nearest_neighbours))
+    as_it_is, mirrored = np.sort(counts, axis=0)[-config.partners :].mean(0) + config.by_chance
+    return float(np.log(mirrored / as_it_is))
+
+
+def _find_visible(landmarks: Landmarks, principal: Array, near: PosePrior) -> tuple[Flags, Array]:
+    """(D,) which descriptors are of points that the camera sees as they were seen; (P, 2) where it sees each point."""
+    shown, depth = near.camera.project(landmarks.points)
+    shown, margin = shown + principal, near.reach_px or _MARGIN * max(near.size)
+    inside = (depth > 0) & (shown > -margin).all(1) & (shown < np.array(near.size) + margin).all(1)
+    points = landmarks.points[landmarks.point_of]
+    before = _directions(points - landmarks.Ts_world_camera[landmarks.photograph_of, :3, 3])
+    now = _directions(points - near.camera.T_world_camera[:3, 3])
+    return inside[landmarks.point_of] & ((before * now).sum(1) > LEAST_COSINE), shown
+
+
+def _nearest(landmarks: Landmarks, T_world_camera: Array) -> Index:
+    """The photographs of the scene that look most alike: a radian counts as much as the distance to the scene."""
+    Ts = landmarks.Ts_world_camera
+    turn = np.arccos(np.clip(Ts[:, :3, 2] @ T_world_camera[:3, 2], -1.0, 1.0))
+    apart = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1) / landmarks.unit
+    return np.argsort(turn + apart, kind="stable")[:_NEAREST]
+
+
+def _each_once(feature_of: Index, descriptor_of: Index, pixels: Array, landmarks: Landmarks) -> Correspondences:
+    """Each feature, which lies at `pixels`, with each landmark that it may show, once."""
+    photograph_of = landmarks.photograph_of[descriptor_of]
+    both = np.column_stack([feature_of, landmarks.point_of[descriptor_of]])
+    pairs, first, pair_of = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    feature_of, landmark_of = pairs.T
+    along = _directions(landmarks.points[both[:, 1]] - landmarks.Ts_world_camera[photograph_of, :3, 3])
+    seen_along = np.zeros((len(pairs), 3))
+    np.add.at(seen_along, pair_of.ravel(), along)
+    return Correspondences(
+        pixels=pixels[feature_of],
+        feature_of=feature_of,
+        points=landmarks.points[landmark_of],
+        covariances=landmarks.covariances[landmark_of],
+        landmark_of=landmark_of,
+        photograph_of=photograph_of[first],
+        seen_along=_directions(seen_along),
+    )
+
+
+def _directions(vectors: Array) -> Array:
+    """The vectors (M, 3) in unit length."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), _MIN_LENGTH)
+
+
+# Observations that tell as much as one with an error of its own: what lens, shutter and scene do otherwise than the
+# model moves whole regions alike. Registration takes 100 (recon/registration/incremental_mapper.py); the landmarks
+# have been
+# through the same lenses and keep a part of it: with 30, 98 % of the turns are within their 95 % bounds (tests/bench).
+CORRELATED = 30.0
+_ROBUST = 3.0  # scale of the Cauchy loss, in standard deviations
+_STEPS = 12  # Gauss-Newton converges in a few
+_CONVERGED = 1e-6  # largest change of a parameter over its standard deviation, squared
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
+_FIXED = 1e-9  # stands for a sigma of 0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFit:
+    """A camera with what its correspondences say of it."""
+
+    camera: CameraModel
+    covariance: Array  # (NUM_PARAMETERS, NUM_PARAMETERS) of `CameraModel.moved`'s step; NaN where it is not finite
+    spread: float  # of the residuals, over what is expected of them: 1 where all is as it should be
+
+
+def optimize_camera(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: float) -> CameraFit:
+    """The camera with the least robust cost, from `camera` on.
+
+    `noise_px` is the standard deviation of a pixel's coordinate; the points' own uncertainty counts beside it. The
+    lens is held near `prior`, by its sigmas.
+    """
+    information_of_prior = 1.0 / np.maximum(prior.sigmas, _FIXED) ** 2
+    spread = 1.0
+    covariance = np.full((NUM_PARAMETERS, NUM_PARAMETERS), np.nan)
+    covariances = np.ascontiguousarray(known.covariances.transpose(1, 2, 0))
+    for _ in range(_STEPS):
+        rows, residuals = _whiten_residuals(camera, known, covariances, noise_px)
+        lengths = np.hypot(*residuals)
+        spread = max(_median(lengths) / _RAYLEIGH_MEDIAN, 1.0)
+        weights = 1.0 / (1.0 + (lengths / (_ROBUST * spread)) ** 2) / spread**2
+        across, down = weights * rows
+        information = across @ rows[0].T + down @ rows[1].T
+        gradient = across @ residuals[0] + down @ residuals[1]
+        # The prior is one observation, and so are CORRELATED correspondences.
+        lens = slice(POSE, NUM_PARAMETERS)
+        information[lens, lens] += CORRELATED * np.diag(information_of_prior)
+        gradient[lens] += CORRELATED * information_of_prior * (prior.values - camera.lens.values)
+        inverse = _inverse(information)
+        if inverse is None:
+            return CameraFit(camera, np.full_like(covariance, np.nan), spread)
+        step = inverse @ gradient
+        if not np.isfinite(step).all():
+            return CameraFit(camera, np.full_like(covariance, np.nan), spread)
+        camera, covariance = camera.apply_step(step), CORRELATED * inverse
+        if step @ information @ step < _CONVERGED:
+            break
+    return CameraFit(camera, covariance, spread)
+
+
+def _whiten_residuals(
+    camera: CameraModel,
+    known: Correspondences,
+    covariances: Array,  # (3, 3, M) of the points
+    noise_px: float,
+) -> tuple[Array, Array]:
+    """Derivatives (2, NUM_PARAMETERS, M) and residuals (2, M), observed less predicted, in standard deviations."""
+    by_parameters, by_point = (each.transpose(1, 2, 0) for each in camera.derivatives(known.points))
+    residuals = (known.pixels - camera.project(known.points)[0]).T
+    # The Cholesky factor of each pixel's covariance (2, 2).
+    of_first, of_second = ((covariances * each[:, None]).sum(0) for each in by_point)
+    top = np.sqrt((of_first * by_point[0]).sum(0) + noise_px**2)
+    aside = (of_first * by_point[1]).sum(0) / top
+    bottom = np.sqrt((of_second * by_point[1]).sum(0) + noise_px**2 - aside**2)
+    rows, errors = np.empty_like(by_parameters), np.empty((2, len(known)))
+    for whitened, given in ((rows, by_parameters), (errors, residuals)):
+        whitened[0] = given[0] / top
+        whitened[1] = (given[1] - aside * whitened[0]) / bottom
+    return rows, errors
+
+
+def _median(values: Array) -> float:
+    """As NumPy's of (M,), in a fraction of its time for few."""
+    middle = (len(values) - 1) // 2, len(values) // 2
+    return float(np.partition(values, middle)[list(middle)].mean())
+
+
+def _inverse(information: Array) -> Array | None:
+    """(N, N) inverse of the normal matrix; None where it is not finite or no information at all."""
+    unit = np.sqrt(np.diag(information))
+    if not (np.isfinite(information).all() and (unit > 0).all()):
+        return None
+    try:
+        return np.linalg.inv(information / unit[:, None] / unit) / unit[:, None] / unit
+    except np.linalg.LinAlgError:
+        return None
+
+
+def pose_covariance(camera: CameraModel, covariance: Array) -> Array:
+    """(6, 6) of a small motion in the camera's frame: translation (3), then rotation vector (3), radians.
+
+    `covariance` (POSE, POSE or more) is of a step of `CameraModel.moved`.
+    """
+    change = np.zeros((POSE, POSE))
+    change[:3, :3] = -cross_matrix(camera.translation[None])[0]
+    change[:3, 3:] = -np.eye(3)
+    change[3:, :3] = -np.eye(3)
+    return change @ covariance[:POSE, :POSE] @ change.T

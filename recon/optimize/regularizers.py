@@ -1,0 +1,219 @@
+"""All losses beside the photometric one together (equation 13), each with its weight at its time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from splatnode.recon.networks.depth_anything import load_relative
+from splatnode.recon.optimize.losses.loss import Evaluate, Loss, LossChoice, Schedule
+from splatnode.recon.optimize.point_render import PointRender, render_points
+from splatnode.recon.optimize.pseudo_views import PseudoView, pseudo_views
+from splatnode.recon.priors.monocular import fit_monocular_depth
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.rasterize.reference import Render
+
+# What is known of training views and pseudo views beside the photographs: targets that losses compare renders with.
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTarget:
+    """The depth and the normals of a view, where they are known."""
+
+    depth: Tensor  # (H, W) z in the camera frame
+    normal: Tensor  # (H, W, 3) camera frame, unit length, facing the camera
+    weights: Tensor  # (H, W) in [0, 1], 0 where nothing is known
+
+
+@dataclass(frozen=True, eq=False)
+class Supervision:
+    """Targets of the C training views and the V pseudo views; each kind is computed when a loss first asks for it."""
+
+    images: Sequence[npt.NDArray[np.uint8]]  # C photographs (H, W, 3) RGB at modelled size
+    pointmaps: Sequence[Pointmap]  # of the same C views
+    pseudo_views: Sequence[PseudoView]  # V of them
+    nearest_points: int  # that are blended in a pixel of a point render
+    min_confidence: float  # of a point or a depth that is used
+    # C masks (H, W): False where a photograph does not show the scene; None: all of them do everywhere
+    shown: Sequence[npt.NDArray[np.bool_]] | None = None
+
+    @cached_property
+    def surfaces(self) -> tuple[SurfaceTarget, ...]:
+        """Returns the training views' surfaces: of a monocular network where there is one, else of point maps."""
+        return tuple(_make_pointmap_target(pointmap, self.min_confidence) for pointmap in self._depth_targets[0])
+
+    @property
+    def depth_source(self) -> str:
+        """Returns the source of the depths of `surfaces`, for the report."""
+        return self._depth_targets[1]
+
+    @cached_property
+    def point_renders(self) -> tuple[PointRender, ...]:
+        """Renders the point cloud of all point maps from each pseudo view."""
+        if not self.pseudo_views:
+            return ()
+        cloud = _cloud(self.pointmaps, self.images, self.min_confidence)
+        return tuple(
+            render_points(*cloud, view.T_world_camera, view.K, view.width, view.height, nearest=self.nearest_points)
+            for view in self.pseudo_views
+        )
+
+    @cached_property
+    def pseudo_surfaces(self) -> tuple[SurfaceTarget, ...]:
+        """Returns the surfaces of the pseudo views: depth and normals of the point renders."""
+        return tuple(_make_point_target(shown) for shown in self.point_renders)
+
+    @cached_property
+    def _depth_targets(self) -> tuple[Sequence[Pointmap], str]:
+        """The point maps with a monocular network's depth, except in views that contradict it, and the source."""
+        network = load_relative()
+        if network is None:
+            return self.pointmaps, "multi-view depth"
+        pairs = list(zip(self.pointmaps, self.images, strict=True))
+        completed = [fit_monocular_depth(pointmap, image, network) for pointmap, image in pairs]
+        changed = sum(new is not old for new, (old, _) in zip(completed, pairs, strict=True))
+        if self.shown is not None:  # a network sees depth in what a mask hides, too
+            completed = [pointmap.apply_mask(shown) for pointmap, shown in zip(completed, self.shown, strict=True)]
+        source = f"depth of {network.name} (in {changed} of {len(pairs)} views, scaled by multi-view depth)"
+        return completed, source
+
+
+def resample_target(target: Tensor, render: Tensor) -> Tensor:
+    """`target` (h, w, ...) sampled at the pixels of `render` (H, W, ...), which has the same view at another size."""
+    if target.shape == render.shape:
+        return target
+    rows, columns = (
+        ((torch.arange(size) + 0.5) * full / size).long()
+        for size, full in zip(render.shape[:2], target.shape[:2], strict=True)
+    )
+    return target[rows][:, columns]
+
+
+def _cloud(
+    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], min_confidence: float
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Points (M, 3), colours (M, 3) and world normals (M, 3) of all confident pixels."""
+    points, colours, normals = [], [], []
+    for pointmap, image in zip(pointmaps, images, strict=True):
+        confident = (pointmap.confidence >= min_confidence) & (pointmap.depth > 0)
+        points.append(pointmap.points[confident])
+        colours.append(image[confident].astype(np.float32) / 255.0)
+        normals.append((pointmap.normal[confident] @ pointmap.T_world_camera[:3, :3].T).astype(np.float32))
+    return np.concatenate(points), np.concatenate(colours), np.concatenate(normals)
+
+
+def _make_pointmap_target(pointmap: Pointmap, min_confidence: float) -> SurfaceTarget:
+    confident = (pointmap.confidence >= min_confidence) & (pointmap.depth > 0)
+    weights = np.where(confident, pointmap.confidence, 0).astype(np.float32)
+    return SurfaceTarget(*(torch.from_numpy(array) for array in (pointmap.depth, pointmap.normal, weights)))
+
+
+def _make_point_target(shown: PointRender) -> SurfaceTarget:
+    weights = shown.seen.astype(np.float32)
+    return SurfaceTarget(*(torch.from_numpy(array) for array in (shown.depth, shown.normal, weights)))
+
+
+class RegularizerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The losses, and what they share: pseudo views, and the points and depths that are trusted.
+
+    Pseudo views have the full size: with half of it sceaux lost .29 dB, .005 SSIM and .016 LPIPS, because Gaussians of
+    a pixel look different there.
+    """
+
+    losses: Mapping[str, LossChoice] = {}  # by names of your own, which the report uses; a weight of 0 costs nothing
+    pseudo_views: int = 12  # how many views between the cameras are drawn for losses that need them
+    off_path: float = 0.1  # largest distance of these from the cameras' path, in distances of neighbouring cameras
+    nearest_points: int = 8  # points that are blended in a pixel (K of equation 6)
+    min_confidence: float = 0.3  # least confidence of the points that are rendered and of the depths that are compared
+
+    @property
+    def active_losses(self) -> dict[str, LossChoice]:
+        """The losses whose weight is not 0."""
+        return {name: choice for name, choice in self.losses.items() if choice.config.weight}
+
+
+class Regularizer:
+    """The losses of one refinement; it draws the pseudo view of each iteration."""
+
+    def __init__(
+        self,
+        pointmaps: Sequence[Pointmap],
+        images: Sequence[npt.NDArray[np.uint8]],
+        config: RegularizerConfig,
+        *,
+        seed: int,
+        shown: Sequence[npt.NDArray[np.bool_]] | None = None,
+    ) -> None:
+        """`pointmaps` and `images` (h, w, 3) RGB are of the training views, in the order of `training_loss`.
+
+        `shown` (h, w) are False where these photographs do not show the scene: what a network tells there is not used.
+        """
+        self._rng = np.random.default_rng(seed)
+        self._pseudo_views = _sample_pseudo_views(pointmaps, config, self._rng)
+        supervision = Supervision(
+            images, pointmaps, self._pseudo_views, config.nearest_points, config.min_confidence, shown
+        )
+        losses = {
+            name: choice.module.prepare(choice.config, supervision, seed)
+            for name, choice in config.active_losses.items()
+        }
+        self._losses: list[tuple[Schedule, Loss]] = [
+            (config.losses[name].config, loss) for name, loss in losses.items() if _is_usable(loss)
+        ]
+        self.served_by = {name: loss.served_by for name, loss in losses.items()}
+
+    def channels(self, progress: float) -> tuple[str, ...]:
+        """Returns the channels to render at this progress in [0, 1]: colours, and what active losses compare."""
+        compared = [
+            channel for schedule, loss in self._losses if schedule.weight_at(progress) for channel in loss.channels
+        ]
+        return tuple(dict.fromkeys(("rgb", *compared)))
+
+    def training_loss(self, index: int, render: Render, progress: float) -> Tensor | None:
+        """The losses on training view `index` (equation 11), weighted; None while none is active."""
+        return _sum_losses(self._active(progress, lambda loss: loss.on_training_view), index, render)
+
+    def pseudo_loss(self, draw: Callable[[PseudoView, Collection[str]], Render], progress: float) -> Tensor | None:
+        """The losses on a random pseudo view, as `draw` renders its channels, weighted; None while none is active."""
+        active = self._active(progress, lambda loss: loss.on_pseudo_view)
+        if not self._pseudo_views or not active:
+            return None
+        index = int(self._rng.integers(len(self._pseudo_views)))
+        return _sum_losses(active, index, draw(self._pseudo_views[index], self.channels(progress)))
+
+    def _active(self, progress: float, function: Callable[[Loss], Evaluate | None]) -> list[tuple[float, Evaluate]]:
+        """Weight and `function` of each loss that has it and counts at this progress."""
+        found = [(schedule.weight_at(progress), function(loss)) for schedule, loss in self._losses]
+        return [(weight, evaluate) for weight, evaluate in found if weight and evaluate is not None]
+
+
+def _sum_losses(active: Sequence[tuple[float, Evaluate]], index: int, render: Render) -> Tensor | None:
+    parts = [weight * evaluate(index, render) for weight, evaluate in active]
+    return torch.stack(parts).sum() if parts else None
+
+
+def _is_usable(loss: Loss) -> bool:
+    return loss.on_training_view is not None or loss.on_pseudo_view is not None
+
+
+def _sample_pseudo_views(
+    pointmaps: Sequence[Pointmap], config: RegularizerConfig, rng: np.random.Generator
+) -> list[PseudoView]:
+    """The pseudo views; none between fewer than two cameras."""
+    if len(pointmaps) < 2:
+        return []
+    return pseudo_views(
+        [pointmap.T_world_camera for pointmap in pointmaps],
+        [pointmap.K for pointmap in pointmaps],
+        [(pointmap.depth.shape[1], pointmap.depth.shape[0]) for pointmap in pointmaps],
+        config.pseudo_views,
+        off_path=config.off_path,
+        rng=rng,
+    )

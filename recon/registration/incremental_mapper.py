@@ -1,0 +1,590 @@
+"""The map of few views: attempts with several first pairs and focal lengths, of which the best is kept.
+
+With a handful of views there is time to try. Attempts are scored by ALL pairwise matches, those included that a map was
+not built from.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.geometry import distortion
+from splatnode.recon.registration import (
+    bundle_adjustment,
+    epipolar,
+    mapping_problem,
+    own_lenses,
+    subpixel,
+    triangulation,
+)
+from splatnode.recon.registration import resection as registration_resection
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, Pair, Pairs, PartialMap
+from splatnode.recon.registration.resection import Resection
+from splatnode.recon.registration.self_calibration import CORNER, LEAST_SHIFT
+from splatnode.recon.registration.subpixel import PatchImage
+from splatnode.recon.registration.triangulation import Tracks
+from splatnode.recon.threads import map_parallel
+
+# Incremental mapping: a first pair, then one view after the other, with a bundle adjustment after each.
+
+Array = npt.NDArray[np.float64]
+
+# The less is settled, the larger errors may be, as multiples of `triangulation.max_error_px`, for a point to be kept:
+_FIRST_PAIR_TOLERANCE = 4.0  # with two views and a guessed focal length
+_NEW_VIEW_TOLERANCE = 3.0  # with a view that has just been resected
+SETTLED_TOLERANCE = 2.0  # with views that have been adjusted before
+
+# A bundle adjustment after each view need not converge: the next view changes the map again.
+_QUICK_ITERATIONS, _QUICK_DECREASE = 10, 1e-3
+
+_MIN_IMPROVEMENT = 1.05  # factor of the score by which another map must be better to replace one
+_MIN_VIEWS = 3  # that must stay when doubtful ones are removed
+
+
+class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    resection: registration_resection.ResectionConfig = registration_resection.ResectionConfig()
+    triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
+    robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
+    min_points: int = 15  # points that a map needs
+    candidates: int = 3  # views that are resected before the best of them is registered
+    min_view_ratio: float = 0.6  # inlier ratio of a view's matches below which it is removed and resected again
+    # Standard deviation of log focal while there are two views, which say little about it
+    pair_focal_sigma: float = 0.03
+
+
+def grow(problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig) -> PartialMap | None:
+    """A map from the pair `first` on, with every view that can be registered; None where the pair gives too little.
+
+    `focals` (one a lens) are in pixels.
+    """
+    partial = _initialise(problem, focals, first, config)
+    return _repair(problem, extend(problem, partial, config), config) if partial else None
+
+
+def score(problem: MapperInput, partial: PartialMap, zero_px: float) -> float:
+    """The number of matches that the map explains, of all pairs; one with error e counts 1 - (e / zero_px)^2.
+
+    `zero_px` is in pixels at REFERENCE_SIDE; matches with larger errors count 0.
+    """
+    errors = registration_resection.pair_errors(problem, partial).values()
+    return sum(float(np.maximum(0.0, 1.0 - (of_pair / zero_px) ** 2).sum()) for of_pair in errors)
+
+
+def adjust(
+    problem: MapperInput,
+    partial: PartialMap,
+    tracks: Tracks,
+    loss: bundle_adjustment.BundleAdjustmentConfig,
+    tolerance: float,
+    config: triangulation.TriangulationConfig,
+) -> PartialMap:
+    """The map with all points triangulated anew (see `retriangulate` for `tolerance`), then bundle-adjusted."""
+    estimate, track_of_point = triangulation.retriangulate(
+        partial.estimate, tracks, partial.registered, problem.scale, config, tolerance
+    )
+    if len(estimate.points):
+        estimate = bundle_adjustment.adjust(estimate, partial.prior, loss, partial.registered[0])
+    return replace(partial, estimate=estimate, track_of_point=track_of_point)
+
+
+def adjust_quickly(
+    problem: MapperInput, partial: PartialMap, tolerance: float, config: IncrementalMapperConfig
+) -> PartialMap:
+    """`adjust` with few tracks and few iterations, for after each view."""
+    robust_px = config.robust_px * float(np.median(problem.scale))
+    loss = bundle_adjustment.BundleAdjustmentConfig(
+        robust_px=robust_px, max_iterations=_QUICK_ITERATIONS, tolerance=_QUICK_DECREASE
+    )
+    return adjust(problem, partial, problem.growing_tracks, loss, tolerance, config.triangulation)
+
+
+def _initialise(
+    problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig
+) -> PartialMap | None:
+    """The map of the pair `first`: its first view is the world's origin, its baseline the unit of length."""
+    count = len(problem.views)
+    rotation, direction, num_inliers = epipolar.relative_pose(
+        problem.pairs[first],
+        focals[problem.views[first[0]].lens],
+        focals[problem.views[first[1]].lens],
+        config.triangulation.max_error_px * float(problem.scale[first[0]]),
+    )
+    if num_inliers < config.min_points:
+        return None
+    rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    rotations[first[1]], translations[first[1]] = rotation, direction
+    estimate = bundle_adjustment.make_empty_problem(
+        rotations=rotations,
+        translations=translations,
+        lens_of_camera=np.array([view.lens for view in problem.views]),
+        log_focals=np.log(focals),
+        radials=np.array([lens.radial for lens in problem.lenses]),
+        shifts=np.zeros((len(problem.lenses), 2)),
+    )
+    prior = bundle_adjustment.focal_prior(np.log(focals), np.array([lens.sigma for lens in problem.lenses]))
+    tight = replace(prior, sigmas=np.minimum(prior.sigmas, config.pair_focal_sigma))
+    start = PartialMap(first, estimate, tight, np.zeros(0, np.int64))
+    partial = adjust_quickly(problem, start, _FIRST_PAIR_TOLERANCE, config)
+    return replace(partial, prior=prior) if len(partial.estimate.points) >= config.min_points else None
+
+
+def extend(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> PartialMap:
+    """The map with every further view that can be registered.
+
+    Of the views that observe most of the map, the one with the highest inlier ratio comes next: a view that repeated
+    structures misplace contradicts some of its neighbours, and waits until more of them are registered.
+    """
+    failed: set[int] = set()
+    while len(partial.registered) + len(failed) < len(problem.views):
+        candidates = _next_views(problem, partial, failed)[: config.candidates]
+        resect = functools.partial(registration_resection.resect, problem, partial, config=config.resection)
+        tried = dict(zip(candidates, map_parallel(resect, candidates), strict=True))
+        found: dict[int, Resection] = {view: resected for view, resected in tried.items() if resected is not None}
+        failed |= tried.keys() - found.keys()
+        if not found:
+            continue
+        best = max(found, key=lambda view: (found[view].inlier_ratio, -view))
+        estimate = bundle_adjustment.replace_pose(partial.estimate, best, found[best].rotation, found[best].translation)
+        larger = replace(partial, estimate=estimate, registered=(*partial.registered, best))
+        partial = adjust_quickly(problem, larger, _NEW_VIEW_TOLERANCE, config)
+        failed.clear()  # The new view brings new points, from which others may now be resected.
+    return partial
+
+
+def _next_views(problem: MapperInput, partial: PartialMap, failed: set[int]) -> list[int]:
+    """The views that are not registered and have not failed; those that observe most of the map's points first."""
+    tracks = problem.growing_tracks
+    in_map = np.isin(tracks.track_of, partial.track_of_point)
+    counts = np.bincount(tracks.camera_of[in_map], minlength=len(problem.views))
+    waiting = [view for view in range(len(problem.views)) if view not in partial.registered and view not in failed]
+    return sorted(waiting, key=lambda view: (-counts[view], view))
+
+
+def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> PartialMap:
+    """The map after views with low inlier ratios have been removed and resected, where that raises the score.
+
+    First all of them at once, because misplaced views may support each other; then one after the other.
+    """
+    doubtful = _incremental_find_doubtful_views(problem, partial, config)
+    for group in [doubtful, *([view] for view in doubtful)]:
+        rest = tuple(view for view in partial.registered if view not in group)
+        if not group or len(rest) < _MIN_VIEWS:
+            continue
+        without = adjust_quickly(problem, replace(partial, registered=rest), SETTLED_TOLERANCE, config)
+        if len(without.estimate.points) < config.min_points:
+            continue
+        again = extend(problem, without, config)
+        limit = config.triangulation.max_error_px
+        if score(problem, again, limit) > _MIN_IMPROVEMENT * score(problem, partial, limit):
+            partial = again
+    return partial
+
+
+def _incremental_find_doubtful_views(
+    problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig
+) -> list[int]:
+    """The registered views with an inlier ratio below `min_view_ratio`, the lowest first."""
+    ratios = registration_resection.inlier_ratios(problem, partial, config.triangulation.max_error_px)
+    of_view = {
+        view: registration_resection.compute_pooled_ratio(ratios, problem.pairs, view) for view in partial.registered
+    }
+    return sorted((view for view in of_view if of_view[view] < config.min_view_ratio), key=lambda view: of_view[view])
+
+
+# The last adjustment of a map: more tracks, subpixel observations, lenses as free as their priors leave them.
+
+Flags = npt.NDArray[np.bool_]
+
+_ROBUST_PER_MEDIAN = 3.0  # scale of the robust loss over the median error
+_TOLERANCES = (3.0, 2.0, 1.0)  # of observations, in one adjustment after the other: multiples of `max_error_px`
+_REFINED_ADJUSTMENTS = 3  # with subpixel observations; each drops outliers, and the next one fits better
+_WIDEST_RADIAL = 0.3  # prior standard deviation of a radial coefficient before observations tell how large it is
+_MIN_OBSERVATIONS = 6  # of a registered camera: three fix a pose, twice as many check it
+
+
+class FinalAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
+    subpixel: subpixel.SubpixelConfig = subpixel.SubpixelConfig()
+    min_points: int = 15  # points that a map needs
+    # Smallest and largest scale of the robust loss, pixels at REFERENCE_SIDE
+    robust_range_px: tuple[float, float] = (0.15, 1.5)
+    # So many observations tell as much as one with an error of its own, because what lens, shutter and scene do
+    # otherwise than the model moves whole regions alike. With this number, errors of real cameras are as large as
+    # their sigmas say (tests/bench/quality/poses.py).
+    correlated: float = 100.0
+    # Prior standard deviation of the radial coefficient of a lens that is not calibrated, where pictures tell little
+    radial_sigma: float = 0.02
+    shift_sigma: float = 0.004  # that of its principal point, as a share of the longer side
+
+
+@dataclass(frozen=True, eq=False)
+class FinalMap:
+    """A map after its last adjustment."""
+
+    map: PartialMap
+    loss: bundle_adjustment.BundleAdjustmentConfig  # of that adjustment
+    rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
+
+
+def run_final_adjustment(
+    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: FinalAdjustmentConfig
+) -> FinalMap | None:
+    """The map of the final tracks, adjusted until it has settled, or None when too few points are left.
+
+    `images`, one a view, give subpixel observations; where there are none, the features' positions are kept.
+    """
+    partial = replace(partial, prior=_free_lenses(problem, partial.prior, config))
+    for tolerance in _TOLERANCES:
+        partial = _adjust_final_tracks(problem, partial, tolerance, config)
+        if len(partial.estimate.points) < config.min_points:
+            return None
+    bending = _find_distorting_lenses(problem, partial.estimate)
+    if bending.any():
+        partial = _adjust_final_tracks(problem, _free_second_radial(partial, bending), _TOLERANCES[-1], config)
+        if len(partial.estimate.points) < config.min_points:
+            return None
+    if images:
+        refined = subpixel.refine(partial.estimate, partial.registered, images, config.subpixel)
+        if len(refined.points) >= config.min_points and _has_enough_observations(refined, partial.registered):
+            partial = replace(partial, estimate=refined)
+            for _ in range(_REFINED_ADJUSTMENTS):
+                partial = _fit_radial_prior(_adjust_and_filter(problem, partial, config), config)
+    loss, errors = _loss(problem, partial.estimate, config), _errors(problem, partial.estimate)
+    return FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))))
+
+
+def _adjust_final_tracks(
+    problem: MapperInput, partial: PartialMap, tolerance: float, config: FinalAdjustmentConfig
+) -> PartialMap:
+    """The map after an adjustment to the final tracks, its lenses held by what it found of them."""
+    loss = _loss(problem, partial.estimate, config)
+    adjusted = adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
+    return _fit_radial_prior(adjusted, config)
+
+
+def _free_lenses(
+    problem: MapperInput, prior: bundle_adjustment.LensPrior, config: FinalAdjustmentConfig
+) -> bundle_adjustment.LensPrior:
+    """The prior with distortion and principal point free for all lenses that are not calibrated."""
+    unknown = prior.sigmas > 0
+    radial_sigmas = np.column_stack([_WIDEST_RADIAL * unknown, np.zeros(len(unknown))])
+    least = config.shift_sigma * _longer_sides(problem) * unknown
+    return replace(prior, radial_sigmas=radial_sigmas, shift_sigmas=np.maximum(prior.shift_sigmas, least))
+
+
+def _longer_sides(problem: MapperInput) -> Array:
+    """(G,) of each lens' largest picture, pixels."""
+    lenses = range(len(problem.lenses))
+    sides = (max((view.longer_side for view in problem.views if view.lens == g), default=1) for g in lenses)
+    return np.array(list(sides), np.float64)
+
+
+def _fit_radial_prior(partial: PartialMap, config: FinalAdjustmentConfig) -> PartialMap:
+    """The map with a prior under which a radial coefficient is as likely as it was found, or as `config` has it.
+
+    A prior as wide as what is found lets a coefficient stay where observations tell it to within half of what it is;
+    any other falls, adjustment by adjustment, to where `config` holds it (MacKay, "Bayesian interpolation", 1992).
+    """
+    found = np.maximum(np.abs(partial.estimate.radials), config.radial_sigma)
+    sigmas = np.where(partial.prior.radial_sigmas > 0, found, 0.0)
+    return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
+
+
+def _find_distorting_lenses(problem: MapperInput, estimate: bundle_adjustment.Problem) -> Flags:
+    """(G,) the lenses whose distortion moves the corners of their pictures by more than LEAST_SHIFT."""
+    focals = np.exp(estimate.log_focals) / _longer_sides(problem)
+    corners = CORNER / focals
+    return np.abs(distortion(corners**2, estimate.radials) - 1.0) * corners * focals > LEAST_SHIFT
+
+
+def _free_second_radial(partial: PartialMap, lenses: Flags) -> PartialMap:
+    """The map with the second coefficient free of those of the `lenses` (G,) whose first one is."""
+    sigmas = partial.prior.radial_sigmas.copy()
+    sigmas[lenses & (sigmas[:, 0] > 0), 1] = _WIDEST_RADIAL
+    return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
+
+
+def _loss(
+    problem: MapperInput, estimate: bundle_adjustment.Problem, config: FinalAdjustmentConfig
+) -> bundle_adjustment.BundleAdjustmentConfig:
+    """The scale of the robust loss and the noise of an observation, from the residuals."""
+    scale = float(np.median(problem.scale))
+    if len(estimate.points) == 0:
+        return bundle_adjustment.BundleAdjustmentConfig(robust_px=scale * config.robust_range_px[1])
+    median = float(np.median(_errors(problem, estimate)))
+    noise_px = bundle_adjustment.noise_px(len(estimate.pixels), len(estimate.points), median)
+    return bundle_adjustment.BundleAdjustmentConfig(
+        robust_px=scale * float(np.clip(_ROBUST_PER_MEDIAN * median, *config.robust_range_px)),
+        noise_px=scale * noise_px * float(np.sqrt(config.correlated)),
+    )
+
+
+def _adjust_and_filter(problem: MapperInput, partial: PartialMap, config: FinalAdjustmentConfig) -> PartialMap:
+    """The map after a bundle adjustment, without observations with large errors and points with fewer than two."""
+    loss = _loss(problem, partial.estimate, config)
+    estimate = bundle_adjustment.adjust(partial.estimate, partial.prior, loss, partial.registered[0])
+    good = _errors(problem, estimate) < config.triangulation.max_error_px
+    good &= np.bincount(estimate.point_of[good], minlength=len(estimate.points))[estimate.point_of] >= 2
+    kept, point_of = np.unique(estimate.point_of[good], return_inverse=True)
+    filtered = replace(
+        estimate,
+        points=estimate.points[kept],
+        camera_of=estimate.camera_of[good],
+        point_of=point_of,
+        pixels=estimate.pixels[good],
+    )
+    return replace(partial, estimate=filtered if _has_enough_observations(filtered, partial.registered) else estimate)
+
+
+def _has_enough_observations(estimate: bundle_adjustment.Problem, registered: Sequence[int]) -> bool:
+    """Whether every registered camera has enough observations for its pose, or a given pose that holds it."""
+    enough = np.bincount(estimate.camera_of, minlength=len(estimate.rotations)) >= _MIN_OBSERVATIONS
+    if estimate.given is not None:
+        enough |= estimate.given.is_held
+    return bool(enough[list(registered)].all())
+
+
+def _errors(problem: MapperInput, estimate: bundle_adjustment.Problem) -> Array:
+    """(O,) reprojection errors, pixels at REFERENCE_SIDE."""
+    return bundle_adjustment.reprojection_errors(estimate) / problem.scale[estimate.camera_of]
+
+
+_MAX_SPLITS = 4  # rounds in which views get lenses of their own
+_MAX_DOUBTED = 8  # views for which other focal lengths are tried at once
+_DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
+_COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
+_UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
+
+
+class MapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    incremental: IncrementalMapperConfig = IncrementalMapperConfig()
+    finishing: FinalAdjustmentConfig = FinalAdjustmentConfig()
+    max_growing_tracks: int = 350  # tracks of a view, while views are added; more take time and change no decision
+    max_final_tracks: int = 1500  # tracks of a view, in the last adjustment
+    max_attempts: int = 6  # combinations of first pair and focal length that are tried
+    score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
+    same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map
+    same_focal: float = 0.02  # largest difference of the log focals of two such attempts
+    own_lenses: own_lenses.OwnLensesConfig = own_lenses.OwnLensesConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """Registered views and points. `estimate` has all views of the problem as cameras; only `views` are valid."""
+
+    views: tuple[int, ...]  # the registered ones; the first is the camera that adjustments fixed
+    estimate: bundle_adjustment.Problem
+    prior: bundle_adjustment.LensPrior
+    loss: bundle_adjustment.BundleAdjustmentConfig
+    inlier_ratios: dict[Pair, float]  # the share of each pair's matches that agree with the poses
+    median_angle_deg: float  # of the points' triangulation angles
+    rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
+    num_common: int  # lenses that views were taken to share: those from this number on are of single views
+
+    def relabel(self, number: Sequence[int]) -> Map:
+        """The same map with the views relabelled: new = number[old], a permutation."""
+        old, new = np.argsort(number), np.asarray(number)
+        relabelled = replace(
+            self.estimate,
+            rotations=self.estimate.rotations[old],
+            translations=self.estimate.translations[old],
+            lens_of_camera=self.estimate.lens_of_camera[old],
+            given=None if self.estimate.given is None else self.estimate.given.relabel(old),
+            camera_of=new[self.estimate.camera_of],
+        )
+        ratios = {
+            (int(min(new[i], new[j])), int(max(new[i], new[j]))): ratio for (i, j), ratio in self.inlier_ratios.items()
+        }
+        return replace(
+            self,
+            views=tuple(int(new[view]) for view in self.views),
+            estimate=relabelled,
+            inlier_ratios=dict(sorted(ratios.items())),
+        )
+
+
+def build_map(
+    views: Sequence[MapperView],
+    lenses: Sequence[Lens],
+    pairs: Pairs,
+    config: MapperConfig,
+    images: Sequence[PatchImage] = (),
+    pause: Callable[[], None] = lambda: None,
+) -> Map | None:
+    """The best map of several attempts, or None when no two views can be registered.
+
+    `images`, one a view, make its observations exact to a tenth of a pixel. `pause` is called between attempts and may
+    raise to abandon the work.
+    """
+    problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
+    attempts: list[tuple[float, PartialMap]] = []
+    for first, focals in _starts(lenses, pairs, config.max_attempts):
+        pause()
+        partial = grow(problem, focals, first, config.incremental)
+        if partial is None:
+            continue
+        found_again = bool(attempts) and _is_same_map(max(attempts, key=_score)[1], partial, config)
+        attempts.append((score(problem, partial, config.score_px), partial))
+        if found_again and len(partial.registered) == len(views):
+            break
+    if not attempts:
+        return None
+    pause()
+    _, best = max(attempts, key=_score)
+    finished = run_final_adjustment(problem, best, images, config.finishing)
+    if finished is None:
+        return None
+    problem, finished = give_own_lenses(problem, finished, images, config, pause)
+    return make_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
+
+
+def give_own_lenses(
+    problem: MapperInput,
+    finished: FinalMap,
+    images: Sequence[PatchImage],
+    config: MapperConfig,
+    pause: Callable[[], None] = lambda: None,
+) -> tuple[MapperInput, FinalMap]:
+    """Both, with lenses of their own for the views that refute the common one.
+
+    First for views that hardly fit and fit better with another focal length, then for those whose observations say so.
+    """
+    searches = [_try_other_focals, _try_coarse_lenses]
+    for _ in range(_MAX_SPLITS):
+        pause()
+        before = finished
+        for search in searches if _find_doubtful_views(problem, finished.map, config) else ():
+            found = search(problem, finished.map, config)
+            again = None if found is None else run_final_adjustment(*found, images, config.finishing)
+            if found is None or again is None:
+                continue
+            if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
+                problem, finished = found[0], again
+        searches = [_try_other_focals]
+        freed = own_lenses.free_lenses(problem, finished.map, finished.loss, config.own_lenses)
+        if freed.refuting_views.any() or freed.displaced.any():
+            apart, partial = own_lenses.split_lenses(problem, finished.map, freed, config.own_lenses)
+            again = run_final_adjustment(apart, partial, images, config.finishing)
+            if again is not None:
+                problem, finished = apart, again
+        if finished is before:
+            break
+    return problem, finished
+
+
+def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> list[int]:
+    """The views that are not registered, or whose matches hardly fit; those first that fit least."""
+    ratios = registration_resection.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
+    of_view = {
+        view: registration_resection.compute_pooled_ratio(ratios, problem.pairs, view)
+        if view in partial.registered
+        else 0.0
+        for view in range(len(problem.views))
+    }
+    return sorted((view for view in of_view if of_view[view] < _DOUBTED_RATIO), key=lambda view: (of_view[view], view))
+
+
+def _try_coarse_lenses(
+    problem: MapperInput, partial: PartialMap, config: MapperConfig
+) -> tuple[MapperInput, PartialMap] | None:
+    """Both, with own lenses as a coarse search finds them; None where it finds none."""
+    scale = float(np.median(problem.scale))
+    noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
+    loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=scale * _COARSE_ROBUST_PX, noise_px=noise_px)
+    freed = own_lenses.free_lenses(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
+    if not (freed.refuting_views.any() or freed.displaced.any()):
+        return None
+    problem, partial = own_lenses.split_lenses(problem, partial, freed, config.own_lenses)
+    partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
+    if len(partial.estimate.points) < config.incremental.min_points:
+        return None
+    return problem, extend(problem, partial, config.incremental)
+
+
+def _try_other_focals(
+    problem: MapperInput, partial: PartialMap, config: MapperConfig
+) -> tuple[MapperInput, PartialMap] | None:
+    """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits."""
+    zoomed = {}
+    for view in _find_doubtful_views(problem, partial, config)[:_MAX_DOUBTED]:
+        # Points that the view helped to place where it does not belong must not speak for it.
+        registered = tuple(each for each in partial.registered if each != view)
+        if len(registered) < 2:
+            continue
+        rest = replace(partial, registered=registered)
+        rest = adjust_quickly(problem, rest, SETTLED_TOLERANCE, config.incremental)
+        if len(rest.estimate.points) < config.incremental.min_points:
+            continue
+        focal = registration_resection.own_focal(problem, rest, view, config.incremental.resection)
+        if focal is not None:
+            zoomed[view] = focal
+    if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
+        return None
+    for view, focal in zoomed.items():
+        problem, partial = own_lenses.add_lens(problem, partial, view, focal)
+    partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
+    if len(partial.estimate.points) < config.incremental.min_points:
+        return None
+    return problem, extend(problem, partial, config.incremental)
+
+
+def _score_of(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> float:
+    return score(problem, partial, config.score_px)
+
+
+def _score(attempt: tuple[float, PartialMap]) -> float:
+    return attempt[0]
+
+
+def _is_same_map(one: PartialMap, other: PartialMap, config: MapperConfig) -> bool:
+    """Whether two attempts registered the same views with the same poses and focal lengths."""
+    if set(one.registered) != set(other.registered):
+        return False
+    rotation_deg, log_focal = mapping_problem.difference(one, other)
+    return rotation_deg < config.same_rotation_deg and log_focal < config.same_focal
+
+
+def _starts(lenses: Sequence[Lens], pairs: Pairs, limit: int) -> list[tuple[Pair, list[float]]]:
+    """First pairs with focal lengths (one a lens), the likeliest of both first."""
+    first = _first_pairs(pairs)
+    num_focals = max(len(lens.focals) for lens in lenses)
+    focals = [[lens.focals[min(choice, len(lens.focals) - 1)] for lens in lenses] for choice in range(num_focals)]
+    order = sorted(itertools.product(range(len(first)), range(num_focals)), key=lambda ranks: (sum(ranks), ranks[0]))
+    return [(first[pair], focals[choice]) for pair, choice in order[:limit]]
+
+
+def _first_pairs(pairs: Pairs) -> list[Pair]:
+    """The pairs, those first that have many matches which neither a plane nor a rotation explains."""
+
+    def strength(key: Pair) -> float:
+        pair = pairs[key]
+        count = len(pair.matches)
+        degenerate = min(1.0, max(pair.num_homography, pair.num_rotation) / count)
+        return count * (_UNEXPLAINED_BY_PLANE - degenerate) ** 0.5
+
+    return sorted(pairs, key=lambda key: (-strength(key), key))
+
+
+def make_map(problem: MapperInput, finished: FinalMap, max_error_px: float, num_common: int) -> Map:
+    """The finished map with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
+    partial, estimate = finished.map, finished.map.estimate
+    angles = triangulation.largest_angles(
+        bundle_adjustment.centres(estimate), estimate.points, estimate.camera_of, estimate.point_of
+    )
+    return Map(
+        views=partial.registered,
+        estimate=estimate,
+        prior=partial.prior,
+        loss=finished.loss,
+        inlier_ratios=registration_resection.inlier_ratios(problem, partial, max_error_px),
+        median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
+        rms_px=finished.rms_px,
+        num_common=num_common,
+    )

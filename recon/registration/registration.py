@@ -1,0 +1,341 @@
+"""Registration: from keyframes and their verified pairs to cameras and sparse points, with their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
+from splatnode.recon.geometry import undistort_rays
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import (
+    bundle_adjustment,
+    incremental_mapper,
+    known_poses,
+    mapping_problem,
+    own_lenses,
+    self_calibration,
+)
+from splatnode.recon.registration.known_poses import GivenWorld
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
+from splatnode.recon.registration.self_calibration import Grouping
+from splatnode.recon.registration.subpixel import PatchImage, patch_image
+
+# The configuration of registration: the lenses, and the mapper.
+
+
+class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    lenses: self_calibration.LensGroupingConfig = self_calibration.LensGroupingConfig()
+    mapper: incremental_mapper.MapperConfig = incremental_mapper.MapperConfig()
+    # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
+    # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
+    trust_poses: bool = False
+
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+_DISPLACED = 0.0045  # of the longer side: a wider prior of a principal point was widened by what was found
+_MIN_DEPTH = 1e-9  # median depth of the points, in the map's unit of length, in place of 0
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredCamera:
+    """The estimated camera of a frame, in pixels of the frame at full size."""
+
+    index: int  # position among the keyframes
+    T_world_camera: Array  # (4, 4)
+    lens: int  # cameras with the same number share a lens, relative to their longer side
+    focal: float  # pixels
+    principal: Array  # (2,) pixels
+    radial: Array  # (2,) coefficients of r^2 and r^4 in the lens' distortion, as bundle.py has them
+    rotation_sigma_deg: float  # after the best similarity; infinite where nothing is known
+    centre_sigma_rel: float  # over the spread of the centres, after the best similarity; infinite likewise
+    # (3, 3) of the centre, after the best similarity, in the frame and the squared unit of the world; NaN likewise
+    centre_covariance: Array
+    aspect: float = 1.0  # focal length down over that across
+    own_lens: bool = False  # the lens that it was taken to share, or that was given, is refuted
+    near_lens: int = -1  # the lens whose focal length it has to within `own_lenses.focal_sigma`; -1: its own alone
+    displaced: bool = False  # the principal point is not where it was taken to be
+    focal_sigma: float = np.inf  # of log focal; infinite where nothing is known
+
+    @property
+    def focals(self) -> Array:
+        """(2,) across and down, pixels."""
+        return self.focal * np.array([1.0, self.aspect])
+
+    def normalise(self, pixels: Array) -> Array:
+        """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the frame at full size."""
+        return undistort_rays((pixels - self.principal) / self.focals, np.tile(self.radial, (len(pixels), 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Cameras and sparse points. The world is the first camera's frame; the median depth of the points is 1."""
+
+    cameras: tuple[RegisteredCamera, ...]  # in the order of the keyframes
+    points: Array  # (P, 3) world
+    observed_by: npt.NDArray[np.int64]  # (O,) keyframe index
+    observed_point: npt.NDArray[np.int64]  # (O,)
+    observed_pixels: Array  # (O, 2) full-size pixels
+    inlier_ratios: dict[tuple[int, int], float]  # the share of each pair's matches that agree with the poses
+    focal_sigma: float  # of the logarithm of the least certain focal length; infinite where nothing is known
+    median_angle_deg: float  # of the points' triangulation angles
+    rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
+    given: GivenWorld | None = None  # the world of given poses that held cameras; None: none did
+
+
+def register(
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    config: RegistrationConfig,
+    pause: Callable[[], None] = lambda: None,
+) -> Registration | None:
+    """The cameras of as many keyframes as can be registered together, or None when no two can.
+
+    `pairs` holds the verified pairs by position (i < j). The result does not depend on the order of the keyframes.
+    `pause` is called between steps and may raise to abandon the work.
+    """
+    if not pairs:
+        return None
+    order = sort_by_content(keyframes)
+    ordered = [keyframes[index] for index in order]
+    rank = np.argsort(order)
+    built = _build(ordered, relabel_pairs(pairs, rank), config, pause)
+    if built is None:
+        return None
+    found, grouping = built
+    return make_registration(found.relabel(order), keyframes, [grouping.scales[i] for i in rank], config)
+
+
+def sort_by_content(keyframes: Sequence[Keyframe]) -> list[int]:
+    """Positions of the keyframes in the order in which they are registered, which is not that of their arrival."""
+    return sorted(range(len(keyframes)), key=lambda index: content_key(keyframes[index]))
+
+
+def relabel_pairs(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
+    """The pairs, sorted, with keyframes relabelled: keyframe i becomes keyframe `new[i]`."""
+    found = {}
+    for (i, j), pair in pairs.items():
+        first, second = int(new[i]), int(new[j])
+        found[min(first, second), max(first, second)] = pair if first < second else pair.swap()
+    return dict(sorted(found.items()))
+
+
+def _build(
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    config: RegistrationConfig,
+    pause: Callable[[], None],
+) -> tuple[incremental_mapper.Map, Grouping] | None:
+    """The map, in the pixels of its lenses, and their grouping: one lens for all sizes unless the map disagrees."""
+    together, apart = (self_calibration.group(keyframes, across_sizes) for across_sizes in (True, False))
+    built = _map(keyframes, pairs, together, config, pause)
+    if built is None or together == apart:
+        return None if built is None else (built, together)
+    if not self_calibration.sizes_disagree(
+        built.estimate, built.prior, built.loss, built.views[0], together, config.lenses
+    ):
+        return built, together
+    built = _map(keyframes, pairs, apart, config, pause)
+    return None if built is None else (built, apart)
+
+
+def _map(
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    grouping: Grouping,
+    config: RegistrationConfig,
+    pause: Callable[[], None],
+) -> incremental_mapper.Map | None:
+    """The map of keyframes with the lenses of `grouping`, in the pixels of these."""
+    images = patch_images(keyframes, grouping, config)
+    known = self_calibration.candidates(keyframes, grouping, pairs, config.lenses)
+    views, scaled = make_views(keyframes, grouping), convert_to_lens_pixels(pairs, grouping)
+    return incremental_mapper.build_map(views, known, scaled, config.mapper, images, pause)
+
+
+def patch_images(keyframes: Sequence[Keyframe], grouping: Grouping, config: RegistrationConfig) -> list[PatchImage]:
+    """The keyframes' images in the pixels of their lenses, by which observations become exact."""
+    settings = config.mapper.finishing.subpixel.patch_image
+    return [
+        patch_image(keyframe.frame.image, principal_point(keyframe.frame), settings).rescale(grouping.scales[i])
+        for i, keyframe in enumerate(keyframes)
+    ]
+
+
+def make_views(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[MapperView]:
+    """The keyframes as the mapper sees them, in the pixels of their lenses."""
+    return [
+        MapperView(
+            points=grouping.scales[i] * (keyframe.features.points - principal_point(keyframe.frame)),
+            lens=grouping.lens_of[i],
+            longer_side=grouping.longer_side,
+        )
+        for i, keyframe in enumerate(keyframes)
+    ]
+
+
+def convert_to_lens_pixels(
+    pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping
+) -> dict[tuple[int, int], TwoView]:
+    """The pairs in the pixels of their frames' lenses."""
+    return {(i, j): pair.rescale(grouping.scales[i], grouping.scales[j]) for (i, j), pair in pairs.items()}
+
+
+def make_registration(
+    found: incremental_mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float], config: RegistrationConfig
+) -> Registration:
+    """The map in the frame of the first registered keyframe, scaled to a median point depth of 1.
+
+    `scales` are those of the keyframes: pixels of their lens, which the map is in, over their own pixels.
+    """
+    estimate = found.estimate
+    order = sorted(found.views)
+    sides = np.array([scale * longer_side(k.frame) for scale, k in zip(scales, keyframes, strict=True)])
+    doubted, prior = own_lenses.widen_lens_priors(estimate, found.prior, sides, config.mapper.own_lenses)
+    covariance = bundle_adjustment.covariance(doubted, prior, found.loss, found.views[0])
+    unit = 1.0 / max(known_poses.distance(estimate, order), _MIN_DEPTH)
+    rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
+    rotation_sigmas, centre_sigmas = bundle_adjustment.camera_sigmas(estimate, covariance, order)
+    covariances = unit**2 * rotation0 @ bundle_adjustment.centre_covariances(estimate, covariance, order) @ rotation0.T
+    focal_sigmas = bundle_adjustment.sigmas(covariance.log_focals)
+    cameras = []
+    for position, i in enumerate(order):
+        T_world_camera = np.eye(4)
+        T_world_camera[:3, :3] = rotation0 @ estimate.rotations[i].T
+        T_world_camera[:3, 3] = unit * (translation0 - T_world_camera[:3, :3] @ estimate.translations[i])
+        lens = estimate.lens_of_camera[i]
+        cameras.append(
+            RegisteredCamera(
+                index=i,
+                T_world_camera=T_world_camera,
+                lens=int(lens),
+                focal=float(np.exp(estimate.log_focals[lens])) / scales[i],
+                principal=principal_point(keyframes[i].frame) + estimate.shifts[lens] / scales[i],
+                radial=estimate.radials[lens].copy(),
+                rotation_sigma_deg=float(rotation_sigmas[position]),
+                centre_sigma_rel=float(centre_sigmas[position]),
+                centre_covariance=covariances[position],
+                aspect=float(estimate.aspects[lens]),
+                near_lens=own_lenses.find_common_lens(found.prior, int(lens), config.mapper.own_lenses),
+                displaced=bool(found.prior.shift_sigmas[lens] > _DISPLACED * sides[i]),
+                focal_sigma=float(focal_sigmas[i]),
+                own_lens=bool(lens >= found.num_common),
+            )
+        )
+    principal = np.stack([principal_point(keyframe.frame) for keyframe in keyframes])
+    camera_of = estimate.camera_of
+    return Registration(
+        cameras=tuple(cameras),
+        points=unit * (estimate.points @ rotation0.T + translation0),
+        observed_by=camera_of,
+        observed_point=estimate.point_of,
+        observed_pixels=estimate.pixels / np.array(scales)[camera_of, None] + principal[camera_of],
+        inlier_ratios=found.inlier_ratios,
+        focal_sigma=float(focal_sigmas[order].max()),
+        median_angle_deg=found.median_angle_deg,
+        rms_px=found.rms_px,
+    )
+
+
+# Continuation: further keyframes registered beside known cameras, quickly, until all can be registered anew.
+#
+# The known cameras start the map; new views are resected from the points that they share with them, and everything is
+# adjusted. No other first pair or focal length is tried and no patches are aligned, so that errors of the start
+# remain.
+
+
+def extend_registration(
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    start: Sequence[RegisteredCamera],
+    config: RegistrationConfig,
+) -> Registration | None:
+    """The cameras `start` and those of all keyframes that can be registered beside them; None where it fails.
+
+    `start` and `pairs` (i < j) number the keyframes by their positions. The world is as `register` has it.
+    """
+    grouping = _grouping(keyframes, start)
+    if grouping is None:
+        return None
+    known = self_calibration.candidates(keyframes, grouping, pairs, config.lenses)
+    views, scaled = make_views(keyframes, grouping), convert_to_lens_pixels(pairs, grouping)
+    max_tracks = config.mapper.max_growing_tracks
+    problem = mapping_problem.prepare(views, known, scaled, max_tracks, max_tracks)
+    first = _make_camera_map(keyframes, grouping, known, start)
+    problem, first = _add_own_lenses(problem, first, keyframes, grouping, start)
+    settings = config.mapper.incremental
+    partial = incremental_mapper.adjust_quickly(problem, first, incremental_mapper.SETTLED_TOLERANCE, settings)
+    if len(partial.estimate.points) < settings.min_points:
+        return None
+    finished = incremental_mapper.run_final_adjustment(
+        problem, incremental_mapper.extend(problem, partial, settings), (), config.mapper.finishing
+    )
+    if finished is None:
+        return None
+    problem, finished = incremental_mapper.give_own_lenses(problem, finished, (), config.mapper)
+    found = incremental_mapper.make_map(problem, finished, settings.triangulation.max_error_px, len(known))
+    return make_registration(found, keyframes, grouping.scales, config)
+
+
+def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) -> Grouping | None:
+    """The frames grouped by lens as the cameras `start` are; None where no grouping fits, or a lens has no camera."""
+    shared = [camera for camera in start if not camera.own_lens]
+    for across_sizes in (True, False):
+        grouping = self_calibration.group(keyframes, across_sizes)
+        if not shared:
+            return grouping if len(set(grouping.lens_of)) == 1 else None
+        lens_of = {(grouping.lens_of[camera.index], camera.lens) for camera in shared}
+        if len(lens_of) == len({now for now, _ in lens_of}) == len({then for _, then in lens_of}):
+            return grouping if len(lens_of) == len(set(grouping.lens_of)) else None
+    return None
+
+
+def _make_camera_map(
+    keyframes: Sequence[Keyframe], grouping: Grouping, known: Sequence[Lens], start: Sequence[RegisteredCamera]
+) -> PartialMap:
+    """A map of the known cameras without points, in the pixels of their lenses; only focal lengths are free."""
+    count, num_lenses = len(keyframes), len(known)
+    rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    log_focals, radials, shifts = np.zeros(num_lenses), np.zeros((num_lenses, 2)), np.zeros((num_lenses, 2))
+    for camera in sorted(start, key=lambda each: each.own_lens):
+        index, lens = camera.index, grouping.lens_of[camera.index]
+        rotations[index] = camera.T_world_camera[:3, :3].T
+        translations[index] = -rotations[index] @ camera.T_world_camera[:3, 3]
+        if camera.own_lens and log_focals[lens] != 0.0:
+            continue
+        log_focals[lens] = np.log(grouping.scales[index] * camera.focal)
+        radials[lens] = camera.radial
+        nominal = principal_point(keyframes[index].frame)
+        shifts[lens] = grouping.scales[index] * (camera.principal - nominal)
+    estimate = bundle_adjustment.make_empty_problem(
+        rotations, translations, np.array(grouping.lens_of), log_focals, radials, shifts
+    )
+    prior = bundle_adjustment.focal_prior(log_focals, np.array([lens.sigma for lens in known]))
+    return PartialMap(tuple(camera.index for camera in start), estimate, prior, np.zeros(0, np.int64))
+
+
+def _add_own_lenses(
+    problem: MapperInput,
+    first: PartialMap,
+    keyframes: Sequence[Keyframe],
+    grouping: Grouping,
+    start: Sequence[RegisteredCamera],
+) -> tuple[MapperInput, PartialMap]:
+    """Both, with lenses of their own for the known cameras that have one."""
+    registered = first.registered
+    for camera in start:
+        if not camera.own_lens:
+            continue
+        scale = grouping.scales[camera.index]
+        problem, first = own_lenses.add_lens(problem, first, camera.index, scale * camera.focal)
+        radials, shifts = first.estimate.radials.copy(), first.estimate.shifts.copy()
+        radials[-1] = camera.radial
+        shifts[-1] = scale * (camera.principal - principal_point(keyframes[camera.index].frame))
+        first = replace(first, estimate=replace(first.estimate, radials=radials, shifts=shifts))
+    return problem, replace(first, registered=registered)
