@@ -184,7 +184,8 @@ def _walk_folder(folder: Path, out: Path | None, seen: set[Path]) -> Iterator[Pa
             seen.add(place)
             try:
                 below = _below(path)
-            except OSError:
+            except OSError as error:
+                raise_shortage(error)
                 yield path
                 continue
             if below is None:

@@ -33,7 +33,7 @@ WRONG = (
     ("splatnode.capture.process.files", "splatnode.capture.frame"),
     ("splatnode.viewer.state", "splatnode.api.result"),
     ("splatnode.api.result", "splatnode.command_line"),
-    ("splatnode.recon.pipeline", "splatnode.recon.pipeline"),
+    ("splatnode.recon.replay_source", "splatnode.recon.pipeline"),
     ("splatnode.viewer.state", "splatnode.recon.scene.scene"),
     ("splatnode.viewer.text", "torch"),
     ("splatnode.recon.result.snapshot", "torch"),

@@ -83,8 +83,11 @@ HARMLESS = {
         "capture/process/files.py:remove_leftovers",
         "capture/process/files.py:write_atomically",
         "capture/process/files.py:_remove_if_empty",
+        "capture/process/python.py:_is_current",
         "capture/process/terminal.py:_is_closed_pipe",
         "capture/v4l2_device.py:close",
+        "recon/batch/batch.py:_is",
+        "recon/jobs/ray.py:_apply",
         "recon/result/export/result.py:remove_result",
         "recon/result/export/staged.py:_remove",
         "recon/result/export/staged.py:_write_files",
@@ -95,6 +98,7 @@ HARMLESS = {
         "capture/av.py:_decode",
         "capture/av.py:_packets",
         "capture/av.py:_packets_from",
+        "capture/lerobot/pyarrow.py:_answer",
     },
 }
 
