@@ -28,6 +28,8 @@ _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gi
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Previews: small JPEG images of what the camera sees now. Some may be lost on the way."""
+
     per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
     # At least so many, pixels; less than twice as many, since images are reduced by whole factors
     longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480
@@ -75,6 +77,8 @@ class Camera(Plugin):
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All that can be configured in the capture room, with defaults and units."""
+
     camera: Camera  # where frames come from: the kinds have options of their own, below
     quality: Limits = Limits()  # which frames are usable, and no copies
     selection: keyframe_selection.Config = keyframe_selection.Config()

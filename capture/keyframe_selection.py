@@ -48,6 +48,9 @@ Points = npt.NDArray  # (P, 1, 2) float32, as OpenCV has them
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keyframe selection: a frame of a stream is taken if it is usable and adds parallax or coverage; the reason is
+    given."""
+
     # Take all but unusable frames and copies: for photographs, each of which was taken on purpose
     every_frame: bool = False
     coverage: Share = 0.25  # take a frame when this share of the last keyframe's corners has left the image

@@ -258,6 +258,8 @@ _DOWN = np.array([0.0, 0.0, -1.0])  # in the world of the built-in captures
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The motion that wheels and an IMU of a camera in the built-in capture would report, with errors by chance."""
+
     # Error of each step from a photograph to the next, as a share of its length (root mean square)
     drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.02
     noise_deg: Annotated[float, msgspec.Meta(ge=0, le=90)] = (

@@ -100,6 +100,9 @@ _SEEN = "seen"  # a file with the number of the newest one that somebody has see
 
 
 class QuarantineConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keyframes that nobody takes: recon refused them, or the disk damaged them. Kept to be looked at, within a
+    bound."""
+
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 1000  # keyframes that are kept; beyond, the oldest goes
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 512  # their size, in 2^20 bytes; beyond, the oldest goes
 
@@ -209,6 +212,8 @@ def _number_in(path: Path) -> int:
 
 
 class SpoolConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keyframes on disk until recon has answered them: bounded, oldest first, whole or not there."""
+
     # None: $STATE_DIRECTORY, else $XDG_STATE_HOME/splatnode, else ~/.local/state/splatnode
     directory: Path | None = None
     # Keyframes that wait for recon; when there are so many, no further one is taken

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
-from splatnode.capture.process.config import MAX_NUMBER
+from splatnode.capture.process.config_text import MAX_NUMBER
 from splatnode.capture.process.terminal import show_waiting
 from splatnode.capture.process.text import sanitize_text
 

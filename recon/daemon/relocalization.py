@@ -41,6 +41,8 @@ DAMPING = 1e-9  # added to the normal matrix, which points in one line leave sin
 
 
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Relocalisation: where in the finished scene a preview was taken, and whether the camera has moved since."""
+
     every_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
     num_features: int = 2000  # of a preview, at most
     longer_side: int = 800  # of the preview in which features are found, pixels

@@ -20,6 +20,8 @@ REMEMBERED_REJECTED = 100  # frames of a stream: more of them change no verdict
 
 
 class ScreeningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Screening: copies, blank and blurred frames are left out before anything is computed from them."""
+
     limits: quality.Limits = quality.Limits()  # those of capture, which has screened live frames already
 
 

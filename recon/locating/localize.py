@@ -53,6 +53,8 @@ _OF_STRETCHED, _MORE_STRETCHED = (Reason.ELSEWHERE, Reason.INCONSISTENT), 1.25
 
 
 class LocalizationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Localization of a query image in a saved scene, or the reason why it cannot be said."""
+
     features: matching_features.FeatureConfig = matching_features.FeatureConfig()
     neighbours: matching_features.NearestNeighbourConfig = matching_features.NearestNeighbourConfig()
     posing: pose_candidates.PoseSearchConfig = pose_candidates.PoseSearchConfig()

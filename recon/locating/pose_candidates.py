@@ -166,6 +166,8 @@ _MIN_LENGTH = 1e-12
 
 
 class PoseSearchConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The pose on which most correspondences agree, for a lens that is known or has to be tried."""
+
     search_px: float = 6.0  # reprojection error of an inlier while the lens is not exact, pixels at REFERENCE_SIDE
     max_error_px: float = 3.0  # of an inlier in the end
     iterations: int = 10_000  # of RANSAC, at most: they do for 9 % inliers

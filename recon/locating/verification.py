@@ -330,6 +330,8 @@ def _refine_with_free_lens(judged: QueryContext, free: PoseEstimate, prior: Lens
 
 
 class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Checks of the camera that was found for a query image. Each check refuses by the evidence of its own."""
+
     max_log10_nfa: float = -12.0  # as of a pair of photographs (recon/matching/two_view.py)
     min_points: int = 15  # that agree, as of a view that is added to a map (recon/registration/resection.py)
     min_share_of_picture: float = 0.04  # that their hull covers: less may be a thing that stood elsewhere

@@ -34,6 +34,9 @@ Pair = tuple[int, int]
 
 
 class PairSelectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which pairs of keyframes are worth matching, so that the work grows with the keyframes and not with their
+    pairs."""
+
     exhaustive: int = 12  # keyframes up to which all pairs are matched
     partners: int = 8  # with which a keyframe is matched first: with 8 of 29, real sets were as exact as with all
     short_list: int = 24  # keyframes with similar codes that are matched at a glance, to choose the partners

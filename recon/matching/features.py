@@ -30,6 +30,8 @@ _SCORE_OFFSET = 16320  # `kOffset` of recon/core/match.cpp: keeps scores positiv
 
 
 class NearestNeighbourConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Mutual nearest neighbours with the ratio test (Lowe, 2004), in one native sweep over all descriptor pairs."""
+
     ratio: float = 0.85  # largest ratio of nearest to second-nearest distance; loose, because geometry decides later
 
 
@@ -145,6 +147,8 @@ _NO_BLUR = 0.01  # sigma, pixels, along the other side: OpenCV takes 0 for "as a
 
 
 class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Local features: many SIFT keypoints with RootSIFT descriptors, also of images with a simulated tilt."""
+
     num_features: int = 8000  # of an image, at most: the strongest
     contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
     max_longer_side: int = 1600  # larger images are shrunk before features are found, pixels

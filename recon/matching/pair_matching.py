@@ -77,6 +77,8 @@ log = logging.getLogger(__name__)
 
 
 class PairMatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Matching of two keyframes: descriptor matches, and the two-view geometry that verifies them."""
+
     nearest_neighbours: matching_features.NearestNeighbourConfig = matching_features.NearestNeighbourConfig()
     two_view: two_view.TwoViewConfig = two_view.TwoViewConfig()
     max_static_px: float = 1.0  # median motion below which matches may show the robot itself, pixels at REFERENCE_SIDE
@@ -197,6 +199,8 @@ def _estimate_geometry(
 
 
 class AffineSimulationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which pairs of keyframes are matched again with simulated tilts, which find more and take three times as long."""
+
     tilts: tuple[float, ...] = (
         1.6,
     )  # by which the image's width is divided; below 1, its height multiplied; none: no pair is matched again

@@ -38,6 +38,8 @@ class MovingObjectsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The configuration of matching: local features, which pairs are matched and how, which get simulated tilts."""
+
     features: features.FeatureConfig = features.FeatureConfig()
     candidates: candidates.PairSelectionConfig = candidates.PairSelectionConfig()
     pair_matching: matching_pair_matching.PairMatchingConfig = matching_pair_matching.PairMatchingConfig()

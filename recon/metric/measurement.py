@@ -82,6 +82,8 @@ class Baseline(NamedTuple):
 
 
 class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The size of a scene in metres, as it is configured."""
+
     baseline: Baseline | None = None  # two photographs and the metres between their cameras
     further_baselines: tuple[Baseline, ...] = ()  # more of them: they make the scale surer, and check one another
     # Standard deviation of each measured distance, as a share of it

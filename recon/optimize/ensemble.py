@@ -25,6 +25,8 @@ from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 
 
 class EnsembleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Ensemble: several scenes of the same photographs, and in the end one that agrees with all of them."""
+
     members: Annotated[int, Meta(ge=1)] = 1  # scenes that are refined; 1: that one, and nothing after it
     # Steps of the refinement after them, on photographs as often as on pseudo views; nothing is pruned any more
     iterations: Annotated[int, Meta(ge=1)] = 400
@@ -73,6 +75,8 @@ MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are 
 
 
 class DropoutConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Dropout of Gaussians whose depth is uncertain, so that none relies on another in front of it or behind it."""
+
     share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
     sure: float = 0.6  # least confidence of stereo at which the uncertainty is 0
     until: float = 0.7  # share of the refinement after which no Gaussian is left out

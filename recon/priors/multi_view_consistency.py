@@ -38,6 +38,8 @@ class Confidence:
 
 @dataclass(frozen=True)
 class ConsistencyConfig:
+    """Geometric consistency of depth maps: what other views confirm is kept, what nothing supports is left out."""
+
     max_error: float = 2.0  # forward-backward reprojection error of agreeing views, pixels
     max_relative_difference: float = 0.01  # largest difference of the depths of agreeing views, relative to the depth
     min_support: float = 0.12  # share of neighbours on the same plane that keeps a pixel which no other view confirms

@@ -86,6 +86,8 @@ class Problem:
 
 
 class BundleAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Bundle adjustment for few views: Levenberg-Marquardt on robust reprojection errors (Triggs et al., 2000)."""
+
     robust_px: float = 1.0  # scale of the Cauchy loss, pixels
     noise_px: float = 1.0  # standard deviation of an observation, pixels: its weight against the priors
     max_iterations: int = 40

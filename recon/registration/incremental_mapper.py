@@ -49,6 +49,8 @@ _MIN_VIEWS = 3  # that must stay when doubtful ones are removed
 
 
 class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Incremental mapping: a first pair, then one view after the other, with a bundle adjustment after each."""
+
     resection: registration_resection.ResectionConfig = registration_resection.ResectionConfig()
     triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
     robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
@@ -210,6 +212,8 @@ _MIN_OBSERVATIONS = 6  # of a registered camera: three fix a pose, twice as many
 
 
 class FinalAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The last adjustment of a map: more tracks, subpixel observations, lenses as free as their priors leave them."""
+
     triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
     subpixel: subpixel.SubpixelConfig = subpixel.SubpixelConfig()
     min_points: int = 15  # points that a map needs
@@ -364,6 +368,8 @@ _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so tha
 
 
 class MapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The map of few views: attempts with several first pairs and focal lengths, of which the best is kept."""
+
     incremental: IncrementalMapperConfig = IncrementalMapperConfig()
     finishing: FinalAdjustmentConfig = FinalAdjustmentConfig()
     max_growing_tracks: int = 350  # tracks of a view, while views are added; more take time and change no decision

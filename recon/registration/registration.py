@@ -29,6 +29,8 @@ from splatnode.recon.registration.subpixel import PatchImage, patch_image
 
 
 class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The configuration of registration: the lenses, and the mapper."""
+
     lenses: self_calibration.LensGroupingConfig = self_calibration.LensGroupingConfig()
     mapper: incremental_mapper.MapperConfig = incremental_mapper.MapperConfig()
     # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.

@@ -38,6 +38,8 @@ _MIN_SCALE_RATIO = 0.4  # share of the points that may fix the length of a trans
 
 
 class ResectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Resection (PnP): the pose of a view from a map's points and from its pairs with registered views."""
+
     max_error_px: float = 2.5  # largest error of an exact match, pixels at REFERENCE_SIDE
     min_points: int = 15  # 2D-3D inliers that a proposed pose needs
     min_inlier_ratio: float = 0.2  # share of the 2D-3D correspondences that must be inliers

@@ -65,6 +65,8 @@ _ROUNDING_PX = 1.0  # difference of the shorter sides of two frames of one shape
 
 
 class LensGroupingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Lenses: which frames share one, and what is known of it before anything is reconstructed."""
+
     exif_sigma: float = 0.05  # of log focal, from EXIF: nominal focal lengths are rounded, and focusing changes them
     voted_sigma: float = 0.3  # of log focal, when pairs of frames voted for it
     # Largest difference of log focals, adjusted for each size of frames of one shape by itself, with which all have one

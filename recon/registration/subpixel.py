@@ -30,6 +30,8 @@ MAX_RADIUS = 12  # pixels; `kMaxRadius` of recon/core/align.cpp
 
 
 class PatchAlignmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Affine alignment of image patches to parts of a pixel (Baker and Matthews, 2004)."""
+
     radius: int = 8  # of a patch, pixels; at most 12
     max_iterations: int = 20  # of Gauss-Newton, at most
 
@@ -104,6 +106,8 @@ class _Patches(ctypes.Structure):
 
 
 class PatchImageConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The image of a view as patches are taken from it: grey, smoothed, and of limited size."""
+
     max_longer_side: int = 1600  # larger images are shrunk, pixels
     blur_px: float = 0.7  # sigma of the smoothing, after shrinking: interpolation errs less in a smooth image
 
@@ -147,6 +151,8 @@ _MIN_ALONG_NORMAL = 1e-12  # component of a ray along a surface's normal, in pla
 
 
 class SubpixelConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Subpixel refinement of observations: patches of the map's points aligned in every view that may show them."""
+
     patch_alignment: PatchAlignmentConfig = PatchAlignmentConfig()
     patch_image: PatchImageConfig = PatchImageConfig()
     # Angles that are tried, of the surface's normal from the direction to the reference

@@ -90,6 +90,8 @@ _ROUNDS = 3  # of triangulation: the worst observation of a track is left out tw
 
 
 class TriangulationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Triangulation: scene points from their tracks and the cameras' poses."""
+
     max_error_px: float = 2.5  # reprojection error of a kept observation, pixels at REFERENCE_SIDE
     min_angle_deg: float = 1.0  # triangulation angle: the widest between two rays of a kept point
 

@@ -98,6 +98,8 @@ ADVICE = "Add photographs between these, a short step apart, so that each shows 
 
 
 class ConsistentDepthConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Multi-view consistent depth: how much of a scene was measured by several views, in words of a verdict."""
+
     # Share of the pixels with multi-view consistent depth below which the verdict calls views away from the cameras
     # guesses. Of 22 sets of real photographs the ten below it reach 18.1 dB on held-out views, at most 21.7, and the
     # twelve above it 22.8 dB (tests/bench/results/consistent_depth.json). 0: never

@@ -39,6 +39,9 @@ MIN_WIDENING = 1.1  # of the spacing in each attempt to have fewer Gaussians
 
 
 class BackgroundConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The far shell: Gaussians on a sphere around the scene, so that what no view has seen has the colours around
+    it."""
+
     spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
     margin: float = 2.0  # how far beyond the images' borders they are so near, in units of the images' size
     elsewhere_deg: float = 10.0  # between those in all other directions; 0: there are none
@@ -190,6 +193,8 @@ MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or fart
 
 
 class DepthCompletionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Depth completion: pixels that no two views confirm are filled where no view contradicts it, else left empty."""
+
     min_confidence: float = 0.12  # least confidence of stereo for a known depth; those below are doubtful
     min_usable_confidence: float = 0.1  # doubtful depths below tell less than their surroundings do: they are dropped
     colour_tolerance: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel

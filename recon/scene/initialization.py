@@ -126,6 +126,9 @@ ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
 
 
 class GaussianInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and
+    depth."""
+
     depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
     max_footprint_ratio: float = 1.5  # a pixel is redundant only beside a point whose footprint is at most this larger
     min_confidence: float = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
@@ -388,6 +391,8 @@ def spacing(points: npt.NDArray[np.float32], neighbours: int) -> npt.NDArray[np.
 
 
 class PixelwiseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Pixelwise seeding, a Gaussian a pixel: how InstantSplat and the paper start; our scenes are compared with it."""
+
     down_sampling: GaussianInitializationConfig = GaussianInitializationConfig(
         max_footprint_ratio=1e9
     )  # equations 14 to 17 as they are written

@@ -32,6 +32,9 @@ STEP = 1e-5  # of a rotation or a direction, radians, in differences
 
 
 class CycleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Cycle consistency: relative poses that single pairs find by themselves, against each other and the
+    registration."""
+
     min_matches: int = 40  # least matches of a pair that is used
     partners: int = 3  # of each frame, those with most matches
     max_matches: int = 400  # matches of a pair that are used; more make a relative pose no surer
@@ -167,6 +170,8 @@ Flags = npt.NDArray[np.bool_]
 
 
 class ReflectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Mirror images among the frames: do some look more like the others when they are turned left to right."""
+
     num_features: int = 1500  # of each frame, the strongest
     by_chance: float = 50.0  # matches of frames that have nothing in common, which say nothing
     partners: int = 4  # known frames with which a further one is compared, those that share most points with it

@@ -239,6 +239,8 @@ MIN_MATCHES = 60  # of a pair whose homography says something: fewer are explain
 
 
 class VerificationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The verification of a registration: evidence from sources that the fit did not use, or used otherwise."""
+
     tracks_per_camera: int = 300  # tracks of a camera in the bundle that is adjusted again
     cycles: consistency.CycleConfig = consistency.CycleConfig()
     reflection: consistency.ReflectionConfig = consistency.ReflectionConfig()

@@ -146,6 +146,8 @@ PACKAGE = "safetensors"  # reads them
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Depth Anything 3 as a prior: it proposes matches, and gives depth once it was told the verified cameras."""
+
     weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
     longer_side: int = 504  # of the network's images, pixels: what it was published with
     views_at_once: int = 12  # photographs that look at each other: memory and time grow with their square

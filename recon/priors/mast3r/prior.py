@@ -107,6 +107,8 @@ LICENCE = (
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """MASt3R as a prior: matches by its descriptors, depth by global alignment of its point maps."""
+
     weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
     longer_side: int = 512  # of the network's images, pixels: what it was trained with
     max_neighbours: int = 6  # places in the circle of frames: of up to 13 frames every pair is asked about

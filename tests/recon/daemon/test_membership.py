@@ -61,7 +61,7 @@ class FakeReconstruction:
         return self.estimate_quickly() or self.estimate_thoroughly(pause)
 
     def estimate_quickly(self) -> Any:
-        if self.proven == frozenset(self.names):
+        if self.publishable_names == frozenset(self.names):
             return self._estimated(("late", "far", "other") if self._called("late") < 2 else ("far", "other"))
         estimated = self._estimated(("late", "far", "other"))
         all_placed = len(estimated.publishable_camera_names) == len(self.names)
@@ -71,7 +71,7 @@ class FakeReconstruction:
         pause()
         estimated = self._estimated(("late", "far", "other") if self._called("late") < 2 else ("far", "other"), "worse")
         if estimated.verdict.publishable:
-            self.proven = frozenset(self.names)
+            self.publishable_names = frozenset(self.names)
         else:
             self.refusals.append(frozenset(self.names))
         return estimated
@@ -82,7 +82,7 @@ class FakeReconstruction:
     def _estimated(self, not_placed: tuple[str, ...], *spoiling: str) -> Any:
         verdict = Verdict(Code.OK, "", "", publishable=not any(map(self._called, ("bad", *spoiling))))
         placed = {name for name in self.names if not name.endswith(not_placed)} if verdict.publishable else set()
-        return SimpleNamespace(placed=placed, verdict=verdict)
+        return SimpleNamespace(publishable_camera_names=placed, verdict=verdict)
 
     def _components(self) -> list[list[int]]:
         others = [index for index, name in enumerate(self.names) if "other" in name]
@@ -109,7 +109,7 @@ def test_before_there_is_a_scene_every_keyframe_is_taken():
 def test_of_a_batch_only_the_keyframe_that_does_not_fit_at_once_is_set_aside():
     work = reconstruction("0", "1", "2")
     assert come(work, "3", "4-bad", "5", "6-far") == {"4-bad", "6-far"}
-    assert work.names == ["0", "1", "2", "3", "5"] and named(work.aside) == ["4-bad", "6-far"]
+    assert work.names == ["0", "1", "2", "3", "5"] and named(work.keyframes_deferred) == ["4-bad", "6-far"]
 
 
 def test_keyframes_that_only_all_together_have_a_place_join_the_scene():
@@ -117,7 +117,7 @@ def test_keyframes_that_only_all_together_have_a_place_join_the_scene():
     assert come(work, "3-late") == {"3-late"} and membership.has_links_to_deferred(work)
     assert membership.join(work, ["3-late"]) and named(membership.find_untracked(work)) == ["3-late"]
     assert come(work, "4-late") == {"4-late"} and named(membership.find_untracked(work)) == ["3-late", "4-late"]
-    assert membership.join(work, named(work.aside))
+    assert membership.join(work, named(work.keyframes_deferred))
     assert work.names == ["0", "1", "2", "3-late", "4-late"] and membership.find_untracked(work) == []
 
 
@@ -126,14 +126,14 @@ def test_what_was_refused_once_is_not_estimated_again_and_stays_aside():
     come(work, "3-bad")
     assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
     assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
-    assert named(work.aside) == ["3-bad"] and work.names == ["0", "1", "2"]
+    assert named(work.keyframes_deferred) == ["3-bad"] and work.names == ["0", "1", "2"]
 
 
 def test_frames_with_which_most_of_the_scene_has_no_place_do_not_join_it():
     work = reconstruction("0", "1", "2")
     come(work, "3-far")
     work.estimate_thoroughly = lambda pause: work._estimated(("0", "1"))  # of the scene, one of three is left
-    assert not membership.join(work, ["3-far"]) and named(work.aside) == ["3-far"]
+    assert not membership.join(work, ["3-far"]) and named(work.keyframes_deferred) == ["3-far"]
     work.estimate_thoroughly = lambda pause: work._estimated(("0",))
     assert membership.join(work, ["3-far"])
 
@@ -151,7 +151,7 @@ def test_only_the_last_strangers_in_a_row_count_and_those_before_contradict_the_
 def test_no_pair_leads_to_another_place():
     work = reconstruction("0", "1", "2")
     come(work, "3-other")
-    assert not membership.has_links_to_deferred(work) and named(work.aside) == ["3-other"]
+    assert not membership.has_links_to_deferred(work) and named(work.keyframes_deferred) == ["3-other"]
     come(work, "4-bad")
     assert membership.has_links_to_deferred(work)
 
@@ -160,7 +160,7 @@ def test_what_was_added_for_now_and_spoils_the_scene_is_found_when_all_is_proven
     work = reconstruction("0", "1", "2")
     assert come(work, "3", "4-worse", "5") == set()
     membership.verify_provisional(work)
-    assert work.names == ["0", "1", "2", "3", "5"] and named(work.aside) == ["4-worse"]
+    assert work.names == ["0", "1", "2", "3", "5"] and named(work.keyframes_deferred) == ["4-worse"]
     assert named(membership.find_contradicting(work)) == ["4-worse"]
 
 
@@ -169,7 +169,7 @@ def test_proof_brings_in_what_only_all_together_have_a_place_for():
     come(work, "3-late")
     come(work, "4-late")
     membership.verify_provisional(work)
-    assert membership.find_untracked(work) == [] and not work.aside
+    assert membership.find_untracked(work) == [] and not work.keyframes_deferred
 
 
 def test_proof_that_is_abandoned_changes_nothing():
@@ -181,7 +181,7 @@ def test_proof_that_is_abandoned_changes_nothing():
     come(work, "4-bad")
     with pytest.raises(InterruptedError):
         membership.verify_provisional(work, pause)
-    assert work.names == ["0", "1", "2", "3-worse"] and named(work.aside) == ["4-bad"]
+    assert work.names == ["0", "1", "2", "3-worse"] and named(work.keyframes_deferred) == ["4-bad"]
 
 
 def test_a_scene_that_was_never_proven_is_not_taken_apart():
@@ -214,7 +214,7 @@ def test_keyframes_that_only_each_other_join_are_a_place_of_their_own():
 
 def test_of_those_that_were_set_aside_too():
     work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
-    work.set_aside(["4-other", "5-other"])
+    work.defer_keyframes(["4-other", "5-other"])
     assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
     assert work.names == ["0", "1", "2", "3-other"]
 

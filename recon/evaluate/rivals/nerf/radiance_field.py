@@ -139,6 +139,8 @@ class Focal(nn.Module):
 
 
 class FitConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The joint optimisation of a radiance field and its cameras."""
+
     iterations: int = 1500
     checkpoints: tuple[int, ...] = (400,)
     rays: int = 384  # of one photograph, in each iteration
