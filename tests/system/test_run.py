@@ -53,6 +53,20 @@ def test_the_site_is_built_or_shown_to_this_machine_alone(calls):
     assert calls("docs", "--serve")[-1] == "-m mkdocs serve --strict --dev-addr 127.0.0.1:8000"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "given"),
+    [
+        ([], "-n 2 --dist loadfile -m not long"),
+        (["--all"], "-n 2 --dist loadfile"),
+        (["--all", "-m", "long", "-x"], "-n 2 --dist loadfile -m long -x"),
+        (["tests/recon/merging", "-x"], "tests/recon/merging -x"),
+        (["-k", "merging"], "-k merging"),
+    ],
+)
+def test_the_quick_tests_are_run_unless_others_are_named(calls, arguments, given):
+    assert calls("test", *arguments)[-1] == f"-m pytest -q {given}"
+
+
 def test_an_environment_that_is_set_up_is_left_alone(calls):
     assert any("pip install" in line for line in calls("demo"))
     again = calls("demo")
