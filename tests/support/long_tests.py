@@ -1,7 +1,7 @@
 """Which tests are long: the lines of long_tests.txt. `./run test` runs the others, `./run test --all` runs all.
 
 A line is a folder, a file or a test, from tests/ on, and the processor seconds that it takes, its processes included.
-`./run test --processor-times=FILE` measures them.
+`./run test --processor-times=FILE` measures them. Seconds with a `~` before are estimated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def parse_long_tests(text: str) -> tuple[LongTest, ...]:
 def _parse_line(line: str) -> LongTest:
     start, _, seconds = line.rpartition(" ")
     try:
-        return LongTest(start.strip(), float(seconds))
+        return LongTest(start.strip(), float(seconds.removeprefix("~")))
     except ValueError:
         raise ValueError(
             f"a line of {LIST.name} must be START SECONDS, such as `recon/test_cli.py::test_help 12`, is {line!r}"

@@ -71,7 +71,7 @@ def test_a_start_ends_where_a_name_ends(start, named):
 
 
 def test_a_line_is_a_start_and_seconds():
-    text = "# what takes long\n\nrecon/test_cli.py 12\nviewer/test_map.py::test_turn 1.5\n"
+    text = "# what takes long\n\nrecon/test_cli.py 12\nviewer/test_map.py::test_turn ~1.5\n"
     assert parse_long_tests(text) == (LongTest("recon/test_cli.py", 12), LongTest("viewer/test_map.py::test_turn", 1.5))
     with pytest.raises(ValueError, match="must be START SECONDS.*is 'recon/test_cli.py'"):
         parse_long_tests("recon/test_cli.py\n")
