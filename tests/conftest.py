@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests, and which of them are numerical."""
+"""Fixtures shared by all tests, and which of them are numerical, and which long."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pytest
 import torch
 from hypothesis import settings
 
-pytest_plugins = ["tests.support.skip_check"]
+from tests.support.long_tests import LIST, is_long, parse_long_tests
+
+pytest_plugins = ["tests.support.processor_times", "tests.support.skip_check"]
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -40,9 +42,12 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    long_tests = parse_long_tests(LIST.read_text(encoding="utf-8"))
     for item in items:
         if item.nodeid.startswith(tuple(f"tests/{start}" for start in NUMERICAL)):
             item.add_marker("numerical")
+        if is_long(item.nodeid.removeprefix("tests/"), long_tests):
+            item.add_marker("long")
 
 
 @pytest.fixture(scope="session")

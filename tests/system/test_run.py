@@ -58,6 +58,20 @@ def test_fuzzing_gets_its_options(calls):
     assert calls("fuzz", "--only", "writes")[-1] == "-m tests.fuzz --only writes"
 
 
+@pytest.mark.parametrize(
+    ("arguments", "given"),
+    [
+        ([], "-n 2 --dist loadfile -m not long"),
+        (["--all"], "-n 2 --dist loadfile"),
+        (["--all", "-m", "long", "-x"], "-n 2 --dist loadfile -m long -x"),
+        (["tests/recon/merging", "-x"], "tests/recon/merging -x"),
+        (["-k", "merging"], "-k merging"),
+    ],
+)
+def test_the_quick_tests_are_run_unless_others_are_named(calls, arguments, given):
+    assert calls("test", *arguments)[-1] == f"-m pytest -q {given}"
+
+
 def test_an_environment_that_is_set_up_is_left_alone(calls):
     assert any("pip install" in line for line in calls("demo"))
     again = calls("demo")
