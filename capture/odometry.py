@@ -139,7 +139,7 @@ class Motion:
 
 # Where an IMU says that down is.
 
-SIGMA_DEG = 2.0  # standard deviation where nobody tells any
+GRAVITY_SIGMA_DEG = 2.0  # standard deviation where nobody tells any
 _SHORTEST, _LONGEST = 1e-6, 1e6
 
 
@@ -151,7 +151,7 @@ class Gravity:
     """
 
     down: tuple[float, float, float]
-    sigma_deg: float = SIGMA_DEG  # standard deviation in each direction, degrees
+    sigma_deg: float = GRAVITY_SIGMA_DEG  # standard deviation in each direction, degrees
 
     def __post_init__(self) -> None:
         length = math.hypot(*self.down)

@@ -5,10 +5,12 @@ The call lies in a folder, `called` is the process, and the answer lies in the s
 
 from __future__ import annotations
 
+import io
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 from splatnode.capture.process import python
@@ -36,9 +38,25 @@ class Answer:
 
 
 def pack_call(work: Work) -> bytes:
-    """A call for any machine with this splatnode: where the function's module is found, its name, the function."""
+    """A call for any machine with this splatnode: where the modules of the call are found, the function's, the call."""
+    packed = io.BytesIO()
+    pickler = _Pickler(packed)
+    pickler.dump(work)
+    places = sorted(filter(None, {python.place_of(module) for module in pickler.modules}))
     module = getattr(work, "func", work).__module__
-    return b"".join(map(pickle.dumps, (python.place_of(module), module, work)))
+    return pickle.dumps(places) + pickle.dumps(module) + packed.getvalue()
+
+
+class _Pickler(pickle.Pickler):
+    """Notes the modules of all functions and classes that it writes."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file)
+        self.modules: set[str] = set()
+
+    def persistent_id(self, obj: object) -> None:
+        if isinstance(obj, (FunctionType, type)):
+            self.modules.add(obj.__module__)
 
 
 def write_call(call: bytes, folder: Path) -> Path:

@@ -36,9 +36,9 @@ def run_call(folder: Path) -> int:
 
 def module_of(call: IO[bytes]) -> str:
     """The name of the module of a call, which is found from here on; the function comes next in the file."""
-    place = pickle.load(call)
-    if place is not None and place not in sys.path:
-        sys.path.append(place)
+    for place in pickle.load(call):
+        if place not in sys.path:
+            sys.path.append(place)
     return pickle.load(call)
 
 

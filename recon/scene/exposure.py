@@ -142,7 +142,7 @@ def _compare_views(pair: tuple[int, int], source: _SampledView, target: _Sampled
 # solved from all pairs together with a gain for each photograph, by robust least squares of logarithms.
 
 
-BINS, MIN_SAMPLES = 8, 30  # of a pair's pixels, by how far the radii differ; and in each
+BINS, MIN_BIN_SAMPLES = 8, 30  # of a pair's pixels, by how far the radii differ; and in each
 GAIN_SIGMA, FALLOFF_SIGMA = 1.0, 2.0  # of their priors around 0
 MIN_PHOTOGRAPHS = 3  # fewer cannot contradict each other
 SIGMAS = 2.0  # standard deviations that a falloff must be above the least that is taken out
@@ -196,7 +196,7 @@ def _bins(shared: SharedPixels) -> list[_Bin]:
     farther, logs = shared.radii[:, 0] - shared.radii[:, 1], shared.logs.mean(axis=1)
     found = []
     for own in np.array_split(np.argsort(farther, kind="stable"), BINS):
-        if len(own) < MIN_SAMPLES:
+        if len(own) < MIN_BIN_SAMPLES:
             continue
         log, sigma = median_log(logs[own])
         found.append(_Bin(shared.pair, float(log), float(farther[own].mean()), float(sigma)))

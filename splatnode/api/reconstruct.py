@@ -27,7 +27,7 @@ from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.odometry import SIGMA_DEG, GivenPose, Gravity, Motion, make_given_pose
+from splatnode.capture.odometry import GRAVITY_SIGMA_DEG, GivenPose, Gravity, Motion, make_given_pose
 from splatnode.capture.pose_files import create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
@@ -101,7 +101,7 @@ def gravity_of(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravit
     if down.shape != (3,):
         raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
     x, y, z = down.tolist()
-    return Gravity((x, y, z), SIGMA_DEG if sigma_deg is None else float(sigma_deg))
+    return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))
 
 
 def poses_given(

@@ -207,10 +207,10 @@ def test_signals_end_a_verb_cleanly(number, code):
 def test_the_second_signal_ends_a_process_at_once():
     program = (
         "import signal\n"
-        "from splatnode.capture.process import stop_signals\n"
+        "from splatnode.capture.process import system\n"
         "now = [0.0]\n"
-        "stop_signals.time.monotonic = lambda: now[0]\n"
-        "stop_signals.handle_first_signal((signal.SIGTERM, signal.SIGINT), lambda: print('stopping', flush=True))\n"
+        "system.time.monotonic = lambda: now[0]\n"
+        "system.handle_first_signal((signal.SIGTERM, signal.SIGINT), lambda: print('stopping', flush=True))\n"
         "for now[0], number in ((0.0, 15), (0.1, 15), (0.2, 2), (0.8, 2)):\n"
         "    signal.raise_signal(number)\n"
         "    print('goes on', flush=True)\n"

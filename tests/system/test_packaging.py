@@ -177,7 +177,7 @@ def test_run_names_the_command_where_python_is_too_old(bare_path, tmp_path):
 
 def test_run_names_the_command_where_venv_is_missing(bare_path, tmp_path):
     without = bare_path / "python3"
-    without.write_text('#!/bin/sh\ncase "$2" in *ensurepip*) exit 1;; esac\nexit 0\n')
+    without.write_text('#!/bin/sh\ncase "$*" in *ensurepip*) exit 1;; esac\nexit 0\n')
     without.chmod(0o755)
     result = run_script("demo", path=bare_path, venv=tmp_path / "venv")
     assert result.returncode == 69

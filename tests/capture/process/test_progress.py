@@ -157,4 +157,4 @@ def test_what_is_soon_there_is_not_waited_for(monkeypatch):
     ],
 )
 def test_a_step_in_words(step, said, announced):
-    assert (str(step), step.announced) == (said, announced)
+    assert (str(step), step.announcement) == (said, announced)

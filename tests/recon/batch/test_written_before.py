@@ -99,8 +99,8 @@ WHOLE = parquet(episode_index=[0], camera=["top"], verdict=["OK"])
 FOOTER = len(WHOLE) - 8 - int.from_bytes(WHOLE[-8:-4], "little")  # where it begins
 DAMAGED = WHOLE[:FOOTER] + bytes([255] * 50) + WHOLE[FOOTER + 50 :]
 FOREIGN = {
-    "is no Parquet": (b"no table", r"must be a table of cameras .* move it away, or mend it: cannot be read \("),
-    "breaks off": (WHOLE[:-20], "must be a table of cameras .* or mend it: cannot be read"),
+    "is no Parquet": (b"no table", r"must be a table of cameras .* move it away, or mend it: must be a Parquet file"),
+    "breaks off": (WHOLE[:-20], "must be a table of cameras .* or mend it: must be a Parquet file"),
     "is damaged": (DAMAGED, "must be a table of cameras .* or mend it: cannot be read"),
     "has other columns": (parquet(episode_index=[0], camera=["top"], mine=[1]), r"it has other columns \(mine\)"),
     "lacks a column": (parquet(episode_index=[0]), "it has no column camera"),

@@ -21,7 +21,7 @@ from tests.support.synthetic import photographs
 class Work:
     """What finishing needs of an IncrementalReconstruction."""
 
-    begun: str = "initial_scene"
+    initial_scene: str = "initial_scene"
     asked: list[training.RefinementConfig] = field(default_factory=list)
 
     def rebuild(self, pause: Callable[[], None]) -> None:
@@ -30,7 +30,7 @@ class Work:
     def refine(
         self, scene: str, steps: training.RefinementConfig, pause: Callable[[], None]
     ) -> Iterator[SceneWithVerdict]:
-        assert scene == self.begun
+        assert scene == self.initial_scene
         self.asked.append(steps)
         for _ in range(steps.steps):
             pause()

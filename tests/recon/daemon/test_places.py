@@ -281,7 +281,9 @@ def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, pee
     came += [rename_frame(frame, 4 + number, frame.name, 4 + number) for number, frame in enumerate(ours[3:])]
     aside: list[list[str]] = []
     monkeypatch.setattr(
-        ActiveSubmap, "export_provisionally", lambda place: aside.append([each.name for each in place._work.aside])
+        ActiveSubmap,
+        "export_provisionally",
+        lambda place: aside.append([each.name for each in place._work.keyframes_deferred]),
     )
     with running(replace(moving, max_views=5, export_every_s=NEVER_S)):
         for count, frame in enumerate(came, 1):

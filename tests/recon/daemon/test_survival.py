@@ -152,7 +152,7 @@ def test_what_the_camera_could_not_give_is_remembered_and_disturbs_no_scene(tmp_
 
 def test_what_there_is_no_memory_for_waits_until_there_is(tmp_path, monkeypatch, plain, impatient):
     with taking(ipc(tmp_path), tmp_path) as node:
-        for module, what in ((node.store, "put"), (ingest, "prepare")):
+        for module, what in ((node.store, "add_frame"), (ingest, "prepare")):
             real, failures = getattr(module, what), [MemoryError(), RuntimeError("can't allocate memory")]
 
             def short(*args, real=real, failures=failures):
@@ -220,7 +220,7 @@ def test_a_preview_that_makes_tracking_fail_is_one_preview(tmp_path, monkeypatch
     monkeypatch.setattr(
         relocalization,
         "compute_landmarks",
-        lambda *_: _raise(IndexError("none")) if where == "compute_landmarks" else None,
+        lambda *_: _raise(IndexError("none")) if where == "landmarks" else None,
     )
     monkeypatch.setattr(relocalization, "Tracker", Failing)
     camera = SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)

@@ -70,5 +70,5 @@ def test_the_table_says_what_is_lost():
 
 def test_the_chart_of_the_cases_is_a_picture():
     case_chart = pytest.importorskip("splatnode.recon.evaluate.charts", reason="matplotlib is not installed")
-    assert case_chart.draw([*ROWS, row("paper", 25.5, seed=1)])["cases.png"].startswith(b"\x89PNG")
-    assert case_chart.draw([r for r in ROWS if r.method == "fast"]) == {}
+    assert case_chart.draw_case_charts([*ROWS, row("paper", 25.5, seed=1)])["cases.png"].startswith(b"\x89PNG")
+    assert case_chart.draw_case_charts([r for r in ROWS if r.method == "fast"]) == {}

@@ -38,7 +38,7 @@ def test_the_papers_schedule_and_weights():
     weights = {name: loss.config.weight for name, loss in losses.items()}
     assert weights == {"point_render": 0.25, "depth": 0.05, "normal": 0.01, "semantic": 0.5}
     assert CONFIGS["paper"].optimize.iterations == 1000
-    assert [losses[name].config.at(0.1) > 0 for name in ("point_render", "depth")] == [True, False]
+    assert [losses[name].config.weight_at(0.1) > 0 for name in ("point_render", "depth")] == [True, False]
     without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularizers.RegularizerConfig())
     assert without == CONFIGS["instantsplat-xl"].optimize
 

@@ -73,7 +73,7 @@ def test_a_further_view_finds_depth_where_those_before_it_were_not_confirmed():
         assert pointmap.unchecked is not None and (pointmap.unchecked > 0).mean() > 0.95
         confirmed = np.zeros(pointmap.depth.shape, bool)
         confirmed[:, : SMALL.width // 4] = True
-        known[pointmap.name] = pointmap.masked(confirmed)
+        known[pointmap.name] = pointmap.apply_mask(confirmed)
     (further,) = prior.further_pointmaps(graph, registration, known)
     blind = {name: replace(pointmap, unchecked=None) for name, pointmap in known.items()}
     (without,) = prior.further_pointmaps(graph, registration, blind)

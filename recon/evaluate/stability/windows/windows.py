@@ -287,7 +287,7 @@ def _restore_plain_matches(graph: ViewGraph, known: Pieces) -> ViewGraph:
         done.add(pair)
         plain[first, second] = found
         if found.geometry is not None:
-            pairs[pair] = found.geometry if first < second else found.geometry.swapped()
+            pairs[pair] = found.geometry if first < second else found.geometry.swap()
     return replace(graph, pairs=pairs, plain=plain, pending=graph.pending - done)
 
 

@@ -80,13 +80,15 @@ def test_what_was_estimated_and_measured_comes_back_and_is_not_made_anew(store, 
     monkeypatch.setattr(again, "estimate_thoroughly", refuse)
     before, after = work.find_reconstruction(), again.find_reconstruction()
     assert (
-        after.verdict == before.verdict and after.evidence == before.evidence and again.publishable_names == work.proven
+        after.verdict == before.verdict
+        and after.evidence == before.evidence
+        and again.publishable_names == work.publishable_names
     )
     for one, other in zip(after.registration.cameras, before.registration.cameras, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera) and one.lens == other.lens
     assert after.registration.inlier_ratios == before.registration.inlier_ratios
     assert np.array_equal(after.registration.observed_pixels, before.registration.observed_pixels)
-    for name, pointmap in work.known.pointmaps.items():
+    for name, pointmap in work.state.pointmaps.items():
         known = pointmap.depth > 0
         assert np.array_equal(again.state.pointmaps[name].depth > 0, known)
         assert np.abs(again.state.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
@@ -106,7 +108,7 @@ def test_what_another_version_wrote_is_made_anew(store, caplog):
 
 def test_evidence_of_an_older_version_is_weighed_anew_and_no_frame_is_lost(store, work, caplog):
     """Before, the weakest link was the weakest joint, inlier ratios were agreements."""
-    record, arrays = checkpoint_store.make_reconstruction_message(work.find_reconstruction(), work.proven)
+    record, arrays = checkpoint_store.make_reconstruction_message(work.find_reconstruction(), work.publishable_names)
     older = msgspec.to_builtins(record)
     evidence = older["evidence"]
     evidence["joint"], evidence["loose"] = evidence.pop("weakest_link"), evidence.pop("disconnected")

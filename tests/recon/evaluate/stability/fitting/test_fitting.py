@@ -74,7 +74,7 @@ def test_a_bound_grows_with_what_the_sources_say(samples):
 
 def test_wrong_registrations_are_refused_by_numbers_that_did_not_see_their_scene(samples):
     numbers = fit_without_each_scene(samples)
-    bad = [each for each in samples if each.gross]
+    bad = [each for each in samples if each.is_gross]
     assert len(bad) == 10 and not any(is_published(each, numbers[each.scene]) for each in bad)
     assert all(is_wrong(each, numbers[each.scene]) for each in bad)
 
@@ -105,7 +105,7 @@ def test_sets_that_break_the_assumption_of_one_lens_widen_the_bounds_of_such_set
 
 
 def test_more_must_speak_for_poses_with_a_lens_of_its_own_where_such_were_wrong(samples):
-    seen = [replace(each, evidence=with_own_lens(each, True).evidence) for each in samples if each.gross]
+    seen = [replace(each, evidence=with_own_lens(each, True).evidence) for each in samples if each.is_gross]
     good = [replace(each, inlier_ratio=0.95) for each in seen[0].evidence.cameras]
     convincing = [
         replace(s, broken=True, evidence=replace(s.evidence, cameras=tuple(good), inlier_ratio=0.95)) for s in seen
@@ -118,7 +118,7 @@ def test_more_must_speak_for_poses_with_a_lens_of_its_own_where_such_were_wrong(
 
 def test_cameras_of_two_worlds_are_beyond_every_claim(samples):
     mixed = replace(samples[0], errors=dict(list(samples[0].errors.items())[:2]))
-    assert not mixed.together and exceeds_bounds(mixed, fit_models(samples))
+    assert not mixed.is_one_world and exceeds_bounds(mixed, fit_models(samples))
 
 
 def test_the_module_that_is_written_holds_what_was_found(samples):
