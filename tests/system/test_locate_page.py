@@ -24,7 +24,7 @@ def test_the_examples_in_python_place_photographs(tmp_path: Path, monkeypatch, c
     names: dict[str, object] = {}
     for example in re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE):
         exec(compile(example, "docs/locate.md", "exec"), names)
-        assert "Claim(rotation_deg=" in capsys.readouterr().out
+        assert "LocalizationBounds(rotation_deg=" in capsys.readouterr().out
 
 
 def test_the_page_has_every_refusal():

@@ -289,7 +289,7 @@ def test_a_checkpoint_that_there_is_no_memory_for_is_left_as_it_is(tmp_path, mon
 def test_the_running_daemon_tells_what_was_refused_and_answers_what_fails(config, peer, monkeypatch):  # noqa: F811
     with running(config):
         for index in range(8):
-            peer.server.spool.put(*refused(index))
+            peer.server.spool.store(*refused(index))
         (taken,) = photographs()[:1]
         peer.server.offer(taken)
         peer.wait_for_acknowledgements()
