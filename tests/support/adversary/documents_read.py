@@ -131,7 +131,7 @@ def _read_manifest(path: Path) -> object:
 
 
 def _read_list(path: Path) -> object:
-    return [os.fsencode(each) for each in read_list(path, ())]
+    return [os.fsencode(each) for each in read_list(path, (), set())]
 
 
 def _draw_list(rng: random.Random) -> bytes:
