@@ -94,11 +94,16 @@ def values(annotation: Any) -> str:
 
 
 def _range(meta: msgspec.Meta) -> str:
-    least = f"{meta.ge}" if meta.ge is not None else f"above {meta.gt}" if meta.gt is not None else None
-    most = f"{meta.le}" if meta.le is not None else f"below {meta.lt}" if meta.lt is not None else None
+    least = _number(meta.ge) if meta.ge is not None else f"above {_number(meta.gt)}" if meta.gt is not None else None
+    most = _number(meta.le) if meta.le is not None else f"below {_number(meta.lt)}" if meta.lt is not None else None
     if least and most:
         return f"{least} to {most}"
     return f"up to {most}" if most else f"from {least}" if meta.ge is not None else least or ""
+
+
+def _number(bound: float) -> str:
+    """The bound, whole numbers without a point: `typing` gives 1e6 for 1000000 where it met that first."""
+    return str(int(bound)) if float(bound).is_integer() and abs(bound) < 1e15 else str(bound)
 
 
 def _kinds(plugin: type[Plugin], annotation: Any) -> str:
