@@ -448,7 +448,8 @@ def _read_safetensors(path: Path) -> dict[str, Tensor]:
     except MemoryError:
         raise
     except Exception as error:  # of a damaged file: whatever its bytes happen to say
-        raise ValueError(f"{path} is damaged or not a safetensors file; fetch it again ({error})") from error
+        said = sanitize_text(error, 300)
+        raise ValueError(f"{path} is damaged or not a safetensors file; fetch it again ({said})") from error
 
 
 def _abbreviate_names(names: list[str]) -> str:
