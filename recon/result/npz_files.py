@@ -217,7 +217,7 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
         known = counts.setdefault(count, len(array) if array.ndim else 0)
         if array.dtype.kind != kind or array.ndim != 1 + len(rest) or array.shape != (known, *rest):
             raise SceneFileError(f"{name}: {key} must be {('?', *rest)} of kind {kind!r}, got {array.shape}")
-        if kind == "f" and not (np.abs(array) <= MAX_COORDINATE).all():
+        if kind == "f" and not (np.abs(array.astype(np.float64)) <= MAX_COORDINATE).all():
             raise SceneFileError(f"{name}: {key} must be finite, within ±{MAX_COORDINATE:g}")
     if found["descriptors"].dtype != np.uint8 or counts["D"] > MOST_DESCRIPTORS or not counts["C"]:
         raise SceneFileError(f"{name}: there must be cameras, and at most {MOST_DESCRIPTORS} descriptors of bytes")
