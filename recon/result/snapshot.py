@@ -233,7 +233,10 @@ def find_camera_problem(T_world_camera: Array, K: Array, width: int, height: int
     """Describes what is wrong with the camera; empty where nothing is."""
     if T_world_camera.shape != (4, 4) or K.shape != (3, 3):
         return f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}"
-    if not (np.abs(T_world_camera) <= MAX_COORDINATE).all() or not (np.abs(K) <= MAX_COORDINATE).all():
+    if (
+        not (np.abs(T_world_camera.astype(np.float64)) <= MAX_COORDINATE).all()
+        or not (np.abs(K.astype(np.float64)) <= MAX_COORDINATE).all()
+    ):
         return f"T_world_camera and K must be finite, within ±{MAX_COORDINATE:g}"
     rotation = T_world_camera[:3, :3]
     turned = np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0
