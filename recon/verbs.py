@@ -187,7 +187,7 @@ VERBS = (
         "retract",
         "take a keyframe back",
         _retract_arguments,
-        import_lazily("splatnode.recon.daemon.node", "retract"),
+        import_lazily("splatnode.recon.daemon.node", "remove_keyframe"),
     ),
     BENCH,
     STABILITY,

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -353,3 +354,13 @@ def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):
     monkeypatch.setattr(core, "library", missing)
     assert doctor.doctor(argparse.Namespace(json=False)) == 2
     assert "Run: python recon/core/compile.py" in capsys.readouterr().out
+
+
+def test_each_verb_leads_to_a_function():
+    """Verbs name their functions in text, so that help loads nothing."""
+    rooms = [path for room in ("capture", "recon", "viewer", "splatnode") for path in (ROOT / room).rglob("*.py")]
+    named = [
+        found for path in rooms for found in re.findall(r'import_lazily\(\s*"([\w.]+)",\s*"(\w+)"', path.read_text())
+    ]
+    assert len(named) > 20
+    assert [each for each in named if not hasattr(import_module(each[0]), each[1])] == []
