@@ -8,16 +8,27 @@ import sys
 
 from tests.conftest import ROOT
 from tests.fuzz import __main__ as command
-from tests.fuzz import boundaries, catalogue, reproducer
+from tests.fuzz import catalogue, reproducer
 from tests.fuzz.planted import PLANTED, PROBLEMS
 from tests.fuzz.reproducer import Defect
 from tests.support.adversary.boundaries import BOUNDARIES, case_of, cases_of
 
+IN_A_FRESH_PROCESS = """
+import json
+from tests.fuzz import boundaries
+from tests.fuzz.planted import PLANTED
+result = boundaries.main(600.0, 0, 8 * len(PLANTED), [each.name for each in PLANTED])
+kept = {defect.boundary: defect.problem for defect in result["kept"]}
+print(json.dumps({"kept": kept, **{name: result[name] for name in ("rows", "defects", "interrupted")}}, default=str))
+"""  # whose memory has no peak from earlier tests
+
 
 def test_a_defect_of_each_kind_is_found_and_the_others_are_read_on():
-    result = boundaries.main(600.0, 0, 8 * len(PLANTED), [each.name for each in PLANTED])
+    run = subprocess.run([sys.executable, "-c", IN_A_FRESH_PROCESS], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    result = json.loads(run.stdout.splitlines()[-1])
     assert set(result["rows"]) == {each.name for each in PLANTED}
-    found = {defect.boundary.removeprefix("planted: "): defect.problem for defect in result["kept"]}
+    found = {boundary.removeprefix("planted: "): problem for boundary, problem in result["kept"].items()}
     assert {name: text for name, text in PROBLEMS.items() if not found.get(name, "").startswith(text)} == {}
     assert result["defects"] >= len(PLANTED) and not result["interrupted"]
     assert all(row["cases"] >= 3 for row in result["rows"].values())

@@ -140,11 +140,15 @@ void bundle(Draw& draw) {
     const auto pixels = draw.numbers(2 * camera_of.size(), 300);
     std::vector<double> information(36 * size_t(lenses) * lenses);
     for (int k = 0; k < 6 * lenses; ++k) information[size_t(k) * 6 * lenses + k] = draw.whole(0, 2) * 10.0;
+    auto given_rotations = rotations, given_centres = draw.numbers(3 * size_t(cameras));
+    std::vector<double> given(2 * size_t(cameras));
+    for (double& each : given) each = draw.whole(0, 2) * 10.0;
     const core::Bundle task = {rotations.data(),  translations.data(), focals.data(),    radials.data(),
                                shifts.data(),     aspects.data(),      places.data(),    lens_of.data(),
                                camera_of.data(),  first_of.data(),     pixels.data(),    means.data(),
                                information.data(), cameras,            lenses,           points,
-                               draw.whole(-1, cameras - 1), draw.whole(1, 9) * 1.0};
+                               draw.whole(-1, cameras - 1), draw.whole(1, 9) * 1.0,
+                               given_rotations.data(), given_centres.data(), given.data()};
     core_bundle_adjust(&task, draw.whole(0, 8), 1e-6);
     const size_t size = 6 * size_t(cameras + lenses);
     std::vector<double> matrix(size * size);
