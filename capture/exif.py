@@ -219,7 +219,7 @@ _NS = 10**9
 # with 1, dates of this century with 2: no number can be read as both.
 _SECONDS = re.compile(r"(?<![0-9])(1[0-9]{9})(?:\.([0-9]{1,9})|([0-9]{3}|[0-9]{6}|[0-9]{9}))(?![0-9])")
 # A fraction of the second has three, six or nine digits.
-_NAME_TIME_DATE_TIME = re.compile(
+_DATE_TIME_IN_NAME = re.compile(
     r"(?<![0-9])(20[0-9]{2})([-_.:]?)([0-9]{2})\2([0-9]{2})(?:[-_.T ]| at )?([0-9]{2})([-_.:]?)([0-9]{2})\6([0-9]{2})"
     r"(?:[.,]?([0-9]{3}|[0-9]{6}|[0-9]{9}))?(?![0-9])(Z?)(?!\s?[ap]\.?m)",
     re.IGNORECASE,
@@ -234,7 +234,7 @@ def name_time(name: str) -> Stamp | None:
     zone is not known. A name has one time, and no number behind it: then the time may be that of a whole sequence.
     """
     stem = PurePath(name).stem
-    found = [*_SECONDS.finditer(stem), *_NAME_TIME_DATE_TIME.finditer(stem)]
+    found = [*_SECONDS.finditer(stem), *_DATE_TIME_IN_NAME.finditer(stem)]
     if len(found) != 1 or _DIGIT.search(stem, found[0].end()):
         return None
     return _parse_unix_time(found[0]) if found[0].re is _SECONDS else _parse_date(found[0])

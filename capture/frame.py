@@ -252,7 +252,7 @@ class Frame:
     """
 
     frame_id: int  # position in its stream, from 0
-    name: str  # printable, unique in its stream; for a file, its name as `printable_name` writes it
+    name: str  # printable, unique in its stream; for a file, its name as `sanitize_name` writes it
     stamp_ns: int  # time in its stream, which never falls; of a live camera, the monotonic clock at exposure
     image: npt.NDArray[np.uint8]  # (H, W, 3) RGB
     intrinsics: Intrinsics | None  # None: nothing is known about this camera

@@ -367,7 +367,7 @@ def _unproject_near(pixels: Array, view: Viewpoint, width: int, height: int) -> 
 
 
 MEASURING_COLOUR: Colour = (0.3, 1.0, 1.0)
-_MEASURING_AROUND = 2  # pixels in each direction around the click, whose middle depth is taken
+_CLICK_RADIUS_PX = 2  # pixels in each direction around the click, whose middle depth is taken
 _CROSS = 0.012  # half the size of a point's mark, in parts of its distance from the eye
 
 
@@ -378,8 +378,8 @@ def surface_point(canvas: Canvas, view: Viewpoint, x: float, y: float) -> Array 
     if not (0 <= column < width and 0 <= row < height):
         return None
     near = np.s_[
-        max(row - _MEASURING_AROUND, 0) : row + _MEASURING_AROUND + 1,
-        max(column - _MEASURING_AROUND, 0) : column + _MEASURING_AROUND + 1,
+        max(row - _CLICK_RADIUS_PX, 0) : row + _CLICK_RADIUS_PX + 1,
+        max(column - _CLICK_RADIUS_PX, 0) : column + _CLICK_RADIUS_PX + 1,
     ]
     depths = canvas.depth[near]
     depths = depths[np.isfinite(depths)]

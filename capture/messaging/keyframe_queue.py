@@ -11,7 +11,7 @@
 Either process may die at any moment. A frame without an answer stays in the spool and is sent to the next connection
 that is ready and does not hold it. An acknowledged one is in recon's checkpoint; if it comes again, because capture
 died before it removed it, it is acknowledged again and not delivered. What is larger than recon allows is not sent: it
-goes to the quarantine at once. Answers of a recon that is not served (turns.py) do not count.
+goes to the quarantine at once. Answers of a recon that is not served (`ConsumerArbiter`) do not count.
 """
 
 from __future__ import annotations

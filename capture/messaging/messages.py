@@ -123,7 +123,7 @@ DELIVERY_PARTS = 2  # that come before a frame's own
 
 
 class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
-    """A Frame; its arrays are its image and, where it has these, its mask and its right image (frame_arrays.py)."""
+    """A Frame; its arrays are its image and, where it has these, its mask and its right image."""
 
     frame_id: Sequential
     name: Name

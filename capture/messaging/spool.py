@@ -94,7 +94,7 @@ def _parts(body: memoryview, count: int, path: Path) -> Iterator[memoryview]:
 
 log = logging.getLogger(__name__)
 
-_QUARANTINE_FILE = re.compile(r"[0-9]{12,18}\.frame")
+_QUARANTINED = re.compile(r"[0-9]{12,18}\.frame")
 _LARGEST_RECORD = 16 << 10  # bytes
 _SEEN = "seen"  # a file with the number of the newest one that somebody has seen
 
@@ -126,7 +126,7 @@ class Quarantine:
         self._records: dict[int, QuarantinedKeyframe] = {}  # oldest first
         self._bytes: dict[int, int] = {}
         remove_leftovers(directory)
-        for path in list_own_files(directory, _QUARANTINE_FILE, ".frame"):
+        for path in list_own_files(directory, _QUARANTINED, ".frame"):
             self._records[int(path.stem)] = _record(path)
             self._bytes[int(path.stem)] = path.stat().st_size
         self._last_seen = _number_in(directory / _SEEN)

@@ -143,7 +143,7 @@ def format_summary(audit: Audit) -> str:
 
 _CELL, _GAP, _LEFT, _TOP, _LINE = 26, 2, 170, 120, 30  # pixels
 _WORDS = 400  # pixels beside the cells, for what a camera did
-_PICTURE_MOST_NAMES = 40  # recordings whose names are written; of more, some
+_MAX_LABELS = 40  # recordings whose names are written; of more, some
 _COLOURS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#e45756", "#72b7b2", "#9d755d", "#eeca3b")
 _NOT_SEEN = "#dddddd"
 _LONGEST = 22  # characters of a name that are written
@@ -160,7 +160,7 @@ def draw_audit(audit: Audit) -> bytes:
         'font-family="sans-serif" font-size="12">',
         f'<rect width="{width}" height="{height}" fill="white"/>',
     ]
-    every = max(1, -(-len(audit.recordings) // _PICTURE_MOST_NAMES))
+    every = max(1, -(-len(audit.recordings) // _MAX_LABELS))
     for number in range(0, len(audit.recordings), every):
         x = _LEFT + number * _CELL + _CELL / 2
         name = _escape_name(audit.recordings[number])

@@ -315,7 +315,7 @@ class Settings:
     alignment_steps: int = 120
     alignment_levels: int = 1
     continued_steps: int = 60  # from the pose that was found in another moment of the same run, at full size
-    start: Literal["true", "interpolated"] = "true"  # of the search: start_pose.py
+    start: Literal["true", "interpolated"] = "true"  # of the search
     # A render gets, a channel, the gain that fits the photograph best: how that was exposed is nobody's to know
     best_gain: bool = False
 

@@ -26,7 +26,7 @@ class Features:
     """Local features of a frame at full size. A point may have several descriptors, one for each simulated tilt."""
 
     points: npt.NDArray[np.float64]  # (M, 2) pixels of the full-size image, top-left pixel centre at (0.5, 0.5)
-    descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/nearest_neighbours.py quantises them
+    descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/features.py quantises them
     point_of: npt.NDArray[np.int64]  # (D,) the point that a descriptor describes
     # (D,) simulated tilt: by which the image's width was divided; below 1, its height was multiplied by it; 1 for none
     tilt: npt.NDArray[np.float64]

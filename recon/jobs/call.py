@@ -72,7 +72,7 @@ def start_call(folder: Path, cores: Sequence[int]) -> Child:
 
 
 def answer_of(folder: Path, end: End) -> Answer:
-    """The answer of a call whose process has ended; nobody else can put one into the folder of `laid_down`."""
+    """The answer of a call whose process has ended; nobody else can put one into the folder of `write_call`."""
     if end.exit_code == 0 and (folder / ANSWER).exists():
         return Answer((folder / ANSWER).read_bytes(), "", end)
     if (folder / ERROR).exists():

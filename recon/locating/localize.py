@@ -1,7 +1,7 @@
 """Where in a finished scene a photograph was taken that was not in the set, or why that cannot be said.
 
 Its features are matched with the scene's landmarks, a pose is found on which most of them agree, and everything that
-speaks against it is asked (checks.py): being wrong is worse than refusing.
+speaks against it is asked (verification.py): being wrong is worse than refusing.
 """
 
 from __future__ import annotations

@@ -28,7 +28,8 @@ from splatnode.recon.result.snapshot import KnownLenses
 
 Array = npt.NDArray[np.float64]
 
-# What is not known of a lens, as in recon/registration (lenses.py, finishing.py); lengths over the longer side.
+# What is not known of a lens, as in recon/registration (self_calibration.py, incremental_mapper.py); lengths over the
+# longer side.
 _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA, _ASPECT_SIGMA = 0.05, 0.02, 0.004, 0.001
 _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA = 0.01, 0.005  # focusing changes the lens of one camera
 # A calibration is right to these; with them an image is asked whether it is of that lens.

@@ -293,8 +293,8 @@ def _directions(vectors: Array) -> Array:
 
 # Observations that tell as much as one with an error of its own: what lens, shutter and scene do otherwise than the
 # model moves whole regions alike. Registration takes 100 (recon/registration/incremental_mapper.py); the landmarks
-# have been
-# through the same lenses and keep a part of it: with 30, 98 % of the turns are within their 95 % bounds (tests/bench).
+# have been through the same lenses and keep a part of it: with 30, 98 % of the turns are within their 95 % bounds
+# (tests/bench).
 CORRELATED = 30.0
 _ROBUST = 3.0  # scale of the Cauchy loss, in standard deviations
 _STEPS = 12  # Gauss-Newton converges in a few

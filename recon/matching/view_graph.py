@@ -1,6 +1,6 @@
 """The view graph: keyframes as nodes, verified pairs of them as edges. A value: every change gives another graph.
 
-Nothing here matches anything: that is done, one pair at a time, by `matching/match.py`.
+Below it are the functions that match pending pairs, one at a time, and give the next graph.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from splatnode.recon.threads import map_parallel, map_parallel_lazily
 
 
 class MovingObjectsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The configuration of `matching/moving.py`."""
+    """Detection of moving objects: see dynamic_objects.py."""
 
     enabled: bool = True  # look for things that moved between photographs that are all at hand, and leave them out
 
@@ -176,7 +176,7 @@ class ViewGraph:
         return find_components(range(len(self.keyframes)), self.pairs)
 
     def select_pairs_worth_matching(self) -> set[Pair]:
-        """The pairs (i < j), matched or not, that are worth it (`candidates.worth_matching`)."""
+        """The pairs (i < j), matched or not, that are worth it (`candidates.select_pairs_worth_matching`)."""
         firm = {
             _ascending(i, j)
             for (i, j), pair in self.plain.items()
@@ -294,9 +294,9 @@ def match_newest(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGrap
 def match_pending(graph: ViewGraph, matcher: Matcher | None, until: float = math.inf) -> Iterator[ViewGraph]:
     """The graph after each pair that was pending and is worth matching; the last one is complete.
 
-    Pairs are matched by plain features. Those that match weakly but may overlap (`tilting.pairs_to_tilt`) are matched
-    again with tilted features, which bridge wider baselines, and with what a prior's matcher proposes: but for those of
-    which the turn comes after `until`, a time of `time.monotonic()`.
+    Pairs are matched by plain features. Those that match weakly but may overlap (`select_weak_pairs` of
+    pair_matching.py) are matched again with tilted features, which bridge wider baselines, and with what a prior's
+    matcher proposes: but for those of which the turn comes after `until`, a time of `time.monotonic()`.
     """
     graph = yield from _glance_pairs(graph)
     while pairs := sorted(graph.select_pairs_to_match()):

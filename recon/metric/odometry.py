@@ -180,7 +180,7 @@ def _estimate_sigma(steps: _MotionSteps, scale: float, kept: Mask) -> float:
 # Where up is in a scene, by what an IMU says of gravity in the frames of its cameras.
 
 
-_GRAVITY_FARTHEST = 3.44  # standard deviations in two dimensions: what one has within 3 in one dimension, 99.7 %
+_MAX_SIGMAS_2D = 3.44  # standard deviations in two dimensions: what one has within 3 in one dimension, 99.7 %
 _SHARED_DEG = 0.5  # standard deviation of an error that all have alike: how the IMU is mounted
 
 
@@ -197,7 +197,7 @@ def estimate_up(views: Mapping[str, MetricView], gravities: Mapping[str, Gravity
     up = ups[np.argmin([_compute_truncated_cost(ups, sigmas, each) for each in ups])]
     kept = np.zeros(len(names), bool)
     for _ in range(_ROUNDS):
-        fits = _compute_angles_deg(ups, up) < _GRAVITY_FARTHEST * np.hypot(sigmas, _SHARED_DEG)
+        fits = _compute_angles_deg(ups, up) < _MAX_SIGMAS_2D * np.hypot(sigmas, _SHARED_DEG)
         if not fits.any() or (fits == kept).all():
             break
         kept = fits
@@ -220,7 +220,7 @@ def _source(names: list[str], kept: npt.NDArray[np.bool_]) -> str:
 
 
 def _compute_truncated_cost(ups: Array, sigmas: Array, up: Array) -> float:
-    return float(np.minimum((_compute_angles_deg(ups, up) / sigmas) ** 2, _GRAVITY_FARTHEST**2).sum())
+    return float(np.minimum((_compute_angles_deg(ups, up) / sigmas) ** 2, _MAX_SIGMAS_2D**2).sum())
 
 
 def _compute_angles_deg(ups: Array, up: Array) -> Array:
@@ -233,7 +233,7 @@ def _compute_angles_deg(ups: Array, up: Array) -> Array:
 # not fit is named and left out. Neither the photographs' cameras nor the scene are changed by them otherwise.
 
 
-_POSES_FARTHEST = 3.76  # standard deviations in three dimensions: what one has within 3 in one dimension, 99.7 %
+_MAX_SIGMAS_3D = 3.76  # standard deviations in three dimensions: what one has within 3 in one dimension, 99.7 %
 # What poses that scatter more than was given are believed to scatter at most: as a share of their spread, and degrees.
 _MOST_SHARE, _MOST_DEG = 0.05, 15.0
 _DRIFT_LEFT = 0.5  # of the drift at the end of the way, in one direction: what is left of it beside the best similarity
@@ -326,7 +326,7 @@ def align_to_poses(
 
 
 def _format_error(metres: float, degrees: float, rotation_deg: float) -> str:
-    turned = f"{degrees:.2g} degrees" if degrees > _POSES_FARTHEST * rotation_deg else ""
+    turned = f"{degrees:.2g} degrees" if degrees > _MAX_SIGMAS_3D * rotation_deg else ""
     return " and ".join(filter(None, (f"{metres:.2g} m", turned)))
 
 
@@ -364,7 +364,7 @@ def _refine_inliers(
     kept = np.zeros(len(pairs.names), bool)
     for _ in range(_ROUNDS):
         off_m, off_deg = pairs.compute_errors(by)
-        fits = (off_m < _POSES_FARTHEST * pairs.sigma_m(by, position_m)) & (off_deg < _POSES_FARTHEST * rotation_deg)
+        fits = (off_m < _MAX_SIGMAS_3D * pairs.sigma_m(by, position_m)) & (off_deg < _MAX_SIGMAS_3D * rotation_deg)
         if fits.sum() < 2 or (fits == kept).all():
             return by, fits
         kept = fits
@@ -387,7 +387,7 @@ def _propose_similarity(
     def cost(by: Similarity) -> float:
         off_m, off_deg = pairs.compute_errors(by)
         squares = (off_m / pairs.sigma_m(by, position_m)) ** 2 + (off_deg / rotation_deg) ** 2
-        return float(np.median(squares) if by_most else np.minimum(squares, 2.0 * _POSES_FARTHEST**2).sum())
+        return float(np.median(squares) if by_most else np.minimum(squares, 2.0 * _MAX_SIGMAS_3D**2).sum())
 
     return min(proposals, key=cost)
 

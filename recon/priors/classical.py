@@ -41,7 +41,7 @@ class DepthEstimator(Protocol):
 
 
 class ClassicalPrior(Prior):
-    """Depth by `recon.priors.stereo`, or by `estimate_depth_maps` in its place; matches by `matcher`, if there is
+    """Depth by `recon.priors.stereo`, or by `depth_maps` in its place; matches by `matcher`, if there is
     one.
     """
 

@@ -174,7 +174,7 @@ def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapper
 
     First all of them at once, because misplaced views may support each other; then one after the other.
     """
-    doubtful = _incremental_find_doubtful_views(problem, partial, config)
+    doubtful = _find_weak_views(problem, partial, config)
     for group in [doubtful, *([view] for view in doubtful)]:
         rest = tuple(view for view in partial.registered if view not in group)
         if not group or len(rest) < _MIN_VIEWS:
@@ -189,9 +189,7 @@ def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapper
     return partial
 
 
-def _incremental_find_doubtful_views(
-    problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig
-) -> list[int]:
+def _find_weak_views(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> list[int]:
     """The registered views with an inlier ratio below `min_view_ratio`, the lowest first."""
     ratios = registration_resection.inlier_ratios(problem, partial, config.triangulation.max_error_px)
     of_view = {

@@ -110,5 +110,5 @@ def _world(
 
 
 def _unit(built: PosedMap, found: Registration) -> float:
-    """A length in `found` over the same in `built`: `in_first_camera` scaled it."""
+    """A length in `found` over the same in `built`: the registration scaled it."""
     return 1.0 / known_poses.distance(built.map.estimate, [camera.index for camera in found.cameras])

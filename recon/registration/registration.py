@@ -54,7 +54,7 @@ class RegisteredCamera:
     lens: int  # cameras with the same number share a lens, relative to their longer side
     focal: float  # pixels
     principal: Array  # (2,) pixels
-    radial: Array  # (2,) coefficients of r^2 and r^4 in the lens' distortion, as bundle.py has them
+    radial: Array  # (2,) coefficients of r^2 and r^4 in the lens' distortion, as bundle_adjustment.py has them
     rotation_sigma_deg: float  # after the best similarity; infinite where nothing is known
     centre_sigma_rel: float  # over the spread of the centres, after the best similarity; infinite likewise
     # (3, 3) of the centre, after the best similarity, in the frame and the squared unit of the world; NaN likewise

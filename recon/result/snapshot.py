@@ -38,7 +38,7 @@ class Landmarks:
 
     points: Array  # (P, 3) world
     covariances: Array  # (P, 3, 3) of the points' errors, the cameras taken as exact
-    descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/nearest_neighbours.py quantises them
+    descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/features.py quantises them
     point_of: Index  # (D,) the point that a descriptor is of
     photograph_of: Index  # (D,) the photograph that it is from
     names: tuple[str, ...]  # of the C photographs

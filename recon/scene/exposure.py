@@ -3,11 +3,11 @@
 A camera that opens its iris, or takes another white for white, between two photographs makes one surface two colours.
 Depth that two photographs agree on tells which pixels show one surface; the median ratio of their colours is the ratio
 of their gains, per channel, and all ratios together give each photograph's gains in closed form (least squares of
-their logarithms). What cameras say of their exposure (told_light.py) is a prior: it decides where photographs share
+their logarithms). What cameras say of their exposure is a prior: it decides where photographs share
 too little, and counts for little where they share much. What is found is used only where it is more than light that
 differs by where it is seen from, and more than an automatic exposure that drifts along the way: photographs that were
 taken near each other share it, and new views between them have it too. A lens that dims its corners much is undimmed
-first (vignetting.py).
+first.
 """
 
 from __future__ import annotations

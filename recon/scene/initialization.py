@@ -108,7 +108,7 @@ def visibility(image: Float32, scale: float) -> Float32:
 
 # Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and depth.
 #
-# A piece is as large as its error allows (`partition`), with the same visible error everywhere (`contrast_masking`):
+# A piece is as large as its error allows (`partition`), with the same visible error everywhere (contrast masking):
 # that is the best use of a number of Gaussians. Errors are measured in photographs of a fixed size, so that the number
 # of Gaussians follows from what there is to see and not from how many pixels show it.
 

@@ -1,6 +1,6 @@
 """What is claimed of verified cameras: 95 % bounds of their errors, from what the evidence says of their size.
 
-A bound is a product of powers (a line between logarithms) of what three sources say (errors.py), and of the share of a
+A bound is a product of powers (a line between logarithms) of what three sources say (refit.py), and of the share of a
 camera's matches that its pose explains: each source sees what another is blind to, none is in the unit of a standard
 error, and errors of real cameras grow more slowly than any of them. The number of cameras counts, too: the more there
 are, the more each source takes errors for independent that are not. `fitted.py` has the powers, which
@@ -97,7 +97,7 @@ def compute_travel_percent(bounds: Mapping[str, Bounds], evidence: Evidence) -> 
 
 # What the evidence amounts to: log odds that the poses are right, as a sum of terms (logistic regression).
 #
-# Wrong are poses whose errors are beyond what is claimed of them (claims.py). Each term is linear in one measure of
+# Wrong are poses whose errors are beyond their bounds. Each term is linear in one measure of
 # all cameras together, counted from its value in right registrations; where one camera is worse than the others, the
 # worst one counts. A measure is clipped where more of it says nothing more, so that none decides by its extremes.
 # `fitted.py` has the slopes, which `python -m tests.bench fit` finds from registrations of real photographs: right

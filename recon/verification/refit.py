@@ -552,8 +552,8 @@ class Errors:
     """The size of one error as each source says it, as one standard error."""
 
     sigma: float  # the covariance of the bundle adjustment, which takes errors for independent
-    regions: float  # what leaving out regions of the pictures changes (see jackknife.py)
-    profile: float  # what unknown lenses leave open (see focal_profile.py and principal_point.py)
+    regions: float  # what leaving out regions of the pictures changes (a jackknife, above)
+    profile: float  # what unknown lenses leave open (focal profile and principal point, above)
 
 
 @dataclass(frozen=True)

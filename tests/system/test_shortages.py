@@ -1,6 +1,6 @@
 """Whoever holds a failed read or write for the fault of a file asks first whether this process lacks something.
 
-Each handler of OSError, or of everything, in the three rooms raises, or asks `memory_shortage`, or is listed here
+Each handler of OSError, or of everything, in the three rooms raises, or asks `process/system.py`, or is listed here
 with what makes a shortage harmless to it.
 """
 

@@ -6,7 +6,7 @@ far after each new one, with adaptive density control.
 
 As published: this order, the losses, and the step sizes of 3DGS. Compact: photographs of 512 pixels; a Gaussian for
 every ninth pixel; and, but for `PUBLISHED`, 60 iterations for a frame alone, 200 for a motion, 60 after each frame. The
-500 at the end are ours. A monocular network's place takes `known_depth`, which also gives the focal length.
+500 at the end are ours. A monocular network's place takes known depth (outcome.py), which also gives the focal length.
 """
 
 from __future__ import annotations

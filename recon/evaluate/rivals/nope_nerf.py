@@ -2,7 +2,8 @@
 
 As published: the weights of the losses (depth 0.04; point clouds 1 and surface colours 1 between consecutive frames,
 until the relative poses stand), and a focal length that is known. Compact as nerfmm is. A monocular network's place
-takes `known_depth`, each map divided by its median so that its scale has to be found; it also gives the focal length.
+takes known depth (outcome.py), each map divided by its median so that its scale has to be found; it also gives the
+focal length.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def weights() -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def network(weights, tmp_path_factory) -> DepthAnything3:
-    """Loaded from a file as it is published: every name behind `model_scene.`, and a second head that is not needed."""
+    """Loaded from a file as it is published: every name behind `model.`, and a second head that is not needed."""
     from safetensors.torch import save_file
 
     path = tmp_path_factory.mktemp("da3") / "model.safetensors"

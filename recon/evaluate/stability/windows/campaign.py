@@ -322,7 +322,7 @@ class Plan:
     per_kind: int = 2  # windows of each scene, count and stride, at most
     counts: tuple[int, ...] = COUNTS
     seed: int = 0  # of the draw of the windows
-    told: Told = "nothing"  # of the lens, to splatnode: see `ours.frames_of`
+    told: Told = "nothing"  # of the lens, to splatnode: see `load_window_frames`
     fresh: bool = False  # measures each window's seconds from photographs on, too
     timeout_s: float = 120.0  # of one method on one window, from the start of its process on
     max_memory_mb: float | None = None  # of the same
