@@ -204,16 +204,9 @@ class KeyframeServer(Endpoint):
 
     def serve(self, timeout_s: float) -> None:
         """Handles the requests that came, waiting at most `timeout_s` for the first."""
-        if self._router.poll(max(0, math.ceil(timeout_s * 1000))):
-            for _ in range(MAX_REQUESTS):
-                try:
-                    identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
-                except zmq.Again:
-                    break
-                try:
-                    self._handle(identity, decode(parts, Request, REQUEST_LIMITS).header)
-                except WireError as error:
-                    self._refuse("a request for keyframes", error)
+        what = "a request for keyframes"
+        for identity, request in self._receive_requests(self._router, Request, what, MAX_REQUESTS, timeout_s):
+            self._handle(identity, request)
         self._turns.forget_silent(time.monotonic())
         self._send_due()
 

@@ -14,13 +14,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import math
 import os
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import zmq
@@ -154,6 +155,27 @@ class Endpoint:
         self.why_refused = sanitize_text(why)
         if is_logged(self.refused):
             log.warning("refused %s (%d so far): %s", what, self.refused, self.why_refused)
+
+    def _receive_requests(
+        self, router: zmq.Socket, schema: Any, what: str, most: int, timeout_s: float
+    ) -> Iterator[tuple[bytes, Any]]:
+        """Yields who asks, and the requests (of `schema`) that came, waiting at most `timeout_s` for the first.
+
+        At most `most` are read; a malformed one counts as refused, `what` is its name in the log.
+        """
+        if not router.poll(max(0, math.ceil(timeout_s * 1000))):
+            return
+        for _ in range(most):
+            try:
+                identity, *parts = router.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            try:
+                header = wire.decode(parts, schema, REQUEST_LIMITS).header
+            except wire.WireError as error:
+                self._refuse(what, error)
+                continue
+            yield identity, header
 
     def _lock(self, service: Service) -> None:
         try:

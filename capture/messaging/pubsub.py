@@ -122,18 +122,7 @@ class CommandServer(Endpoint):
 
     def serve(self, timeout_s: float, reply: Callable[[Any], msgspec.Struct]) -> None:
         """Replies to the requests that came, waiting at most `timeout_s` for the first."""
-        if not self._router.poll(max(0, math.ceil(timeout_s * 1000))):
-            return
-        for _ in range(QUEUE):
-            try:
-                identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                return
-            try:
-                request = decode(parts, self.schema, REQUEST_LIMITS).header
-            except WireError as error:
-                self._refuse("a command", error)
-                continue
+        for identity, request in self._receive_requests(self._router, self.schema, "a command", QUEUE, timeout_s):
             with contextlib.suppress(zmq.Again):
                 self._router.send_multipart([identity, *encode(reply(request))], zmq.NOBLOCK)
 
@@ -208,19 +197,8 @@ class StateServer(Endpoint):
 
     def serve(self, timeout_s: float) -> None:
         """Replies to requests, waiting at most `timeout_s` for the first. To be called several times a second."""
-        if not self._router.poll(max(0, math.ceil(timeout_s * 1000))):
-            return
-        wanted: dict[bytes, Want] = {}  # one reply to each client, however often it asks
-        for _ in range(MAX_REQUESTS):
-            try:
-                identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                break
-            try:
-                wanted[identity] = decode(parts, Want, REQUEST_LIMITS).header
-            except WireError as error:
-                self._refuse("a request", error)
-        for identity, want in wanted.items():
+        requests = self._receive_requests(self._router, Want, "a request", MAX_REQUESTS, timeout_s)
+        for identity, want in dict(requests).items():  # one reply to each client, however often it asks
             self._reply(identity, want)
 
     def _reply(self, identity: bytes, want: Want) -> None:

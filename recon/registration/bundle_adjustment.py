@@ -235,6 +235,19 @@ def reprojection_errors(problem: Problem) -> Array:
     return np.where(depth > 0, np.linalg.norm(predicted - problem.pixels, axis=1), np.inf)
 
 
+def keep_observations(problem: Problem, kept: npt.NDArray[np.bool_]) -> Problem:
+    """Returns the problem with the observations `kept` (O,), and the points that at least two of these see."""
+    kept = kept & (np.bincount(problem.point_of[kept], minlength=len(problem.points))[problem.point_of] >= 2)
+    points, point_of = np.unique(problem.point_of[kept], return_inverse=True)
+    return replace(
+        problem,
+        points=problem.points[points],
+        camera_of=problem.camera_of[kept],
+        point_of=point_of,
+        pixels=problem.pixels[kept],
+    )
+
+
 def robust_cost(problem: Problem, config: BundleAdjustmentConfig) -> float:
     """The Cauchy loss of all observations, pixels squared, without the priors."""
     squared = np.minimum(reprojection_errors(problem), _BEHIND_PX) ** 2

@@ -333,15 +333,7 @@ def _adjust_and_filter(problem: MapperInput, partial: PartialMap, config: FinalA
     loss = _loss(problem, partial.estimate, config)
     estimate = bundle_adjustment.adjust(partial.estimate, partial.prior, loss, partial.registered[0])
     good = _errors(problem, estimate) < config.triangulation.max_error_px
-    good &= np.bincount(estimate.point_of[good], minlength=len(estimate.points))[estimate.point_of] >= 2
-    kept, point_of = np.unique(estimate.point_of[good], return_inverse=True)
-    filtered = replace(
-        estimate,
-        points=estimate.points[kept],
-        camera_of=estimate.camera_of[good],
-        point_of=point_of,
-        pixels=estimate.pixels[good],
-    )
+    filtered = bundle_adjustment.keep_observations(estimate, good)
     return replace(partial, estimate=filtered if _has_enough_observations(filtered, partial.registered) else estimate)
 
 

@@ -349,17 +349,8 @@ def _remove_unseen_cameras(finished: incremental_mapper.FinalMap) -> incremental
     kept = tuple(v for v in partial.registered if v in held or counts[v] >= _LEAST_OBSERVATIONS)
     if kept == partial.registered:
         return finished
-    own = np.isin(estimate.camera_of, kept)
-    own &= np.bincount(estimate.point_of[own], minlength=len(estimate.points))[estimate.point_of] >= 2
-    points, point_of = np.unique(estimate.point_of[own], return_inverse=True)
-    rest = replace(
-        estimate,
-        points=estimate.points[points],
-        camera_of=estimate.camera_of[own],
-        point_of=point_of,
-        pixels=estimate.pixels[own],
-    )
-    rest = bundle_adjustment.adjust(rest, partial.prior, finished.loss) if len(points) else rest
+    rest = bundle_adjustment.keep_observations(estimate, np.isin(estimate.camera_of, kept))
+    rest = bundle_adjustment.adjust(rest, partial.prior, finished.loss) if len(rest.points) else rest
     return replace(finished, map=replace(partial, registered=kept, estimate=rest))
 
 
