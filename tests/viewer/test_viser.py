@@ -58,7 +58,7 @@ def test_small_gaussians_survive_the_16_bits_in_which_their_covariances_travel()
 
 
 def test_only_its_own_page_is_answered_and_no_tunnel_is_opened():
-    with viser.serving("127.0.0.1", 0) as server:
+    with viser.open_server("127.0.0.1", 0) as server:
         port = server.get_port()
         assert asked(port) == 200
         assert asked(port, Host="evil.example") == 403
@@ -76,18 +76,18 @@ def test_only_its_own_page_is_answered_and_no_tunnel_is_opened():
 def test_where_it_cannot_listen_it_says_so_and_takes_no_other_port():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         told = pytest.raises(OSError, match="another program listens there. --port takes another port")
-        with told, viser.serving("127.0.0.1", taken.getsockname()[1]):
+        with told, viser.open_server("127.0.0.1", taken.getsockname()[1]):
             raise AssertionError("it served")
     with (
         pytest.raises(OSError, match="cannot listen on 192.0.2.1, port 0: Cannot assign"),
-        viser.serving("192.0.2.1", 0),
+        viser.open_server("192.0.2.1", 0),
     ):
         raise AssertionError("it served")
 
 
 def test_a_visitor_is_given_the_cameras_where_they_are_with_their_photographs():
     photographs = {"0.png": np.full((80, 100, 3), 200, np.uint8)}
-    with viser.serving("127.0.0.1", 0) as server:
+    with viser.open_server("127.0.0.1", 0) as server:
         stage = ViserStage(server)
         stage.draw(place(images=photographs))
         nodes = stage._nodes
@@ -115,7 +115,7 @@ def test_a_visitor_is_given_the_cameras_where_they_are_with_their_photographs():
 
 def test_a_frustum_is_as_deep_as_that_of_the_other_viewers():
     """viser's own rule (CameraFrustumVariants.tsx): the pyramid x, y, 1 over the cube root of a third of x y."""
-    with viser.serving("127.0.0.1", 0) as server:
+    with viser.open_server("127.0.0.1", 0) as server:
         stage = ViserStage(server)
         stage.draw(place())
         frustum = stage._nodes["/cameras/0.png"]
@@ -126,7 +126,7 @@ def test_a_frustum_is_as_deep_as_that_of_the_other_viewers():
 @pytest.mark.skipif(chromium() is None, reason=f"needs a browser: one of {', '.join(NAMES)}")
 def test_a_browser_shows_what_the_projects_own_rasteriser_does():
     whole = place()
-    with viser.serving("127.0.0.1", 0) as server, browser(900, 600) as page:
+    with viser.open_server("127.0.0.1", 0) as server, browser(900, 600) as page:
         stage = ViserStage(server)
         page.open(f"http://127.0.0.1:{server.get_port()}/")
         deadline = time.monotonic() + PATIENCE_S

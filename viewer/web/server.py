@@ -342,6 +342,7 @@ class Server(ThreadingHTTPServer):
 
     def __init__(self, board: Board, address: str, port: int, key: str | None) -> None:
         self.board = board
+        self.wait_s = _WAIT_S
         self._free = threading.BoundedSemaphore(_MOST_REQUESTS)
         self._running = threading.BoundedSemaphore(
             _MOST_REQUESTS + 2 * _MOST_VISITORS
@@ -463,7 +464,7 @@ class _Request(BaseHTTPRequestHandler):
         board = self.server.board
         if path == "/told":
             (number,) = _numbers([asked.get("number", "")]) or (-1,)
-            shown = board.wait(asked.get("run", ""), number, _WAIT_S)
+            shown = board.wait(asked.get("run", ""), number, self.server.wait_s)
             return self._send("application/json", _encode_state(board, shown))
         kind, data = self.server.pages.get(path) or _find_part(board.current, path) or ("", None)
         if data is None:

@@ -217,8 +217,8 @@ class _Connection:
 @functools.lru_cache(maxsize=2)
 def _server(key: str | None) -> web.Server:
     """Bound to a port of this machine, and never started: requests are handed to it here."""
-    web._WAIT_S = 0.0
     server = web.Server(Board(), "127.0.0.1", 0, key)
+    server.wait_s = 0.0
     server.access = replace(server.access, port=8347)
     server.board.publish({"good": None}, Content(Moment(_snapshot(), 0.0), None), live=False)
     return server
