@@ -9,16 +9,15 @@ import json
 import logging
 import math
 import os
-import pkgutil
 import shutil
 import uuid
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 
-from splatnode.capture import cameras, daemon
-from splatnode.capture.config import CaptureConfig, camera_opener, is_live
+from splatnode.capture import daemon
+from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live
 from splatnode.capture.daemon import last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
@@ -86,11 +85,11 @@ def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | Dropp
 def find(args: argparse.Namespace) -> int:
     """Lists the cameras that are connected, as lines that can be copied into a configuration."""
     found = {}
-    for module in pkgutil.iter_modules(cameras.__path__):
-        source = import_module(f"splatnode.capture.cameras.{module.name}")
+    for kind in Camera.kinds():
+        source = Camera.load_module(kind)
         if hasattr(source, "find"):
             with show_waiting("looking for cameras"):
-                found[module.name] = source.find()
+                found[kind] = source.find()
     if args.json:
         print(json.dumps(found, indent=1))
         return EXIT_GOOD

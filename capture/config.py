@@ -18,6 +18,7 @@ from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.wire import Header, Message, Name, Numbering, Sequential, Text, WireError
+from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.quality import Limits
@@ -71,9 +72,10 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
 
 
 class Camera(Plugin):
-    """The source of frames: a module of capture/cameras."""
+    """The source of frames: a module of capture/cameras, or one that is installed beside it."""
 
     package = "splatnode.capture.cameras"
+    group = plugins.CAMERAS
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin, merge_config, parse_config
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import view_graph as matching
@@ -26,9 +27,10 @@ from splatnode.recon.verification import decision, evidence
 
 
 class PriorChoice(Plugin):
-    """A module of recon/priors, which gives depth, and matches that plain features miss."""
+    """A module of recon/priors, or one beside it, which gives depth, and matches that plain features miss."""
 
     package = "splatnode.recon.priors"
+    group = plugins.PRIORS
     needs = ("Config", "load")
     usual = "classical"
 

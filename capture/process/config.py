@@ -1,8 +1,9 @@
 """YAML and changes to it -> a typed, frozen Struct. What the Struct does not know fails, with what it does know.
 
 Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
-names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. A field
-whose type is a Mapping of Plugins holds several by name, which is also their kind where they say no other.
+names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. Further
+kinds are installed beside the core (`plugins.py`). A field whose type is a Mapping of Plugins holds several by name,
+which is also their kind where they say no other.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import msgspec
 
 from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
 from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.plugins import EntryPoint, entry_points
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
@@ -36,10 +38,12 @@ OF_VERBS = {  # keys by which a file is known that was given to another verb
 class Plugin:
     """A module of `package`, chosen by `kind`, with its Config. A room subclasses it and names the package.
 
-    Modules of the package that lack what `needs` names are no plug-ins. `usual` is the kind where none is named.
+    Modules of the package that lack what `needs` names are no plug-ins. `usual` is the kind where none is named. The
+    entry points of `group` name further modules, which lie elsewhere.
     """
 
     package: ClassVar[str]
+    group: ClassVar[str | None] = None
     needs: ClassVar[tuple[str, ...]] = ("Config",)
     usual: ClassVar[str | None] = None
     kind: str
@@ -47,24 +51,40 @@ class Plugin:
 
     @property
     def module(self) -> ModuleType:
-        return import_module(f"{self.package}.{self.kind}")
+        return self.load_module(self.kind)
+
+    @classmethod
+    def load_module(cls, kind: str) -> ModuleType:
+        """Returns the module of `kind`: a file of the package, or what an entry point names. Raises ImportError."""
+        if kind in cls._own_names() or kind not in (named := cls._entry_points()):
+            return import_module(f"{cls.package}.{kind}")
+        return named[kind].load()
 
     @classmethod
     def kinds(cls) -> list[str]:
-        """All there are. It imports every module of the package, to see what each has."""
+        """All there are. It imports every module of the package, to see what each has, and no entry point's."""
         return [name for name in cls._names() if cls.is_kind(name)]
 
     @classmethod
     def is_kind(cls, name: object) -> bool:
         """Whether there is a plug-in of this name; no other module is imported."""
-        if name not in cls._names():
-            return False
+        own = cls._own_names()
+        if name not in own:
+            return name in cls._entry_points()
         module = import_module(f"{cls.package}.{name}")
         return all(hasattr(module, needed) for needed in cls.needs)
 
     @classmethod
     def _names(cls) -> list[str]:
-        return sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
+        return sorted({*cls._own_names(), *cls._entry_points()})
+
+    @classmethod
+    def _own_names(cls) -> set[str]:
+        return {module.name for module in iter_modules(import_module(cls.package).__path__)}
+
+    @classmethod
+    def _entry_points(cls) -> Mapping[str, EntryPoint]:
+        return {} if cls.group is None else entry_points(cls.group)
 
 
 def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
@@ -166,7 +186,7 @@ def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
         raise ConfigError(
             f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {sanitize_text(repr(kind), 100)}"
         )
-    module = import_module(f"{schema.package}.{kind}")
+    module = schema.load_module(kind)
     rest = {key: value for key, value in raw.items() if key != "kind"}
     return schema(kind, parse_config(rest, module.Config, where))
 
