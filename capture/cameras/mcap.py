@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -33,6 +34,7 @@ from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, saniti
 
 log = logging.getLogger(__name__)
 
+SUFFIX = ".mcap"
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the message comes behind it
 _NOT_PHOTOGRAPHS = "/compressedDepth"  # the end of a topic's name: depth that ROS packs into a PNG
 
@@ -55,6 +57,18 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         raise FileNotFoundError(f"no file {str(config.file)!r}; give an MCAP file")
     topic = _select_topic(config)
     return pace_frames(_frames(config, topic), config.pace)
+
+
+def is_recording(path: Path) -> bool:
+    return path.suffix.lower() == SUFFIX
+
+
+def configure_part(path: Path, part: str) -> dict[str, Any]:
+    return {"file": path, "topic": part}
+
+
+def explain_many(path: Path) -> None:
+    """A file is a film as a whole where one topic has images; `stream` says so where that is not so."""
 
 
 def image_topics(file: Path) -> list[Topic]:
