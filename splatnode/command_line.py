@@ -1,5 +1,7 @@
 """The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
 
+Further verbs are entry points of `splatnode.verbs`, as those of the room `extras` are.
+
 Exit codes: 0 good; 2 usage or configuration; 65 the photographs give no scene, or no lens (the text says why);
 69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted;
 141 nobody reads what is printed any more, as after `| head`.
@@ -23,6 +25,7 @@ from typing import NoReturn
 import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
+from splatnode.capture.process import plugins
 from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
 from splatnode.capture.process.terminal import is_output_closed, sanitize_output
@@ -38,7 +41,10 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 
-VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
+_CORE = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
+_FURTHER = {verb.name: verb for verb in plugins.load_all(plugins.VERBS).values()}
+# Those of the core, whose names no other has, then those that are installed beside it.
+VERBS = (*_CORE, *(verb for name, verb in _FURTHER.items() if name not in {core.name for core in _CORE}))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
