@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -86,11 +85,6 @@ def test_what_extras_names_is_there():
             assert entry.target == target and entry.file.samefile(ROOT / "extras" / "entry_points.txt")
             if group in (plugins.VERBS, plugins.VIEWERS):
                 assert entry.load().name == name
-
-
-def test_metadata_say_the_same():
-    """What installers read is the same file: pyproject.toml takes it whole."""
-    assert re.search(r'entry-points = \{ file = "extras/entry_points.txt" \}', (ROOT / "pyproject.toml").read_text())
 
 
 def test_a_camera_of_another_package_is_a_kind_like_any_other(installed, tmp_path):
