@@ -25,8 +25,12 @@ from splatnode.recon.replay_verb import REPLAY
 from splatnode.recon.shared_arguments import add_lens, add_multi_view_only
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
-_OWN_FORMATS = (module.name for module in iter_modules([str(_FORMATS_FOLDER)]))  # no import: it takes time
-EXPORT_FORMATS = tuple(sorted({*_OWN_FORMATS, *plugins.entry_points(plugins.EXPORT_FORMATS)}))
+
+
+def list_export_formats() -> tuple[str, ...]:
+    """The names of all formats, without an import, which would take time."""
+    own = (module.name for module in iter_modules([str(_FORMATS_FOLDER)]))
+    return tuple(sorted({*own, *plugins.entry_points(plugins.EXPORT_FORMATS)}))
 
 
 def _recon_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +52,7 @@ def _retract_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
-    parser.add_argument("--to", required=True, choices=EXPORT_FORMATS, help="the format")
+    parser.add_argument("--to", required=True, choices=list_export_formats(), help="the format")
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
     add_multi_view_only(parser)
     parser.add_argument(

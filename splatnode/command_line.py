@@ -26,6 +26,7 @@ import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
 from splatnode.capture.process import plugins
+from splatnode.capture.process.arguments import Verb
 from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
 from splatnode.capture.process.terminal import is_output_closed, sanitize_output
@@ -41,10 +42,8 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 
-_CORE = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
-_FURTHER = {verb.name: verb for verb in plugins.load_all(plugins.VERBS).values()}
-# Those of the core, whose names no other has, then those that are installed beside it.
-VERBS = (*_CORE, *(verb for name, verb in _FURTHER.items() if name not in {core.name for core in _CORE}))
+# Of the core; further ones are entry points.
+VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,8 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    parser = build_parser()
-    args = parser.parse_args(argv)
+    given = sys.argv[1:] if argv is None else argv
+    parser = build_parser(given[0] if given else None)
+    args = parser.parse_args(given)
     if args.verb is None:
         parser.print_help(sys.stderr)
         return 2
@@ -91,7 +91,15 @@ class _Parser(argparse.ArgumentParser):
         super().error(sanitize_lines(message))
 
 
-def build_parser() -> argparse.ArgumentParser:
+def list_verbs() -> tuple[Verb, ...]:
+    """All verbs: those of the core, whose names no other has, then those that are installed beside it."""
+    own = {verb.name for verb in VERBS}
+    further = {verb.name: verb for verb in plugins.load_all(plugins.VERBS).values()}
+    return *VERBS, *(verb for name, verb in further.items() if name not in own)
+
+
+def build_parser(wanted: str | None = None) -> argparse.ArgumentParser:
+    """Returns the parser of all verbs, or of the core's verb `wanted` alone, for which nothing else is loaded."""
     parser = _Parser(
         prog="splatnode",
         description="Photographs in, camera poses and a 3D Gaussian scene out, on a CPU.",
@@ -99,7 +107,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.set_defaults(verb=None)
     verbs = parser.add_subparsers(metavar="VERB")
-    for verb in VERBS:
+    for verb in [verb for verb in VERBS if verb.name == wanted] or list_verbs():
         subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
         verb.add_arguments(subparser)
         subparser.add_argument("--debug", action="store_true", help="show the traceback of an error")
