@@ -16,7 +16,6 @@ import errno
 import logging
 import math
 import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -30,7 +29,13 @@ from zmq.utils.monitor import recv_monitor_message
 from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
-from splatnode.capture.process.files import LockHeld, NotOwnerOnly, exclusive, make_owner_only_folder
+from splatnode.capture.process.files import (
+    LockHeld,
+    NotOwnerOnly,
+    default_runtime_directory,
+    exclusive,
+    make_owner_only_folder,
+)
 from splatnode.capture.process.logs import is_logged
 from splatnode.capture.process.system import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.text import sanitize_text
@@ -281,20 +286,12 @@ def _notice_dead_links(socket: zmq.Socket) -> None:
 
 def runtime_directory(network: Network) -> Path:
     """The private folder of sockets and locks, made where it is absent. Raises NetworkError where it is not private."""
-    directory = network.directory or _default_directory()
+    directory = network.directory or default_runtime_directory()
     try:
         make_owner_only_folder(directory, "network.directory (or $XDG_RUNTIME_DIR), for each process,", ours=False)
     except NotOwnerOnly as error:
         raise NetworkError(str(error)) from error
     return directory
-
-
-def _default_directory() -> Path:
-    if os.environ.get("RUNTIME_DIRECTORY"):
-        return Path(os.environ["RUNTIME_DIRECTORY"].split(":")[0])
-    if os.environ.get("XDG_RUNTIME_DIR"):
-        return Path(os.environ["XDG_RUNTIME_DIR"], "splatnode")
-    return Path(tempfile.gettempdir(), f"splatnode-{os.getuid()}")
 
 
 def _address(network: Network, service: Service) -> str:
