@@ -16,6 +16,7 @@ import contextlib
 import ctypes
 import errno
 import fcntl
+import itertools
 import logging
 import mmap
 import os
@@ -31,7 +32,8 @@ from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
 
 log = logging.getLogger(__name__)
 
-_MOST_BYTES = 1 << 16  # of what is said meanwhile; what comes after it is lost, and that is told
+MOST_BYTES = 1 << 16  # of what is said meanwhile; what comes after it is lost, and that is told
+_times, _crashes = itertools.count(1), itertools.count(1)  # that a library has said something
 _UNBUFFERED = 2  # _IONBF of glibc's stdio.h
 _warning = threading.RLock()  # two threads that change and restore the filters would leave them changed
 _ENDING = ".said"  # of the files that outlive their process
@@ -39,7 +41,7 @@ _ENDING = ".said"  # of the files that outlive their process
 
 @contextlib.contextmanager
 def catch_library_lines() -> Iterator[None]:
-    """What is printed on C's `stderr` in here, in any thread, goes to the log once nobody is in here any more."""
+    """Logs what C prints on its `stderr` in here, in any thread, once nobody is in here any more."""
     _catcher.enter()
     try:
         yield
@@ -59,7 +61,7 @@ def ignore_file_warnings() -> Iterator[None]:
 
 
 def keep_last_words(folder: Path) -> None:
-    """From now on what is said lies in a file in `folder` meanwhile, made when it is needed, for one user alone."""
+    """Keeps what is said meanwhile in a file in `folder` from now on, made when it is needed, for one user alone."""
     _catcher.folder = folder
 
 
@@ -75,12 +77,21 @@ def tell_last_words(folder: Path) -> None:
                 _tell_last_words(path)
 
 
-def log_library_lines(data: bytes, **known: object) -> None:
-    """Logs what a library said, and what is `known` of that, as one event of one line."""
-    lines = data.decode(errors="replace").splitlines()
-    cut = {"cut": True} if len(data) >= _MOST_BYTES else {}
-    said = sanitize_text("; ".join(line.strip() for line in lines), LONGEST_TEXT)
-    event(log, logging.DEBUG, "library_said", **known, lines=len(lines), **cut, said=said)
+def log_library_lines(data: bytes, ended: int = 0) -> None:
+    """Logs what a library said, if anything, as one line: the 1st, 2nd, 4th, ... time, with how many times it was.
+
+    `ended`: the exit code of the process in which it said so; below 0, which is a signal, that is no mere detail.
+    """
+    if not data:
+        return
+    times = next(_crashes if ended < 0 else _times)
+    if is_logged(times):
+        lines = data.decode(errors="replace").splitlines()
+        fields: dict[str, object] = {"times": times, "lines": len(lines)}
+        fields |= {"cut": True} if len(data) >= MOST_BYTES else {}
+        fields |= {"ended": ended} if ended else {}
+        said = sanitize_text("; ".join(line.strip() for line in lines), LONGEST_TEXT)
+        event(log, logging.INFO if ended < 0 else logging.DEBUG, "library_said", **fields, said=said)
 
 
 class _Catcher:
@@ -89,7 +100,7 @@ class _Catcher:
     def __init__(self) -> None:
         self.folder: Path | None = None
         self._lock = threading.Lock()
-        self._inside = self._times = 0
+        self._inside = 0
         self._memory: _Memory | None = None  # None before the first time, and where there is none
         self._is_tried = False
 
@@ -108,10 +119,7 @@ class _Catcher:
                 return
             self._memory.detach()
             data = self._memory.take()
-            self._times += bool(data)
-            times = self._times
-        if data and is_logged(times):
-            log_library_lines(data, times=times)
+        log_library_lines(data)
 
     def _find_memory(self) -> _Memory | None:
         libc = ctypes.CDLL(None)
@@ -130,7 +138,7 @@ class _Catcher:
         if self._memory is memory:
             memory.give_up()
             self._lock, self._memory = threading.Lock(), None
-            self._inside, self._times, self._is_tried = 0, 0, False
+            self._inside, self._is_tried = 0, False
 
 
 class _Memory:
@@ -140,16 +148,16 @@ class _Memory:
         """Raises OSError, ValueError."""
         self._libc, self._stderr = libc, ctypes.c_void_p.in_dll(libc, "stderr")  # the variable
         self._before: int | None = None
-        self._file, self._path = _create_file(folder)
-        self._bytes = mmap.mmap(-1 if self._file is None else self._file, _MOST_BYTES)
+        self._lock, self._path = _create_file(folder)
+        self._bytes = _map_file(self._path)
         libc.fmemopen.restype = ctypes.c_void_p
         libc.fmemopen.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p]
         libc.setvbuf.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_size_t]
         libc.ftell.restype, libc.ftell.argtypes = ctypes.c_long, [ctypes.c_void_p]
         libc.rewind.argtypes = [ctypes.c_void_p]
-        place = (ctypes.c_char * _MOST_BYTES).from_buffer(self._bytes)
+        place = (ctypes.c_char * MOST_BYTES).from_buffer(self._bytes)
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(place))  # C may write there for as long as the process lives
-        self._stream: int | None = libc.fmemopen(ctypes.addressof(place), _MOST_BYTES, b"w")
+        self._stream: int | None = libc.fmemopen(ctypes.addressof(place), MOST_BYTES, b"w")
         if self._stream is None:
             raise OSError(errno.ENOMEM, "no stream for what decoders say")
         libc.setvbuf(self._stream, None, _UNBUFFERED, 0)
@@ -159,12 +167,12 @@ class _Memory:
         self._before, self._stderr.value = self._stderr.value, self._stream
 
     def detach(self) -> None:
-        """Where somebody has set the variable meanwhile, it is left as it is."""
+        """Gives the variable back, unless somebody has set it meanwhile."""
         if self._stderr.value == self._stream:
             self._stderr.value = self._before
 
     def take(self) -> bytes:
-        """What was written since the last time."""
+        """Returns what was written since the last time."""
         size = self._libc.ftell(self._stream)
         if size <= 0:
             return b""
@@ -177,8 +185,8 @@ class _Memory:
         """In a copy of the process."""
         self.detach()
         atexit.unregister(self._remove)
-        if self._file is not None:
-            os.close(self._file)  # and with it the lock
+        if self._lock is not None:
+            os.close(self._lock)  # the other process holds it on
 
     def _remove(self) -> None:
         if self._path is not None:
@@ -199,7 +207,7 @@ def _create_file(folder: Path | None) -> tuple[int | None, Path | None]:
         return None, None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.posix_fallocate(descriptor, 0, _MOST_BYTES)  # writing to memory that the disk has no room for ends a process
+        os.posix_fallocate(descriptor, 0, MOST_BYTES)  # writing to memory that the disk has no room for ends a process
     except OSError as error:
         log.debug("what decoders say is in no file that outlives the process: %s", sanitize_text(error))
         os.close(descriptor)
@@ -208,8 +216,19 @@ def _create_file(folder: Path | None) -> tuple[int | None, Path | None]:
     return descriptor, path
 
 
+def _map_file(path: Path | None) -> mmap.mmap:
+    """Maps the file by another descriptor than that of the lock: the memory keeps it, in copies of the process, too."""
+    if path is None:
+        return mmap.mmap(-1, MOST_BYTES)
+    descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        return mmap.mmap(descriptor, MOST_BYTES)
+    finally:
+        os.close(descriptor)
+
+
 def _tell_last_words(path: Path) -> None:
-    data = read_own(path, _MOST_BYTES)
+    data = read_own(path, MOST_BYTES)
     descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import ctypes
+import itertools
 import logging
 import os
 import signal
@@ -27,7 +28,8 @@ pytestmark = pytest.mark.skipif(not hasattr(LIBC, "gnu_get_libc_version"), reaso
 
 @pytest.fixture
 def catcher(monkeypatch):
-    """One that nobody has used."""
+    """One that nobody has used, and to which nobody has said anything."""
+    monkeypatch.setattr(library_lines, "_times", itertools.count(1))
     new = library_lines._Catcher()
     monkeypatch.setattr(library_lines, "_catcher", new)
     return new
