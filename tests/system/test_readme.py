@@ -584,7 +584,8 @@ def test_live():
     fuzz = raw("fuzz")["campaigns"]["boundaries"]
     attacked, defects = len(fuzz["rows"]), fuzz["defects"]
     assert sum(row["cases"] for row in fuzz["rows"].values()) == fuzz["cases"]
-    says(f"| {fuzz['cases'] / 1e6:.1f} million structured cases on {attacked} boundaries | {defects} defects")
+    told = f"{defects} defect{'s' * (defects != 1)}"
+    says(f"| {fuzz['cases'] / 1e6:.1f} million structured cases on {attacked} boundaries | {told}")
 
 
 def test_viewer():
