@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -21,7 +20,6 @@ from tests.mutants.mutant import Mutant, apply_mutant
 _CORE = "recon/core"
 _ENDED_BY_TESTS = (1, 2)  # exit codes of pytest: a test failed; a file could not be read
 _NOTHING_RAN = (0, 5)  # all passed; there was no test
-_FAILED = re.compile(r"^(?:FAILED|ERROR) (tests/\S+?\.py(?:::\S+)?)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -81,29 +79,29 @@ class Copy:
         Raises RuntimeError where pytest could not run them.
         """
         left_out = [part for each in without for part in ("--deselect", each)]
-        options = ["-q", "-x", "-rfE", "--tb=no", "-p", "no:cacheprovider", "-m", "not long", *left_out]
+        options = ["-q", "-x", "--tb=no", "-p", "no:cacheprovider", "-m", "not long", *left_out]
         started = time.monotonic()
-        code, told = self._ask_nursery([*options, *tests], timeout_s)
-        seconds, found = time.monotonic() - started, _FAILED.search(told)
-        if code is None:
-            return TestRun(None, False, seconds)
-        if code in _ENDED_BY_TESTS and found:
-            return TestRun(found[1], True, seconds)
-        if code in _NOTHING_RAN:
-            return TestRun(None, True, seconds)
-        raise RuntimeError(f"pytest must pass or name a failed test, ended with {code}:\n{told[-3000:]}")
-
-    def _ask_nursery(self, arguments: Sequence[str], timeout_s: float) -> tuple[int | None, str]:
-        """The exit code of pytest, and what it wrote."""
-        assert self._nursery.stdin is not None and self._nursery.stdout is not None  # pipes
         output = self.folder.parent / "output"
+        code, test = self._ask_nursery([*options, *tests], timeout_s, output)
+        seconds = time.monotonic() - started
+        if code is None or code in _NOTHING_RAN:
+            return TestRun(None, code is not None, seconds)
+        if (code in _ENDED_BY_TESTS or code < 0) and test:  # below 0: a signal ended the process, such as SIGSEGV
+            return TestRun(test, True, seconds)
+        told = output.read_text(encoding="utf-8", errors="replace")[-3000:]
+        raise RuntimeError(f"pytest must pass or name a failed test, ended with {code}:\n{told}")
+
+    def _ask_nursery(self, arguments: Sequence[str], timeout_s: float, output: Path) -> tuple[int | None, str | None]:
+        """The exit code of pytest, which writes to `output`, and the first test that failed, or the last that ran."""
+        assert self._nursery.stdin is not None and self._nursery.stdout is not None  # pipes
         request = {"arguments": [*arguments], "output": str(output), "timeout_s": timeout_s}
         self._nursery.stdin.write(json.dumps(request) + "\n")
         self._nursery.stdin.flush()
         answer = self._nursery.stdout.readline()
         if not answer:
             raise RuntimeError("the process that runs pytest must answer, and has ended")
-        return json.loads(answer), output.read_text(encoding="utf-8", errors="replace")
+        told = json.loads(answer)
+        return told["code"], told["test"]
 
     def close(self) -> None:
         self._nursery.communicate()

@@ -155,6 +155,12 @@ def test_a_mutant_that_makes_tests_hang_survives_in_time(small):
     assert not fate.killed and fate.seconds < 20.0
 
 
+def test_a_mutant_that_ends_the_process_is_killed_by_the_test_that_ran(small):
+    _, copy = small
+    fate = Trial(copy, 60.0, False, {}).try_mutant(mutant("return 0.0", "return __import__('os').abort()"))
+    assert fate.killed and fate.test == "tests/recon/test_addition.py::test_nothing"
+
+
 def test_a_campaign_goes_on_where_it_ended(tmp_path, monkeypatch, capsys):
     out, tried = tmp_path / "mutants.json", []
     chosen = MUTANTS[:12]
