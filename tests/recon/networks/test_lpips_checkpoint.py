@@ -48,7 +48,7 @@ def test_the_arrays_get_the_names_and_the_order_of_axes_of_the_network(tmp_path)
 
 
 def test_colours_are_shifted_and_scaled_as_the_networks_were_trained():
-    """In [-1, 1]: less (-.030, -.088, -.188), over (.458, .448, .450). A network of one layer shows what it is given."""
+    """In [-1, 1]: less (-.030, -.088, -.188), over (.458, .448, .450). One layer shows what it is given."""
     alone = lpips.Lpips(
         (Layer(3, kernel=1, padding=0, tap=True),),
         {
