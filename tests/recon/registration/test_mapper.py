@@ -164,6 +164,12 @@ def test_false_alarms_fall_with_every_match_that_agrees():
     assert alarms[-1] < -25.0
 
 
+def test_the_number_of_false_alarms_by_hand():
+    """(10 - 7) choices of a model, C(10, 8) sets of 8 inliers, C(8, 7) samples among them, and .1 for the eighth."""
+    assert two_view.log10_number_of_false_alarms(10, 8, 7, 0.1) == pytest.approx(np.log10(3 * 45 * 8 * 0.1))
+    assert two_view.log10_number_of_false_alarms(10, 7, 7, 0.1) == 0.0  # a sample agrees with itself
+
+
 def test_pairs_vote_for_the_focal_length(pairs):
     votes = self_calibration.vote(list(pairs.values()), num_candidates=3)
     assert min(abs(np.log(vote * SIZE[0] / FOCAL)) for vote in votes) < 0.08
