@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     chosen = [each for each in MUTANTS if args.only in (None, each.name) and args.room in (None, each.room)]
     if not chosen:
         names = "\n  ".join(each.name for each in MUTANTS)
-        print(f"no mutant {args.only or 'in ' + args.room!r}; there are:\n  {names}", file=sys.stderr)
+        print(f"no mutant {args.only or f'in {args.room}'!r}; there are:\n  {names}", file=sys.stderr)
         return 2
     fates = read_fates(args.out) if args.resume else {}
     killers = {fate.digest: fate.test for fate in read_fates(RECORD).values() if fate.test is not None}

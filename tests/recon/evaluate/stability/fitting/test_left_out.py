@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,7 +118,7 @@ def test_the_report_counts_windows_with_a_told_lens_apart():
     told = [replace(sample, told=True) for sample in samples[:4]]
     matrix = [replace(sample, window=False) for sample in samples[:2]]
     numbers = fit.fit_without_each_scene(samples)
-    report = fit.make_report(fit.pair_held_out_models([*samples, *told, *matrix], numbers))
+    report: dict[str, Any] = fit.make_report(fit.pair_held_out_models([*samples, *told, *matrix], numbers))
     counts = {kind: report[kind]["sets"] for kind in ("windows", "windows_told", "matrix")}
     assert counts == {"windows": len(samples), "windows_told": 4, "matrix": 2}
     assert sum(row["sets"] for row in report["windows_by_count"].values()) == len(samples)
