@@ -1145,6 +1145,15 @@ def test_a_simulated_batch():
     )
 
 
+def test_faults_that_the_tests_find():
+    mutants = raw("mutants")["mutants"]
+    for room in {each["room"] for each in mutants}:
+        own = [each for each in mutants if each["room"] == room]
+        says(f"| {room} | {len(own)} | {sum(each['killed'] for each in own)} |")
+    killed = sum(each["killed"] for each in mutants)
+    says(f"{killed} of {len(mutants)}", *(f"\u201c{each['name']}\u201d" for each in mutants if not each["killed"]))
+
+
 def test_what_a_thousand_recordings_take():
     own = [row["seconds"]["total"] for row in ends("bench_7sets", method="balanced")]
     seconds = round(mean(own))

@@ -98,3 +98,15 @@ def test_foreign_cameras_file_is_a_clear_error(tmp_path, content):
     (tmp_path / "cameras.json").write_text(content)
     with pytest.raises(SceneFileError, match="cameras.json"):
         read_cameras(tmp_path / "cameras.json")
+
+
+def test_two_cameras_of_one_name_are_a_clear_error(tmp_path):
+    """Files of all formats, and edits of scenes, know a camera by its name."""
+    write(make_snapshot(), tmp_path)
+    file = tmp_path / "cameras.json"
+    content = json.loads(file.read_text())
+    for camera in content["cameras"]:
+        camera["name"] = "same.png"
+    file.write_text(json.dumps(content))
+    with pytest.raises(SceneFileError, match=r"cameras\.json has two cameras of one name"):
+        read_cameras(file)
