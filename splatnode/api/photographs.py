@@ -134,7 +134,7 @@ def apply_lens(given: Source, lens: LensChoice | None, images: Images) -> Source
     known = _key_lenses(lens, images)
     by_key: dict[str, Intrinsics] = {}
     for key, each in known.items():
-        of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera) == key)
+        of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera, frame.camera_id) == key)
         first = next(of_lens, frames[0])
         by_key[key] = intrinsics_of(each, first.width, first.height)
     return apply_lenses(given, Lenses(by_key))
