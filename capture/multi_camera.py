@@ -21,9 +21,10 @@ from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.image_file import UnusableImage, read_image_file
 from splatnode.capture.image_header import read_header
 from splatnode.capture.lerobot import data_set
+from splatnode.capture.logged.static_rig import read_rig
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import LONGEST_NAME, digest_name, guard_untrusted, sanitize_name, sanitize_text
-from splatnode.capture.rig import TOLERANCE_S, FrameSet, form_frame_sets
+from splatnode.capture.rig import TOLERANCE_S, FrameSet, Rig, form_frame_sets
 
 ALL = "all"  # in place of the names of cameras
 _COPIES = ("/compressed", "/theora", "/ffmpeg")  # behind a topic's name: ROS sends its images once more, packed
@@ -61,6 +62,17 @@ class CameraSet:
         parents = {camera.path.resolve().parent for camera in self.cameras}
         named = all(camera.path.name == camera.camera_id for camera in self.cameras)
         return self.cameras[0].path.parent if len(parents) == 1 and named and not self.is_film else None
+
+    def read_rig(self) -> Rig:
+        """Returns where the cameras stand to each other, as the static transforms of their one log tell.
+
+        Raises ValueError where they are of no log, or of several, and as `static_rig.read_rig`.
+        """
+        parts = {camera.camera_id: film.file_and_part(camera.path) for camera in self.cameras}
+        files = {file for file, _ in parts.values()}
+        if len(files) > 1 or min(files).suffix.lower() != film.MCAP:
+            raise ValueError("static transforms are those of one MCAP file; of other cameras, give the rig in a file")
+        return read_rig(min(files), {camera_id: topic for camera_id, (_, topic) in parts.items()})
 
     def form_frame_sets(self, names: Sequence[str] = ()) -> Sequence[FrameSet]:
         """Returns which photographs of folders, all or those called `names`, were taken together, in their order.

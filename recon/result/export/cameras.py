@@ -155,8 +155,8 @@ def _numbers_of(bounds: _Bounds) -> tuple[float, ...]:
 def _make_camera(record: _Camera, name: str) -> CameraEstimate:
     T_world_camera, K = np.array(record.T_world_camera), np.array(record.K)
     problem = find_camera_problem(T_world_camera, K, record.width, record.height)
-    if not is_printable(record.name) or record.name in ("", ".", "..") or "/" in record.name:
-        problem = "a name must be that of a file, in printable letters"
+    if not is_printable(record.name) or any(part in ("", ".", "..") for part in record.name.split("/")):
+        problem = "a name must be that of a file, or of one in a folder of its camera, in printable letters"
     if (record.stamp_ns is None) != (record.clock is None):
         problem = "stamp_ns and clock must be there both, or none"
     if record.bounds is not None and min(_numbers_of(record.bounds)) < 0:
