@@ -89,3 +89,35 @@ def test_without_its_photographs_there_is_none(tmp_path, capsys, damage, said):
     assert command_line.main(["export", str(folder), "--to", "dataset"]) != 0
     told = capsys.readouterr().err
     assert said in told and told.count("\n") == 1 and not (folder / "dataset").exists()
+
+
+def test_nerfstudio_finds_the_points(tmp_path):
+    """Where nerfstudio looks, in the world of its cameras; Open3D, by which it reads, takes these properties."""
+    folder = result(tmp_path, ("a.png", "b.jpg"))
+    assert command_line.main(["export", str(folder), "--to", "dataset"]) == 0
+    content = json.loads((folder / "dataset" / "transforms.json").read_text())
+    assert content["ply_file_path"] == "sparse_pc.ply"
+    data = (folder / "dataset" / content["ply_file_path"]).read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    assert head.decode().splitlines() == [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(make_snapshot().gaussians)}",
+        *(f"property float {name}" for name in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+    ]
+    rows = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    model = (folder / "dataset" / "sparse" / "0" / "points3D.txt").read_text().splitlines()
+    told = np.array([line.split()[1:7] for line in model if not line.startswith("#")], float)
+    assert np.allclose(rows["xyz"], told[:, :3], atol=1e-5) and np.array_equal(rows["rgb"], told[:, 3:])
+
+
+def test_photographs_of_several_cameras_lie_in_their_folders(tmp_path):
+    folder = tmp_path / "out"
+    (folder / "images" / "left").mkdir(parents=True)
+    (folder / "images" / "right").mkdir()
+    result(folder, ("left/1.png", "right/1.png"))
+    assert command_line.main(["export", str(folder), "--to", "dataset"]) == 0
+    frames = json.loads((folder / "dataset" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["images/left/1.png", "images/right/1.png"]
+    assert all((folder / "dataset" / frame["file_path"]).is_file() for frame in frames)
