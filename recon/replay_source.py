@@ -31,7 +31,7 @@ from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_name
 from splatnode.capture.quality import Limits
-from splatnode.capture.rig import TOLERANCE_S
+from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -183,19 +183,40 @@ def _is_film(path: Path) -> bool:
 
 
 def select_frames(
-    frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = ignore_progress
+    frames: Sequence[Frame],
+    views: int | None = None,
+    every_frame: bool = False,
+    tell: Tell = ignore_progress,
+    tolerance_s: float = TOLERANCE_S,
 ) -> Source:
-    """Photographs that lie in no folder, or what is used of them: as of a folder's.
+    """Photographs that lie in no folder, or what is used of them: as of a folder's. Of several cameras by frame sets.
 
     Raises ValueError as `load_source`.
     """
+    if any(frame.camera_id and frame.captured_at for frame in frames):
+        frames = _sort_by_sets(frames, tolerance_s)
+        if views:
+            _check_enough(views, len(frames))
+            sets = [each for each in group_frame_sets(frames, tolerance_s) if isinstance(each, tuple)]
+            return Source(_select_sets(sets, views), None, None)
     if views:
         return Source(tuple(frames[i] for i in _select_evenly(views, len(frames))), None, None)
     if every_frame or len(frames) <= ALL:
         return Source(tuple(frames), None, None)
     looked_through = report_items(frames, tell, "choosing keyframes", len(frames), "photograph")
-    choice = choose(looked_through, _OF_PHOTOGRAPHS, Limits(), MOST, "photograph")
+    choice = choose(looked_through, _OF_PHOTOGRAPHS, Limits(), MOST, "photograph", tolerance_s)
     return Source((*choice.keyframes, *choice.dropped), None, choice)
+
+
+def _sort_by_sets(frames: Sequence[Frame], tolerance_s: float) -> list[Frame]:
+    """The frames in the order of their frame sets, then those that are in none."""
+    by_name = {frame.name: frame for frame in frames}
+    timed = [(frame.name, frame.camera_id, frame.captured_at) for frame in frames if frame.captured_at is not None]
+    names = [name for each in form_frame_sets(timed, tolerance_s) for name in each.names.values()]
+    alone = [frame.name for frame in frames if frame.name not in set(names)]
+    ordered = [by_name[name] for name in (*names, *alone)]
+    stamps = sorted(frame.stamp_ns for frame in frames)
+    return [replace(frame, frame_id=i, stamp_ns=ns) for i, (frame, ns) in enumerate(zip(ordered, stamps, strict=True))]
 
 
 def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayRecording:

@@ -140,9 +140,10 @@ def _load_poses(file: Path, paths: list[Path]) -> Trajectory:
     from splatnode.capture.pose_files import read_poses  # brings what interpolates
 
     poses = read_poses(file)
-    if poses.by_name and not any(poses.names(frame_name(path)) for path in paths):
+    known = [*poses.by_camera, *poses.by_name]
+    if known and not any(poses.names(frame_name(path)) for path in paths):
         raise ValueError(
-            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(poses.by_name), 100)}, and none of "
+            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(known), 100)}, and none of "
             "those "
             f"here, such as {frame_name(paths[0])}; give the poses of these photographs"
         )
