@@ -111,16 +111,16 @@ class Session:
     ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
-        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the id of the camera that took
-        it, of several: photographs of different cameras share no lens. `pose` is where odometry or a tracker says that
-        its camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that is, metres and
-        degrees; default: what `config` says. Two poses or more give the scene metres and their axes. `motion` is how
-        wheels or an IMU say that the camera has moved since the photograph that was given before, whether that was
-        taken or not: T_previous_current (4, 4), metres; `motion_sigma`, metres and degrees, is of this motion alone.
-        One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
-        degrees; it gives `Result.map` its up. `right` is what the right half of a stereo camera saw at that moment,
-        rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
-        the scene metres, too.
+        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the id of the camera
+        that took it, of several: photographs of different cameras share no lens. `pose` is where odometry or a
+        tracker says that its camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma`
+        how unsure that is, metres and degrees; default: what `config` says. Two poses or more give the scene
+        metres and their axes. `motion` is how wheels or an IMU say that the camera has moved since the
+        photograph that was given before, whether that was taken or not: T_previous_current (4, 4), metres;
+        `motion_sigma`, metres and degrees, is of this motion alone. One or more give metres. `gravity` (3,) is
+        the direction of down in the camera's frame, `gravity_sigma` in degrees; it gives `Result.map` its up.
+        `right` is what the right half of a stereo camera saw at that moment, rectified, of the image's size,
+        and `baseline_m` how far it stands from the left one, metres: such pairs give the scene metres, too.
 
         Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
         milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
