@@ -104,6 +104,9 @@ class CameraEstimate:
     camera_id: str = ""  # of several cameras, which one; empty: there is one
     frame_set: int | None = None  # which images were taken together with it: all that have its number. None: none
     given: GivenCameraPose | None = None  # None: no pose was given, or nothing tells where its world lies
+    # As it was given, of the photograph in full size, whose distortion and other pixels than square ones were taken out
+    # of the image. None: none was given, or one of a pinhole with fx = fy
+    given_lens: Intrinsics | None = None
 
     @property
     def given_residual(self) -> tuple[float, float] | None:

@@ -43,6 +43,11 @@ LENS_MEANING = (
     "picture that K, width and height are of; null: nothing estimated was"
 )
 
+GIVEN_LENS_MEANING = (
+    "as it was given, in pixels of the photograph in full size: its distortion, and the difference of fx and fy, were "
+    "taken out of the picture that K, width and height are of; null: none was given, or it was a pinhole with fx = fy"
+)
+
 CONSISTENT_DEPTH_MEANING = (
     "share of the photograph's pixels, 0 to 1, whose depth is multi-view consistent: a point of another view has it, "
     "too; null: not known"
@@ -71,6 +76,7 @@ def make_camera_dict(camera: CameraEstimate) -> dict[str, object]:
         "width": camera.width,
         "height": camera.height,
         "lens": None if camera.lens is None else asdict(camera.lens),
+        "given_lens": None if camera.given_lens is None else asdict(camera.given_lens),
         "bounds": None if camera.bounds is None else asdict(camera.bounds),
         "consistent_depth": None if camera.consistent_depth is None else round(camera.consistent_depth, 4),
         "camera_id": camera.camera_id or None,
@@ -107,6 +113,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             "T_world_camera": "p_world = T_world_camera @ p_camera",
             "stamp_ns": STAMP_MEANING,
             "lens": LENS_MEANING,
+            "given_lens": GIVEN_LENS_MEANING,
             "bounds": BOUNDS_MEANING,
             "consistent_depth": CONSISTENT_DEPTH_MEANING,
             "frame_set": FRAME_SET_MEANING,
@@ -146,6 +153,7 @@ class _Camera(msgspec.Struct, frozen=True):
     camera_id: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)] | None = None
     frame_set: Annotated[int, msgspec.Meta(ge=0, lt=1 << 31)] | None = None
     given: _Given | None = None
+    given_lens: Intrinsics | None = None
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -209,6 +217,7 @@ def _make_camera(record: _Camera, name: str) -> CameraEstimate:
     size = record.width, record.height
     known = bounds, captured_at, record.lens, record.consistent_depth
     known = *known, sanitize_text(record.camera_id or ""), record.frame_set, _make_given(record.given)
+    known = *known, record.given_lens
     return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, *known)
 
 

@@ -77,7 +77,8 @@ def _load_image(camera: CameraEstimate, folders: Sequence[Path], used: ValueRang
         places = " or ".join(str(folder) for folder in folders)
         raise SceneFileError(f"the photograph {camera.name} is not in {places} any more: put it back there")
     try:
-        image = undistort_image(decode_any_image(read_image_file(path), used=used).image, camera.lens)
+        lens = camera.lens or camera.given_lens
+        image = undistort_image(decode_any_image(read_image_file(path), used=used).image, lens)
     except (UnusableImage, ValueError) as error:
         raise SceneFileError(f"{path}: {error}") from error
     height, width = image.shape[:2]
@@ -92,7 +93,7 @@ def _load_image(camera: CameraEstimate, folders: Sequence[Path], used: ValueRang
 def _resize_camera(camera: CameraEstimate, width: int, height: int) -> CameraEstimate:
     """The camera for its photograph of this many pixels, which has no distortion any more."""
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
-    return replace(camera, K=K, width=width, height=height, lens=None)
+    return replace(camera, K=K, width=width, height=height, lens=None, given_lens=None)
 
 
 def _encode_image(image: npt.NDArray[np.uint8], name: str) -> bytes:

@@ -15,6 +15,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.capture.lenses.lens import project
 from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.recon.pipeline import _add_given_lenses
 from tests.support.exported import make_snapshot, write
 
 WIDTH, HEIGHT = 1024, 768
@@ -121,3 +122,27 @@ def test_photographs_of_several_cameras_lie_in_their_folders(tmp_path):
     frames = json.loads((folder / "dataset" / "transforms.json").read_text())["frames"]
     assert [frame["file_path"] for frame in frames] == ["images/left/1.png", "images/right/1.png"]
     assert all((folder / "dataset" / frame["file_path"]).is_file() for frame in frames)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [replace(LENS, source="given"), replace(LENS, source="given", distortion=(), fy=760.0)],
+    ids=["distortion", "pixels that are not square"],
+)
+def test_a_lens_that_was_given_is_taken_out_and_told(tmp_path, given):
+    """cameras.json has K of the picture as it was modelled; the two focal lengths that were given stay two numbers."""
+    folder = tmp_path / "out"
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "a.png").write_bytes(encode_png(photograph(given)))
+    frame = Frame(0, "a.png", 0, photograph(given), given)
+    camera, *_ = make_snapshot().cameras
+    pinhole = undistort_frame(frame).intrinsics.resized(camera.width, camera.height)
+    snapshot = replace(make_snapshot(), cameras=(replace(camera, name="a.png", K=pinhole.K),))
+    write(_add_given_lenses(snapshot, [frame]), folder)
+    told = json.loads((folder / "cameras.json").read_text())["cameras"][0]
+    assert (told["given_lens"]["fx"], told["given_lens"]["fy"]) == (given.fx, given.fy) and told["lens"] is None
+    assert command_line.main(["export", str(folder), "--to", "dataset"]) == 0
+    (shown,) = json.loads((folder / "dataset" / "transforms.json").read_text())["frames"]
+    image = decode_image((folder / "dataset" / shown["file_path"]).read_bytes())[0]
+    seen = RAYS[:, :2] * [shown["fl_x"], shown["fl_y"]] + [shown["cx"], shown["cy"]]
+    assert np.abs(spots(image) - seen[np.argsort(seen[:, 1])]).max() < 0.3
