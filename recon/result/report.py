@@ -80,6 +80,9 @@ def _list_given_poses(cameras: Iterable[CameraEstimate]) -> list[dict[str, objec
     """The poses that were given, and how far they are from the estimated ones; the farthest first."""
     known = [(camera, camera.given, camera.given_residual) for camera in cameras]
     rows = [
+        (residual, camera, given) for camera, given, residual in known if given is not None and residual is not None
+    ]
+    return [
         {
             "name": camera.name,
             "residual_m": residual[0],
@@ -87,10 +90,8 @@ def _list_given_poses(cameras: Iterable[CameraEstimate]) -> list[dict[str, objec
             "sigma_m": given.sigma_m,
             "sigma_deg": given.sigma_deg,
         }
-        for camera, given, residual in known
-        if given is not None and residual is not None
+        for residual, camera, given in sorted(rows, key=lambda row: -row[0][0])
     ]
-    return sorted(rows, key=lambda row: -row["residual_m"])
 
 
 def collect_versions() -> dict[str, str | None]:

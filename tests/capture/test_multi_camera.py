@@ -15,6 +15,7 @@ from splatnode.capture.image_file import encode_png
 from splatnode.capture.keyframe_selection import Config, choose, group_frame_sets
 from splatnode.capture.multi_camera import ALL, CameraSet, CameraSource, find_cameras, select_cameras
 from splatnode.capture.quality import Limits
+from splatnode.capture.rig import TOLERANCE_S
 from tests.support import lerobot_sets, mcap_files
 
 
@@ -28,6 +29,14 @@ def write_photographs(folder: Path, names: list[str]) -> Path:
     for seed, name in enumerate(names):
         (folder / name).write_bytes(encode_png(picture(seed)))
     return folder
+
+
+def frames_of(cameras: CameraSet, *names: str) -> list[Frame]:
+    return [each for each in cameras.stream(names) if isinstance(each, Frame)]
+
+
+def sets_of(frames: list[Frame], tolerance_s: float = TOLERANCE_S) -> list[tuple[Frame, ...]]:
+    return [each for each in group_frame_sets(frames, tolerance_s) if isinstance(each, tuple)]
 
 
 def names_of(cameras: CameraSet, *names: str) -> list[str]:
@@ -46,12 +55,12 @@ def test_a_folder_per_camera_is_one_stream_of_frame_sets(tmp_path):
     for camera in ("right", "left"):
         write_photographs(tmp_path / camera, ["img2.png", "img10.png"])
     cameras = select_cameras([tmp_path])
-    frames = list(cameras.stream())
+    frames = frames_of(cameras)
     assert [each.name for each in frames] == ["left/img2.png", "right/img2.png", "left/img10.png", "right/img10.png"]
     assert [each.camera_id for each in frames] == ["left", "right"] * 2
     assert [each.frame_id for each in frames] == [0, 1, 2, 3]
     assert [each.stamp_ns for each in frames] == sorted(each.stamp_ns for each in frames)
-    assert [[frame.name for frame in frames] for frames in group_frame_sets(frames)] == [
+    assert [[frame.name for frame in frames] for frames in sets_of(frames)] == [
         ["left/img2.png", "right/img2.png"],
         ["left/img10.png", "right/img10.png"],
     ]
@@ -67,9 +76,9 @@ def test_times_in_names_tell_what_was_taken_together(tmp_path):
     cameras = select_cameras([tmp_path])
     assert [sorted(each.names) for each in cameras.form_frame_sets()] == [["a"], ["a", "b"], ["a"], ["b"]]
     assert len(replace(cameras, tolerance_s=0.001).form_frame_sets()) == 5
-    frames = list(cameras.stream())
-    assert [frame.captured_at.clock for frame in frames] == [Clock.UTC] * 5
-    assert [len(each) for each in group_frame_sets(frames)] == [1, 2, 1, 1]
+    frames = frames_of(cameras)
+    assert [frame.captured_at and frame.captured_at.clock for frame in frames] == [Clock.UTC] * 5
+    assert [len(each) for each in sets_of(frames)] == [1, 2, 1, 1]
 
 
 def test_equal_times_of_one_camera_tell_nothing_and_names_do(tmp_path):
@@ -102,18 +111,18 @@ def test_topics_of_a_log_are_cameras(tmp_path):
     file = mcap_files.write(tmp_path / "drive.mcap", messages)
     cameras = select_cameras([file])
     assert [each.camera_id for each in cameras.cameras] == ["left", "right", "wrist"]
-    frames = list(cameras.stream())
+    frames = frames_of(cameras)
     assert [frame.name for frame in frames[:4]] == [
         "left/000000.png",
         "right/000000.png",
         "wrist/000000.png",
         "left/000001.png",
     ]
-    assert [[each.camera_id for each in frames] for frames in group_frame_sets(frames)] == [
+    assert [[each.camera_id for each in frames] for frames in sets_of(frames)] == [
         ["left", "right"],
         ["wrist"],
     ] * 3
-    assert [len(each) for each in group_frame_sets(frames, 0.06)] == [3, 3, 3]
+    assert [len(each) for each in sets_of(frames, 0.06)] == [3, 3, 3]
     by_topic = select_cameras([file], ["/robot/left/image_raw", "wrist"])
     assert [each.camera_id for each in by_topic.cameras] == ["left", "wrist"]
     with pytest.raises(ValueError, match="there is no camera front; there are: left, right, wrist"):
@@ -127,8 +136,8 @@ def test_cameras_of_an_episode(tmp_path):
     episodes = [{key: [picture(10 * n + i) for i in range(4)] for n, key in enumerate(keys)} for _ in range(2)]
     data_set = lerobot_sets.write(tmp_path / "set", episodes)
     cameras = select_cameras([Path(f"{data_set}#1")])
-    frames = list(cameras.stream())
-    assert [len(each) for each in group_frame_sets(frames)] == [2] * 4
+    frames = frames_of(cameras)
+    assert [len(each) for each in sets_of(frames)] == [2] * 4
     assert [frame.name for frame in frames[:3]] == ["top/000000.png", "wrist/000000.png", "top/000001.png"]
     with pytest.raises(ValueError, match="several cameras are those of an episode"):
         find_cameras(data_set)
@@ -137,9 +146,9 @@ def test_cameras_of_an_episode(tmp_path):
 def test_several_films_are_cameras_of_their_names(tmp_path):
     films = [write_film(tmp_path / f"{camera}.mp4") for camera in ("left", "right")]
     cameras = select_cameras(films)
-    frames = list(cameras.stream())
+    frames = frames_of(cameras)
     assert cameras.is_film and cameras.folder is None
-    assert [len(each) for each in group_frame_sets(frames)] == [2] * 3
+    assert [len(each) for each in sets_of(frames)] == [2] * 3
     assert [each.camera_id for each in select_cameras(films, ["l", "r"]).cameras] == ["l", "r"]
     with pytest.raises(ValueError, match="--cameras must name each of the 2 sources"):
         select_cameras(films, ["left"])
@@ -173,8 +182,8 @@ def test_a_recording_of_each_camera_is_a_folder_of_it(tmp_path):
             for i in range(2):
                 stamp = Stamp(10**18 + i * 10**8, Clock.UTC)
                 recorder.write(Frame(i, f"{i}.png", i * 10**8, picture(i), None, captured_at=stamp))
-    frames = list(select_cameras([tmp_path]).stream())
-    assert [len(each) for each in group_frame_sets(frames)] == [2, 2]
+    frames = frames_of(select_cameras([tmp_path]))
+    assert [len(each) for each in sets_of(frames)] == [2, 2]
 
 
 def make_frame(camera: str, step: int, image: np.ndarray) -> Frame:

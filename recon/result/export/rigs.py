@@ -110,4 +110,5 @@ def _make_frame(
     reference = next(iter(rigs[rig].sensors))
     chosen = next((image for image in images if sensor_of[image] == reference), images[0])
     T_sensor_rig = rigs[rig].sensors[sensor_of[chosen]]
-    return ExportedFrame(rig, np.linalg.inv(cameras[chosen].T_world_camera @ T_sensor_rig), images)
+    T_rig_world = np.linalg.inv(cameras[chosen].T_world_camera @ T_sensor_rig)
+    return ExportedFrame(rig, np.asarray(T_rig_world, np.float64), images)

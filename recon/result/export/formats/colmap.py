@@ -75,7 +75,7 @@ def _ids(cameras: Sequence[CameraEstimate]) -> list[str]:
 
 
 def _compute_motion(T_world_camera: npt.NDArray[np.float64]) -> tuple[float, ...]:
-    return _format_motion(np.linalg.inv(T_world_camera))
+    return _format_motion(np.asarray(np.linalg.inv(T_world_camera), np.float64))
 
 
 def _format_motion(T: npt.NDArray[np.float64]) -> tuple[float, ...]:
