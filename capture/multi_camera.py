@@ -295,7 +295,7 @@ def select_cameras(
 
 
 def _names_of(camera: CameraSource) -> set[str]:
-    """By which a camera may be named: its id, and its topic, or its key in a data set."""
+    """Returns the names by which a camera may be called: its id, and its topic, or its key in a data set."""
     _, part = film.file_and_part(camera.path)
     return {camera.camera_id, part, part.lstrip("/"), part.partition("/")[2]} - {""}
 

@@ -102,7 +102,9 @@ def shapes(
             if state.photographs and camera.name in moment.photographs:
                 photographs.append(ImageQuad(camera.name, corners, moment.photographs[camera.name]))
     if state.given:
-        lines += [Lines(given_lines(camera, depth), colours[i], 1) for i, camera in others if camera.given is not None]
+        lines += [
+            Lines(draw_given_pose(camera, depth), colours[i], 1) for i, camera in others if camera.given is not None
+        ]
     if state.graph and moment.graph is not None:
         lines += _graph(moment.graph)
     if state.uncertainty:
@@ -164,7 +166,7 @@ def frustum(T_world_camera: Array, corners: Array) -> Array:
     return np.concatenate([*edges, roof])
 
 
-def given_lines(camera: CameraEstimate, depth: float) -> Array:
+def draw_given_pose(camera: CameraEstimate, depth: float) -> Array:
     """(11, 2, 3) a frustum at the pose that was given for the camera, and a line from there to where it is."""
     if camera.given is None:
         return np.zeros((0, 2, 3))

@@ -62,15 +62,15 @@ def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[s
     snapshot = moment.snapshot
     if camera is not None and camera.bounds is not None:
         bounds = format_camera_bounds(camera.bounds, snapshot.scale)
-        return [f"{camera.name}: {bounds}", *given_pose_lines(moment, camera)]
+        return [f"{camera.name}: {bounds}", *describe_given_poses(moment, camera)]
     known = format_widest_bounds(snapshot.cameras, snapshot.scale)
-    return [*([f"Cameras: {known}"] if known else []), *given_pose_lines(moment)]
+    return [*([f"Cameras: {known}"] if known else []), *describe_given_poses(moment)]
 
 
-def given_pose_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
+def describe_given_poses(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
     """How far the pose that was given for `camera`, or where there is none, the worst of all, is from its estimate."""
     of = moment.snapshot.cameras if camera is None else (camera,)
-    known = [(each, residual) for each in of if (residual := each.given_residual) is not None]
+    known = [(each, residual) for each in of if (residual := each.pose_residual) is not None]
     if not known:
         return []
     worst, (length, degrees) = max(known, key=lambda pair: pair[1][0])

@@ -17,7 +17,7 @@ from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.viewer.colours import camera_colours
-from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, frustum_depth, given_lines
+from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, draw_given_pose, frustum_depth
 from splatnode.viewer.state import Moment
 from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint, move_to_camera, overview
 
@@ -115,7 +115,7 @@ class ViserStage:
         label = self.server.scene.add_label(f"{name}/name", sanitize_text(camera.name), font_screen_scale=0.7)
         self._nodes |= {name: frustum, f"{name}/name": label}
         if camera.given is not None:  # no child of the frustum, which has the pose that was estimated
-            place, ends = f"/given/{own}", given_lines(camera, self._depth).astype(np.float32)
+            place, ends = f"/given/{own}", draw_given_pose(camera, self._depth).astype(np.float32)
             rgb = tuple(round(255 * part) for part in colour)
             self._nodes[place] = self.server.scene.add_line_segments(
                 place, points=ends, colors=rgb, thickness=1.0, thickness_units="screen"

@@ -132,7 +132,7 @@ _TRANSFORMS: dict[tuple[str, str], Callable[[bytes], list[Transform]]] = {
 
 
 def read_static_transforms(file: Path) -> dict[str, Transform]:
-    """What does not move in a log, by the child's frame.
+    """Reads what does not move in a log, by the child's frame.
 
     Of ROS what is on tf_static, of Foxglove what never changes. Raises UnusableMessage where a message cannot be read,
     and what reading the file raises.

@@ -78,7 +78,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
 
 def _list_given_poses(cameras: Iterable[CameraEstimate]) -> list[dict[str, object]]:
     """The poses that were given, and how far they are from the estimated ones; the farthest first."""
-    known = [(camera, camera.given, camera.given_residual) for camera in cameras]
+    known = [(camera, camera.given, camera.pose_residual) for camera in cameras]
     rows = [
         (residual, camera, given) for camera, given, residual in known if given is not None and residual is not None
     ]

@@ -109,7 +109,7 @@ class CameraEstimate:
     given_lens: Intrinsics | None = None
 
     @property
-    def given_residual(self) -> tuple[float, float] | None:
+    def pose_residual(self) -> tuple[float, float] | None:
         """How far the given pose is from the estimated one, metres and degrees; None where none was given."""
         if self.given is None:
             return None

@@ -41,7 +41,7 @@ LensChoice: TypeAlias = "Lens | Sequence[Lens | None] | Mapping[str, Lens]"
 
 @dataclass(frozen=True)
 class SeveralCameras:
-    """What a program says of several cameras: which are used, or which took which image and when."""
+    """The words of a program about several cameras: which are used, or which took which image and when."""
 
     cameras: str | Sequence[str] | None = None  # as `--cameras`
     camera_ids: Sequence[str | None] | None = None  # of each listed image

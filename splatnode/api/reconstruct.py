@@ -290,13 +290,11 @@ def reconstruct(
       `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
       uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
       than 30 photographs, keyframes are chosen.
-    - `cameras`: which cameras of one robot are used together: `"all"`, or a list of their names: the folders in a
-      folder, the image topics of an MCAP file, the cameras of an episode `"pusht#3"`; of a list of folders or films,
-      which are those of a camera each, their names. Frames are called `left/0001.jpg` then, and each camera has a lens
-      of its own. None: of one source one camera.
-    - `camera_ids`: of a list of photographs or pictures which camera took each (None: it is not known). `captured_at`:
-      when each was captured, a `Stamp`. Images of different cameras at one time, to `frame_set_tolerance_s` of
-      `config`, are a frame set: they are used, or left out, as one.
+    - `cameras`: which cameras of one robot are used together, as `--cameras`: `"all"`, or a list of their names: folders
+      of a folder, topics of an MCAP file, keys of an episode `"pusht#3"`; of a list of folders or films, a name for each.
+      Frames are called `left/0001.jpg` then, and each camera has its own lens.
+    - `camera_ids`, `captured_at`: of listed images which camera took each (None: not known), and when, a `Stamp`. What
+      different cameras took together, to `frame_set_tolerance_s` of `config`, is used, or left out, as one.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion; or a list of these, one of each photograph (None: not known); or a mapping of
       them by photograph, by camera id, by camera with which names begin, or by pattern: `{"left": a, "right": b}`.

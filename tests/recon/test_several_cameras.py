@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -22,6 +25,7 @@ from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 from splatnode.recon.replay_source import Request, Source, load_source, parse_sources
+from splatnode.recon.verification.decision import _find_other_lens_frames
 from tests.support import lerobot_sets, mcap_files
 
 PLACE = synthetic.Config(views=9, width=480, height=360, seed=1)
@@ -171,3 +175,20 @@ def test_a_folder_of_each_camera_is_one_result(seen, tmp_path, capsys):
     ]
     assert command_line.main(["export", str(out), "--to", "dataset"]) == 0
     assert (out / "dataset" / "images" / "side" / "0000.png").is_file()
+
+
+def test_a_camera_with_an_id_is_no_foreign_one():
+    """Images of another size are those of a camera that is known to be another one, and no photographs gone astray."""
+
+    def find(camera_id: str) -> list[str]:
+        frames = [Frame(i, f"{i}.png", i, np.zeros((8, 9 if i else 8, 3), np.uint8), None) for i in range(3)]
+        frames = [replace(frame, camera_id=camera_id and f"{camera_id}{frame.width}") for frame in frames]
+        keyframes = [SimpleNamespace(frame=frame, name=frame.name) for frame in frames]
+        cameras = [SimpleNamespace(index=i) for i in range(3)]
+        case = SimpleNamespace(
+            graph=SimpleNamespace(keyframes=keyframes), registration=SimpleNamespace(cameras=cameras)
+        )
+        return _find_other_lens_frames(cast(Any, case))
+
+    assert find("") == ["0.png"]
+    assert find("camera") == []

@@ -47,7 +47,7 @@ def test_a_given_pose_is_a_thin_frustum_with_a_line_to_the_estimated_one():
     assert np.allclose(lines.ends[0, 0], first.given.T_world_camera[:3, 3])
     assert shapes(there, replace(only, given=False), None).lines == ()
     assert text.bounds_lines(there) == ["Given poses: 1, at most 5 cm and 0 degrees off (0.png)"]
-    assert text.given_pose_lines(there, make_cameras()[1]) == []
+    assert text.describe_given_poses(there, make_cameras()[1]) == []
 
 
 def test_the_web_page_gets_both():

@@ -87,7 +87,7 @@ def make_camera_dict(camera: CameraEstimate) -> dict[str, object]:
 
 def make_given_dict(camera: CameraEstimate) -> dict[str, object] | None:
     """The pose that was given for a camera, beside the estimated one; None where none was."""
-    residual = camera.given_residual
+    residual = camera.pose_residual
     if camera.given is None or residual is None:
         return None
     return {

@@ -28,7 +28,7 @@ class ExportedRig:
 
 @dataclass(frozen=True, eq=False)
 class ExportedFrame:
-    """What a rig took at one time."""
+    """The images that a rig took at one time."""
 
     rig: int  # its place among the rigs
     T_rig_world: Array  # (4, 4)

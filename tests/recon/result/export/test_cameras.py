@@ -115,7 +115,7 @@ def test_camera_ids_frame_sets_and_given_poses_read_back_exactly(tmp_path):
         ("right/1.jpg", "right", 3),
     ]
     assert back[0].given is not None and np.array_equal(back[0].given.T_world_camera, T_given)
-    assert back[0].given_residual == pytest.approx((0.05, 0.0), abs=1e-6) and back[1].given is None
+    assert back[0].pose_residual == pytest.approx((0.05, 0.0), abs=1e-6) and back[1].given is None
     told = json.loads(file.read_text())["cameras"][0]["given"]
     assert (told["sigma_m"], told["sigma_deg"]) == (0.01, 0.5) and told["residual_m"] == pytest.approx(0.05)
     report = json.loads((tmp_path / "report.json").read_text())
