@@ -290,8 +290,8 @@ def reconstruct(
       `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
       uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
       than 30 photographs, keyframes are chosen.
-    - `cameras`: which cameras of one robot are used together, as `--cameras`: `"all"`, or a list of their names: folders
-      of a folder, topics of an MCAP file, keys of an episode `"pusht#3"`; of a list of folders or films, a name for each.
+    - `cameras`: which cameras of one robot are used together, as `--cameras`: `"all"`, or a list of names: folders of
+      a folder, topics of an MCAP file, keys of an episode `"pusht#3"`; of listed folders or films, a name for each.
       Frames are called `left/0001.jpg` then, and each camera has its own lens.
     - `camera_ids`, `captured_at`: of listed images which camera took each (None: not known), and when, a `Stamp`. What
       different cameras took together, to `frame_set_tolerance_s` of `config`, is used, or left out, as one.
