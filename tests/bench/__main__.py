@@ -53,6 +53,7 @@ BENCHMARKS = {
         "lens_assumptions",
         "registrations",
         "known_poses",
+        "several_cameras",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
