@@ -9,22 +9,22 @@ import json
 import logging
 import math
 import os
-import pkgutil
 import shutil
 import uuid
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 
-from splatnode.capture import cameras, daemon
-from splatnode.capture.config import CaptureConfig, camera_opener, is_live
+from splatnode.capture import daemon
+from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live
 from splatnode.capture.daemon import last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config, read_yaml
+from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.logs import use_structured_lines
 from splatnode.capture.process.terminal import report_items, say, show_progress, show_waiting
@@ -86,11 +86,15 @@ def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | Dropp
 def find(args: argparse.Namespace) -> int:
     """Lists the cameras that are connected, as lines that can be copied into a configuration."""
     found = {}
-    for module in pkgutil.iter_modules(cameras.__path__):
-        source = import_module(f"splatnode.capture.cameras.{module.name}")
+    for kind in [*Camera.kinds(), *Camera.kinds_elsewhere()]:
+        try:
+            source = Camera.load_module(kind)
+        except ConfigError as error:  # of another package: the other cameras are found all the same
+            say(str(error), error=True)
+            continue
         if hasattr(source, "find"):
             with show_waiting("looking for cameras"):
-                found[module.name] = source.find()
+                found[kind] = source.find()
     if args.json:
         print(json.dumps(found, indent=1))
         return EXIT_GOOD

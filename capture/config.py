@@ -71,9 +71,21 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
 
 
 class Camera(Plugin):
-    """The source of frames: a module of capture/cameras."""
+    """The source of frames: a module of capture/cameras, or one that another package brings."""
 
     package = "splatnode.capture.cameras"
+    needs = ("Config", "stream")
+    entry_points = "splatnode.cameras"
+
+
+class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Configures what a program of one's own sends in place of a camera: as CaptureConfig has it, without a camera."""
+
+    quality: Limits = Limits()
+    selection: keyframe_selection.Config = keyframe_selection.Config()
+    preview: Config = Config()
+    spool: spool.SpoolConfig = spool.SpoolConfig()
+    network: Network = Network()
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import cv2
 import msgspec
@@ -118,7 +118,7 @@ def capture(config: CaptureConfig) -> None:
     with ExitStack() as resources:
         manager = ServiceManager()
         server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
-        session = _Session(config, server, resources)
+        session = CaptureSession(config, server, resources)
         camera = config.camera
         opened = camera_opener(camera, config.body_mask)
         reader = resources.enter_context(Reader(opened, is_live(camera), config.reader))
@@ -144,7 +144,20 @@ def capture(config: CaptureConfig) -> None:
             log.warning("splatnode status will not know that this capture finished: %s", error)
 
 
-class _Session:
+class FrameSource(Protocol):
+    """What a heartbeat tells of where frames come from: a Reader, or a program."""
+
+    @property
+    def state(self) -> ReaderState: ...
+
+    @property
+    def why(self) -> str: ...
+
+    @property
+    def skipped(self) -> int: ...
+
+
+class CaptureSession:
     """The counters of one run, and the sockets that it sends to."""
 
     def __init__(self, config: CaptureConfig, server: KeyframeServer, resources: ExitStack) -> None:
@@ -154,7 +167,7 @@ class _Session:
         self._spool_full = ""
         self._started = False
         self._server = server
-        self._selector = Selector(config.selection, config.quality)
+        self._selectors: dict[str, Selector] = {}  # by camera id: each camera has views of its own
         self._problems = Problems()
         self._commands = resources.enter_context(CommandServer(CAPTURE_CONTROL, config.network, MarkProblemsSeen))
         self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW, config.network))
@@ -217,15 +230,39 @@ class _Session:
 
     def take(self, frame: Frame, state: ReaderState) -> None:
         """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
-        decision = self._selector.decide(frame, waiting=self._server.num_queued)
+        decision = self._decide(frame)
+        if decision.take:
+            self._attempt(frame.name, lambda: self._offer(frame, decision))
+        self._preview.do(lambda: self._send_preview(frame, decision, state))
+
+    def push(self, frame: Frame) -> Decision:
+        """As `take`, for a program that waits for the outcome. Raises SpoolFull, OSError, WireError (too large)."""
+        decision = self._decide(frame)
+        if decision.take:
+            try:
+                self._server.offer(frame)
+            except Exception:
+                self._find_selector(frame).forget_last()
+                self.not_taken += 1
+                raise
+            self._count_keyframe(frame, decision)
+        self._preview.do(lambda: self._send_preview(frame, decision, ReaderState.STREAMING))
+        return decision
+
+    def _decide(self, frame: Frame) -> Decision:
+        decision = self._find_selector(frame).decide(frame, waiting=self._server.num_queued)
         self.frames += 1
         self._rate.count()
         self.unusable += decision.candidate and not decision.take
-        if decision.take:
-            self._attempt(frame.name, lambda: self._offer(frame, decision))
         if decision.candidate:
             self.last_decision = f"{frame.name}: {'taken' if decision.take else 'not taken'}: {decision.reason}"
-        self._preview.do(lambda: self._send_preview(frame, decision, state))
+        return decision
+
+    def _find_selector(self, frame: Frame) -> Selector:
+        """Returns the selector of the frame's camera, which begins with its first frame."""
+        if frame.camera_id not in self._selectors:
+            self._selectors[frame.camera_id] = Selector(self.config.selection, self.config.quality)
+        return self._selectors[frame.camera_id]
 
     def drop(self, dropped: DroppedFrame) -> None:
         """Tells recon of a photograph that cannot be used, where half of the spool at least is free for keyframes.
@@ -239,14 +276,14 @@ class _Session:
         if not live or is_logged(self.dropped):
             event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason, number=self.dropped)
 
-    def send_heartbeat(self, reader: Reader) -> None:
+    def send_heartbeat(self, reader: FrameSource) -> None:
         """Sends a heartbeat, when one is due; none where what it tells cannot be had."""
         if time.monotonic() < self._next_beat:
             return
         self._next_beat = time.monotonic() + HEARTBEAT_S
         self._heart.do(lambda: self._heartbeats.send(self._status(reader)))
 
-    def _status(self, reader: Reader) -> CaptureStatus:
+    def _status(self, reader: FrameSource) -> CaptureStatus:
         quarantine = self._server.spool.quarantine
         return CaptureStatus(
             **self._heartbeat_numbers.next(),
@@ -300,8 +337,11 @@ class _Session:
 
     def _offer(self, frame: Frame, decision: Decision) -> None:
         if not self._deliver(frame):
-            self._selector.forget_last()
+            self._find_selector(frame).forget_last()
             return
+        self._count_keyframe(frame, decision)
+
+    def _count_keyframe(self, frame: Frame, decision: Decision) -> None:
         self.keyframes += 1
         event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.num_queued)
 

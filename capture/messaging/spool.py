@@ -280,13 +280,21 @@ class Spool:
         further_bytes = (self.config.max_mb << 20) - self.size_bytes
         return shortage(self.directory, further_bytes, "further keyframes (spool.max_mb)")
 
+    def check_room(self, size: int) -> None:
+        """Raises SpoolFull where a message of so many bytes would exceed the bound."""
+        if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
+            raise SpoolFull(
+                f"{len(self)} keyframes ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
+                "is splatnode recon running?"
+            )
+
     def store(self, key: Key, parts: Sequence[Part]) -> None:
         """Returns when the message is on the disk.
 
         Raises SpoolFull; what is_shortage tells, where another time may do.
         """
         size = size_in_file(parts)
-        self._make_sure_of_room(size)
+        self.check_room(size)
         path = self.directory / f"{self._number:012d}-{key.session}-{key.sequence}.frame"
         try:
             write_message(path, parts)
@@ -323,13 +331,6 @@ class Spool:
                 log.debug("an acknowledged keyframe cannot be removed: %s", error)
                 return
             self._acknowledged.pop()
-
-    def _make_sure_of_room(self, size: int) -> None:
-        if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
-            raise SpoolFull(
-                f"{len(self)} keyframes ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
-                "is splatnode recon running?"
-            )
 
     def _take_over(self, path: Path) -> None:
         _, session, sequence = path.stem.split("-")
