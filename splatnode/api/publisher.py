@@ -169,7 +169,7 @@ class Publisher:
         gravity_sigma: float | None = None,
         wait_s: float = 0.0,
     ) -> Published:
-        """Gives the node an image: an array (H, W, 3) uint8 RGB or (H, W) grey, a PIL image, or a JPEG's or PNG's bytes.
+        """Gives the node an image: an array (H, W, 3) uint8 RGB or (H, W) grey, a PIL image, or bytes of a JPEG or PNG.
 
         - `captured_at`: when it was taken: seconds since 1970, UTC, or a Stamp. None: now, or as its EXIF tells.
         - `camera_id`: which of several cameras took it. Each camera's keyframes are selected on their own.
