@@ -23,7 +23,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config, read_yaml
+from splatnode.capture.process.config import merge_config, parse_changes, parse_config, read_yaml
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.logs import use_structured_lines
@@ -31,7 +31,7 @@ from splatnode.capture.process.terminal import report_items, say, show_progress,
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
-from splatnode.capture.status import describe_heartbeat, heartbeats, mark_problems_seen
+from splatnode.capture.status import describe_heartbeat, heartbeats, mark_problems_seen, parse_camera_id
 
 log = logging.getLogger(__name__)
 
@@ -62,12 +62,10 @@ def record(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> CaptureConfig:
-    if args.intrinsics is None:
-        return load_config(args.config, CaptureConfig, args.set)
-    lens = {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
-    return parse_config(
-        merge_config(merge_config(read_yaml(args.config), lens), parse_changes(args.set)), CaptureConfig
-    )
+    own = {} if args.intrinsics is None else {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
+    if getattr(args, "camera_id", None) is not None:
+        own["camera_id"] = args.camera_id
+    return parse_config(merge_config(merge_config(read_yaml(args.config), own), parse_changes(args.set)), CaptureConfig)
 
 
 def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
@@ -131,21 +129,27 @@ def status(args: argparse.Namespace) -> int:
     )
     with show_waiting("listening for capture and recon"):
         found = heartbeats(network)
-    ended = last_run(network) if found["capture"] is None else None
+    silent_captures = {room for room in found if room != "recon" and found[room] is None}
+    ended = {room: run for room in silent_captures if (run := last_run(network, parse_camera_id(room))) is not None}
     if args.json:
         print(json.dumps(found))
     else:
         for room, fields in found.items():
-            silent = f"{room}: nothing heard of it; is `splatnode {room}` running, with the same `network` as here?"
-            if room == "capture" and ended is not None:
-                silent = f"{room}: {ended}"
+            silent = f"{room}: nothing heard of it; is `splatnode {_command(room)}` running, with the same `network`?"
+            if room in ended:
+                silent = f"{room}: {ended[room]}"
             for line in [silent] if fields is None else describe_heartbeat(room, fields):
                 say(line)
     if args.seen:
         for room, answer in mark_problems_seen(network, [room for room, fields in found.items() if fields]).items():
             say(f"{room}: {answer}")
-    heard = {room: bool(fields) for room, fields in found.items()} | ({"capture": True} if ended else {})
-    return EXIT_GOOD if all(heard.values()) else EXIT_SILENT
+    return EXIT_GOOD if all(fields or room in ended for room, fields in found.items()) else EXIT_SILENT
+
+
+def _command(room: str) -> str:
+    """`capture --camera-id left`."""
+    camera_id = parse_camera_id(room)
+    return f"capture --camera-id {camera_id}" if camera_id else room
 
 
 # The configurations that come with the package, with systemd's units and udev's rule: listed, or written to a folder.

@@ -15,7 +15,7 @@ from typing import Annotated, Protocol
 import cv2
 import msgspec
 
-from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live
+from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live, name_camera
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.keyframe_selection import Decision, Selector
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
@@ -72,28 +72,28 @@ class LastRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
-def begin_run(network: Network) -> None:
+def begin_run(network: Network, camera_id: str = "") -> None:
     """Forgets the last run: another one has begun. Raises NetworkError, OSError."""
-    _path(network).unlink(missing_ok=True)
+    _path(network, camera_id).unlink(missing_ok=True)
 
 
-def end_run(network: Network, frames: int, keyframes: int) -> None:
+def end_run(network: Network, frames: int, keyframes: int, camera_id: str = "") -> None:
     """Keeps that the recording has ended now. Raises NetworkError, OSError."""
-    path = _path(network)
+    path = _path(network, camera_id)
     path.unlink(missing_ok=True)
     with open(create_own(path), "wb") as file:
         file.write(msgspec.json.encode(LastRun(frames, keyframes, time.time())))
 
 
-def last_run(network: Network) -> LastRun | None:
+def last_run(network: Network, camera_id: str = "") -> LastRun | None:
     """How capture ended on this machine; None where that is not known, or it was stopped. Raises NetworkError."""
     with contextlib.suppress(OSError, StrayFile, msgspec.MsgspecError):
-        return record_in(read_own(_path(network), _MOST_BYTES), LastRun)
+        return record_in(read_own(_path(network, camera_id), _MOST_BYTES), LastRun)
     return None
 
 
-def _path(network: Network) -> Path:
-    return runtime_directory(network) / _FILE
+def _path(network: Network, camera_id: str) -> Path:
+    return runtime_directory(network) / (f"{_FILE}@{camera_id}" if camera_id else _FILE)
 
 
 log = logging.getLogger(__name__)
@@ -117,13 +117,15 @@ def capture(config: CaptureConfig) -> None:
     make_sure_of_room(_FILES + files_for_strangers(config.network, _SOCKETS), _THREADS)
     with ExitStack() as resources:
         manager = ServiceManager()
-        server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
+        server = resources.enter_context(
+            KeyframeServer(config.network, Spool(config.spool, config.camera_id), config.camera_id)
+        )
         session = CaptureSession(config, server, resources)
         camera = config.camera
-        opened = camera_opener(camera, config.body_mask)
+        opened = name_camera(camera_opener(camera, config.body_mask), config.camera_id)
         reader = resources.enter_context(Reader(opened, is_live(camera), config.reader))
         resources.callback(manager.stopping)
-        begin_run(config.network)
+        begin_run(config.network, config.camera_id)
         if why := server.spool.shortage():
             event(log, logging.WARNING, "disk_space", problem=why)
         sound_s = math.inf if is_live(camera) else time.monotonic() + SOUND_S  # a live camera proves it by a frame
@@ -139,7 +141,7 @@ def capture(config: CaptureConfig) -> None:
                 manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
         event(log, logging.INFO, "finished", frames=session.frames, keyframes=session.keyframes)
         try:
-            end_run(config.network, session.frames, session.keyframes)
+            end_run(config.network, session.frames, session.keyframes, config.camera_id)
         except OSError as error:
             log.warning("splatnode status will not know that this capture finished: %s", error)
 
@@ -169,9 +171,11 @@ class CaptureSession:
         self._server = server
         self._selectors: dict[str, Selector] = {}  # by camera id: each camera has views of its own
         self._problems = Problems()
-        self._commands = resources.enter_context(CommandServer(CAPTURE_CONTROL, config.network, MarkProblemsSeen))
-        self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW, config.network))
-        self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS, config.network))
+        self._commands = resources.enter_context(
+            CommandServer(CAPTURE_CONTROL.of(config.camera_id), config.network, MarkProblemsSeen)
+        )
+        self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW.of(config.camera_id), config.network))
+        self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS.of(config.camera_id), config.network))
         self._preview_numbers = Numbering(server.numbering.session)
         self._heartbeat_numbers = Numbering(server.numbering.session)
         self._next_preview_ns = 0

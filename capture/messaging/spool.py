@@ -240,17 +240,20 @@ class Key(NamedTuple):
 class Spool:
     """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
 
-    def __init__(self, config: SpoolConfig) -> None:
-        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate."""
+    def __init__(self, config: SpoolConfig, camera_id: str = "") -> None:
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate.
+
+        Captures beside one another have a camera id each, and so a spool each.
+        """
         self.config = config
-        self.directory = spool_directory(config)
+        self.directory = spool_directory(config, camera_id)
         make_owner_only_folder(self.directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
         self._resources = contextlib.ExitStack()
         self._resources.enter_context(exclusive(self.directory / "lock"))
         self._files: dict[Key, Path] = {}  # oldest first
         self._bytes: dict[Key, int] = {}
         self._acknowledged: list[Path] = []  # that are still to be removed
-        self.quarantine = Quarantine(self.directory.with_name("quarantine"), config.quarantine)
+        self.quarantine = Quarantine(self.directory.with_name(_name("quarantine", camera_id)), config.quarantine)
         remove_leftovers(self.directory)
         found = list_own_files(self.directory, _FILE, ".frame")
         for path in found:
@@ -355,5 +358,9 @@ def _number(path: Path) -> int:
     return int(path.name.split("-")[0])
 
 
-def spool_directory(config: SpoolConfig) -> Path:
-    return (config.directory or state_directory()) / "spool"
+def spool_directory(config: SpoolConfig, camera_id: str = "") -> Path:
+    return (config.directory or state_directory()) / _name("spool", camera_id)
+
+
+def _name(folder: str, camera_id: str) -> str:
+    return f"{folder}-{camera_id}" if camera_id else folder

@@ -133,7 +133,10 @@ class Daemon:
         self._inbox = Inbox()
         self._newest = _NewestSnapshot()
         self._problems = Problems()
-        self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
+        several = config.frame_sets, config.further_captures
+        self._intake = Intake(
+            network, config.reconstruction, self._store, self._inbox, self._problems, stopping, *several
+        )
         self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._scene_numbers = Numbering()

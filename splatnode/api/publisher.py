@@ -148,7 +148,9 @@ class Publisher:
 
     def _open(self) -> None:
         with ExitStack() as resources:
-            self._server = resources.enter_context(KeyframeServer(self._config.network, Spool(self._config.spool)))
+            own = self._config
+            spool = Spool(own.spool, own.camera_id)
+            self._server = resources.enter_context(KeyframeServer(own.network, spool, own.camera_id))
             self._session = CaptureSession(self._config, self._server, resources)
             self._resources = resources.pop_all()
 
