@@ -31,6 +31,7 @@ from splatnode.capture.process.terminal import report_items, say, show_progress,
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
+from splatnode.capture.several import choose_camera, list_cameras, run_captures
 from splatnode.capture.status import describe_heartbeat, heartbeats, mark_problems_seen, parse_camera_id
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,15 @@ EXIT_GOOD, EXIT_SILENT = 0, 75
 
 
 def capture(args: argparse.Namespace) -> int:
-    """Runs the capture process."""
+    """Runs the capture process; of a configuration with several cameras one for each."""
+    camera_ids = list_cameras(read_yaml(args.config)) if args.camera_id is None else []
+    if camera_ids:
+        if args.intrinsics is not None:
+            raise ConfigError("--intrinsics: has one lens, and there are several cameras; give each its `intrinsics`")
+        for each in camera_ids:
+            _config(argparse.Namespace(**{**vars(args), "camera_id": each}))  # what is wrong is told at once
+        use_structured_lines()
+        return run_captures(args.config, camera_ids, [part for each in args.set for part in ("--set", each)])
     config = _config(args)
     use_structured_lines()
     daemon.capture(config)
@@ -62,10 +71,15 @@ def record(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> CaptureConfig:
+    raw, camera_id = read_yaml(args.config), getattr(args, "camera_id", None)
+    if "cameras" in raw:
+        if camera_id is None:
+            raise ConfigError("cameras: this command is for one camera; give a configuration with `camera`")
+        raw = choose_camera(raw, camera_id)
     own = {} if args.intrinsics is None else {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
-    if getattr(args, "camera_id", None) is not None:
-        own["camera_id"] = args.camera_id
-    return parse_config(merge_config(merge_config(read_yaml(args.config), own), parse_changes(args.set)), CaptureConfig)
+    if camera_id is not None:
+        own["camera_id"] = camera_id
+    return parse_config(merge_config(merge_config(raw, own), parse_changes(args.set)), CaptureConfig)
 
 
 def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:

@@ -28,13 +28,13 @@ STEP_NS = {STEP_NS}
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    until_ns: int
+    until_s: float
     seed: int = 0
 
 
 def stream(config):
     number = time.time_ns() // STEP_NS
-    while (number := number + 1) * STEP_NS < config.until_ns:
+    while (number := number + 1) * STEP_NS < config.until_s * 1e9:
         time.sleep(max(0, number * STEP_NS - time.time_ns()) / 1e9)
         noise = np.random.default_rng([number, config.seed]).integers(0, 256, (24, 32, 3)).astype(np.uint8)
         image = np.kron(noise, np.ones((5, 5, 1), np.uint8))
