@@ -87,6 +87,7 @@ class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     preview: Config = Config()
     spool: spool.SpoolConfig = spool.SpoolConfig()
     network: Network = Network()
+    camera_id: CaptureId = ""
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

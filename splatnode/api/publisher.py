@@ -118,7 +118,8 @@ class Publisher:
 
         - `every_frame`: every image becomes a keyframe that is sharp, well exposed and no copy. Otherwise those that
           add parallax or coverage do, as of a camera.
-        - `camera_id`: of images for which `publish` names none.
+        - `camera_id`: of images for which `publish` names none, and of this publisher: with ids of their own several
+          programs and `splatnode capture` send to one node. Up to 32 letters, digits, - and _.
         - `changes`: such as `{"network": {"directory": "run"}, "spool": {"max_frames": 50}}`.
 
         Raises ValueError where the configuration cannot be used, and OSError where another process publishes already
@@ -128,8 +129,7 @@ class Publisher:
         settings = merge_config(settings, _plain(changes or {}))
         if every_frame:
             settings = merge_config(settings, {"selection": {"every_frame": True}})
-        own = parse_config(settings, ProgramConfig)
-        self._camera_id = _check_camera_id(camera_id)
+        own = parse_config(merge_config(settings, {"camera_id": camera_id} if camera_id else {}), ProgramConfig)
         known = {name: getattr(own, name) for name in own.__struct_fields__}
         self._config = CaptureConfig(Camera("program", None), **known)
         self._lock = threading.RLock()
@@ -141,7 +141,9 @@ class Publisher:
         try:
             self._open()
         except LockHeld as error:
-            raise BlockingIOError(f"another process gives this node images already: {error}") from error
+            raise BlockingIOError(
+                f"another process gives this node images already: {error}. Stop it, or give this one a camera_id"
+            ) from error
         self._serving = Unfailing("the answer to recon")
         self._thread = threading.Thread(target=self._serve, name="splatnode.Publisher", daemon=True)
         self._thread.start()
@@ -292,7 +294,7 @@ class Publisher:
         motion: tuple[npt.ArrayLike | None, tuple[float, float] | None],
     ) -> tuple[Frame, Motion | None]:
         """The frame, and the motions up to it. Raises TypeError, ValueError."""
-        by = self._camera_id if camera_id is None else _check_camera_id(camera_id)
+        by = self._config.camera_id if camera_id is None else _check_camera_id(camera_id)
         taken_at = _make_stamp(captured_at)
         made = _read_picture(image)
         taken_at = taken_at or made.captured_at or wall_clock(time.monotonic_ns())

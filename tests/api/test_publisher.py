@@ -55,7 +55,7 @@ def test_an_image_arrives_with_all_that_the_program_knows_of_it(tmp_path):
     image, mask = picture(), np.ones((240, 320), bool)
     mask[:60] = False
     lens = splatnode.Intrinsics(640, 480, 600, 600, 320, 240, "calibration")
-    with publisher(tmp_path, camera_id="left") as node, recon(tmp_path) as client:
+    with publisher(tmp_path, camera_id="left") as node, recon(tmp_path, camera_id="left") as client:
         first = node.publish(image, name="first", captured_at=1.5, intrinsics=lens, pose=POSE, gravity=(0, 1, 0))
         image[:] = 0  # the program may write to it again
         second = node.publish(picture(1), mask=mask, motion=STEP, motion_sigma=(0.01, 1.0), camera_id="left")
@@ -145,6 +145,8 @@ def test_one_program_or_camera_publishes_at_a_time(tmp_path):
         node.publish(picture())
         with pytest.raises(BlockingIOError, match="gives this node images already"):
             publisher(tmp_path)
+        with publisher(tmp_path, camera_id="right") as beside:  # another camera
+            assert beside.publish(picture(1)).taken and (node.waiting, beside.waiting) == (1, 1)
     with publisher(tmp_path) as node:
         assert node.waiting == 1
     with pytest.raises(RuntimeError, match="closed: begin another one"):
@@ -183,6 +185,8 @@ def test_what_cannot_be_used_is_refused_and_costs_nothing(tmp_path, arguments, e
 def test_a_configuration_that_cannot_be_used_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"camera: unknown key.*allowed here: quality"):
         splatnode.Publisher(changes=changes(tmp_path) | {"camera": {"kind": "v4l2"}})
+    with pytest.raises(ValueError, match="camera_id"):
+        splatnode.Publisher(camera_id="a/b", changes=changes(tmp_path))
     config = tmp_path / "publisher.yaml"
     config.write_text("selection: {coverage: 2}\n")
     with pytest.raises(ValueError, match=r"selection\.coverage"):

@@ -28,7 +28,9 @@ from splatnode.recon.daemon import ingest
 from splatnode.recon.daemon.captures import FrameSetConfig, FrameSetQueue, WaitingFrame
 from splatnode.recon.daemon.checkpoint.records import read_frame
 from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
+from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
 from splatnode.recon.daemon.worker import number_frame_sets
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
@@ -151,6 +153,28 @@ def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_p
     ]
     assert [each.frame_set for each in found] == [0, 0, 0, 3, 3, 3, 6, 6, 6]
     assert {server.acknowledged for server in servers.values()} == {3}
+
+
+def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path):
+    store = Store(tmp_path / "checkpoint")
+    for number, each in enumerate([frame("left", 100), frame("right", 105), frame("left", 300), frame("", 100)]):
+        store.add_frame(ReceivedFrame("0" * 32, number, each))
+    inbox = Inbox()
+    node = SimpleNamespace(
+        _store=store,
+        _inbox=inbox,
+        _config=DaemonConfig(),
+        _worker=SimpleNamespace(find_inactive_scenes=lambda name: []),
+        _remove_keyframe=lambda name: Daemon._remove_keyframe(node, name),
+    )
+    answer = Daemon._answer(node, RemoveKeyframe("right_105"))
+    assert answer.done and answer.message.endswith("with it left_100, taken at the same time")
+    assert store.names == {"left_300", "_100"}
+    assert Daemon._answer(node, RemoveKeyframe("left_300")).message == (
+        "left_300 is removed; the scene is built anew without it"
+    )
+    assert not Daemon._answer(node, RemoveKeyframe("right_105")).done
+    store.close()
 
 
 class Node:
