@@ -147,16 +147,15 @@ def capture(config: CaptureConfig) -> None:
 
 
 class FrameSource(Protocol):
-    """What a heartbeat tells of where frames come from: a Reader, or a program."""
+    """Describes where frames come from, for the heartbeat: a Reader, or a program."""
+
+    skipped: int
 
     @property
     def state(self) -> ReaderState: ...
 
     @property
     def why(self) -> str: ...
-
-    @property
-    def skipped(self) -> int: ...
 
 
 class CaptureSession:
@@ -172,10 +171,14 @@ class CaptureSession:
         self._selectors: dict[str, Selector] = {}  # by camera id: each camera has views of its own
         self._problems = Problems()
         self._commands = resources.enter_context(
-            CommandServer(CAPTURE_CONTROL.of(config.camera_id), config.network, MarkProblemsSeen)
+            CommandServer(CAPTURE_CONTROL.select_capture(config.camera_id), config.network, MarkProblemsSeen)
         )
-        self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW.of(config.camera_id), config.network))
-        self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS.of(config.camera_id), config.network))
+        self._previews = resources.enter_context(
+            Publisher(CAPTURE_PREVIEW.select_capture(config.camera_id), config.network)
+        )
+        self._heartbeats = resources.enter_context(
+            Publisher(CAPTURE_STATUS.select_capture(config.camera_id), config.network)
+        )
         self._preview_numbers = Numbering(server.numbering.session)
         self._heartbeat_numbers = Numbering(server.numbering.session)
         self._next_preview_ns = 0

@@ -77,7 +77,7 @@ def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, 
     A capture beside others is `capture@left`, by its camera id.
     """
     with contextlib.ExitStack() as listening:
-        services = {_name_capture(each): CAPTURE_STATUS.of(each) for each in find_captures(network) or [""]}
+        services = {_name_capture(each): CAPTURE_STATUS.select_capture(each) for each in find_captures(network) or [""]}
         services["recon"] = RECON_STATUS
         listeners = {room: listening.enter_context(_Listener(each, network)) for room, each in services.items()}
         found: dict[str, dict[str, Any] | None] = dict.fromkeys(listeners)
@@ -102,7 +102,7 @@ def mark_problems_seen(network: Network, rooms: list[str]) -> dict[str, str]:
     """Tells these processes that their problems have been seen; what they answered. Raises NotAllowed."""
     answers = {}
     for room in rooms:
-        service = RECON_CONTROL if room == "recon" else CAPTURE_CONTROL.of(parse_camera_id(room))
+        service = RECON_CONTROL if room == "recon" else CAPTURE_CONTROL.select_capture(parse_camera_id(room))
         try:
             answers[room] = ask(service, network, MarkProblemsSeen(), Answer, ANSWER_S).message
         except (NoAnswer, WireError) as error:

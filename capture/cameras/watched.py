@@ -64,7 +64,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the file beside an image tells of it, by the names that a message has for them."""
+    """Holds what the file beside an image tells of it, by the names that a message has for them."""
 
     captured_at: Stamp | None = None
     camera_id: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)] | None = None

@@ -169,7 +169,7 @@ class KeyframeServer(Endpoint):
         """
         with contextlib.ExitStack() as taken:
             taken.callback(spool.close)
-            service = CAPTURE_KEYFRAMES.of(camera_id)
+            service = CAPTURE_KEYFRAMES.select_capture(camera_id)
             super().__init__(network, offers=service)
             self._resources.push(taken.pop_all())
         self.spool = spool
@@ -311,7 +311,7 @@ class KeyframeClient(Endpoint):
         self._refused: dict[Key, str] = {}  # and why
         self._received: deque[ReceivedFrame] = deque()
         self._ready_said = -math.inf
-        self._dealer = self._connect(CAPTURE_KEYFRAMES.of(camera_id), zmq.DEALER, queue=QUEUE)
+        self._dealer = self._connect(CAPTURE_KEYFRAMES.select_capture(camera_id), zmq.DEALER, queue=QUEUE)
 
     def receive(self, timeout_s: float) -> ReceivedFrame | None:
         """The next frame, oldest first, each once; None where none comes in `timeout_s`. Raises NotAllowed."""

@@ -57,7 +57,7 @@ class Service:
         """Returns the service on which late subscribers ask for the state; it has a socket of its own."""
         return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
 
-    def of(self, camera_id: str) -> Service:
+    def select_capture(self, camera_id: str) -> Service:
         """Returns capture's service where several captures run, each with a camera id; itself for the empty one."""
         return Service(f"{self.name}@{camera_id}", self.pattern, self.tcp_port) if camera_id else self
 

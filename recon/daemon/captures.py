@@ -47,7 +47,7 @@ class WaitingFrame:
         return self.received.frame.camera_id if isinstance(self.received.frame, Frame) else ""
 
     @property
-    def taken_ns(self) -> int | None:
+    def capture_ns(self) -> int | None:
         """When it was taken, by its clock; None where nobody knows."""
         frame = self.received.frame
         return frame.captured_at.ns if isinstance(frame, Frame) and frame.captured_at is not None else None
@@ -77,8 +77,8 @@ class FrameSetQueue:
         self._waiting = [each for each in self._waiting if each.client.served is not False]  # now another recon's
         if not self._waiting:
             return []
-        alone = next((each for each in self._waiting if not each.camera_id or each.taken_ns is None), None)
-        first = alone or min(self._waiting, key=lambda each: each.taken_ns or 0)
+        alone = next((each for each in self._waiting if not each.camera_id or each.capture_ns is None), None)
+        first = alone or min(self._waiting, key=lambda each: each.capture_ns or 0)
         is_whole = alone is not None or (complete and self._is_whole(now_s))
         if not is_whole and now_s - first.arrived_s < self._config.wait_s:
             return []
@@ -93,12 +93,12 @@ class FrameSetQueue:
 
     def _find_set(self, first: WaitingFrame) -> list[WaitingFrame]:
         """The first frame, and the earliest of each other camera that was taken with it, in order of time."""
-        clock, begin_ns = _clock(first), first.taken_ns or 0
+        clock, begin_ns = _clock(first), first.capture_ns or 0
         found = {first.camera_id: first}
-        for each in sorted(self._waiting, key=lambda each: each.taken_ns or 0):
-            if _clock(each) is clock and (each.taken_ns or 0) - begin_ns <= 1e9 * self._config.tolerance_s:
+        for each in sorted(self._waiting, key=lambda each: each.capture_ns or 0):
+            if _clock(each) is clock and (each.capture_ns or 0) - begin_ns <= 1e9 * self._config.tolerance_s:
                 found.setdefault(each.camera_id, each)
-        return sorted(found.values(), key=lambda each: each.taken_ns or 0)
+        return sorted(found.values(), key=lambda each: each.capture_ns or 0)
 
 
 def _clock(each: WaitingFrame) -> object:
@@ -146,7 +146,7 @@ class Captures:
         self.close()
 
     @property
-    def refused(self) -> int:
+    def num_refused(self) -> int:
         return sum(client.refused for client in self._clients.values())
 
     @property
@@ -158,7 +158,7 @@ class Captures:
         return sum(client.duplicates for client in self._clients.values())
 
     @property
-    def served(self) -> bool | None:
+    def is_served(self) -> bool | None:
         """Whether all captures that are there send their keyframes here; None before one says so."""
         said = [client.served for client in self._clients.values() if client.served is not None]
         return all(said) if said else None

@@ -169,10 +169,10 @@ class Intake:
         before = self.refused
         while not self._stopping.is_set():
             together = captures.receive(timeout_s=RECEIVE_S)
-            self.refused, self.duplicates = before + captures.refused, captures.duplicates
+            self.refused, self.duplicates = before + captures.num_refused, captures.duplicates
             self._problems.count("keyframes that were refused", self.refused, captures.why_refused)
-            if captures.served is not None:
-                self._report_unconnected("" if captures.served else ANOTHER_IS_SERVED)
+            if captures.is_served is not None:
+                self._report_unconnected("" if captures.is_served else ANOTHER_IS_SERVED)
             arrived_s = time.monotonic()
             stored = [each for frame in together if (each := self._store_received(captures, frame)) is not None]
             if stored:  # what the camera could not give is told with the next scene, and disturbs none

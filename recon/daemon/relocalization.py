@@ -273,7 +273,7 @@ class PreviewReceiver:
         while not self._stopping.is_set():
             try:
                 camera_id = self._find_first()
-                with Subscriber(CAPTURE_PREVIEW.of(camera_id), self._network, PreviewHeader) as subscriber:
+                with Subscriber(CAPTURE_PREVIEW.select_capture(camera_id), self._network, PreviewHeader) as subscriber:
                     self._receive(subscriber, camera_id)
             except NotAllowed:  # which the keyframes' connection tells, too
                 self._stopping.wait(RETRY_S)

@@ -233,20 +233,20 @@ class Publisher:
     def flush(self, timeout_s: float | None = None) -> bool:
         """Waits until recon has answered all keyframes; False where some still wait after so many seconds."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        while self.waiting and not self._closed.is_set():
+        while self.num_waiting and not self._closed.is_set():
             if deadline is not None and time.monotonic() >= deadline:
                 return False
             self._closed.wait(_LOOK_S)
-        return not self.waiting
+        return not self.num_waiting
 
     @property
-    def waiting(self) -> int:
+    def num_waiting(self) -> int:
         """Returns how many keyframes recon has not answered; they lie on this disk."""
         with self._lock:
             return self._server.num_queued
 
     @property
-    def acknowledged(self) -> int:
+    def num_acknowledged(self) -> int:
         """Returns how many keyframes recon has on its disk, of those that it answered since this object was made."""
         return self._server.acknowledged
 
@@ -256,7 +256,7 @@ class Publisher:
         return self._server.is_connected
 
     @property
-    def refused(self) -> tuple[RefusedImage, ...]:
+    def refusals(self) -> tuple[RefusedImage, ...]:
         """Returns the images in the quarantine, the newest first: recon refused them, or the disk damaged them."""
         with self._lock:
             quarantine = self._server.spool.quarantine

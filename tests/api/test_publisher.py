@@ -62,7 +62,7 @@ def test_an_image_arrives_with_all_that_the_program_knows_of_it(tmp_path):
         third = node.publish(cv2.imencode(".jpg", picture(2))[1].tobytes(), camera_id="wrist")
         assert first == splatnode.Published("first", True, "every frame is taken") and second.taken and third.taken
         frames = receive(client, 3)
-        assert node.flush(10.0) and (node.waiting, node.acknowledged, node.is_connected) == (0, 3, True)
+        assert node.flush(10.0) and (node.num_waiting, node.num_acknowledged, node.is_connected) == (0, 3, True)
     assert np.array_equal(frames[0].image, picture()) and frames[0].captured_at == Stamp(1_500_000_000, Clock.UTC)
     assert frames[0].intrinsics is not None and frames[0].intrinsics.fx == 300 and frames[0].gravity.down == (0, 1, 0)
     assert np.array_equal(frames[0].given_pose.matrix, POSE) and frames[0].given_pose.sigma_m == 0.01
@@ -89,7 +89,7 @@ def test_keyframes_are_selected_as_a_cameras_for_each_camera_on_its_own(tmp_path
         assert node.publish(picture(1), camera_id="right").reason == "first view of this stream"
         again = node.publish(picture(0), camera_id="left")
         assert not again.taken and again.reason.startswith(("adds too little", "between two examinations"))
-        assert node.waiting == 2
+        assert node.num_waiting == 2
 
 
 def test_recon_may_be_killed_and_started_again_and_so_may_the_program(tmp_path):
@@ -100,7 +100,7 @@ def test_recon_may_be_killed_and_started_again_and_so_may_the_program(tmp_path):
             lost = wait_for(lambda: client.receive(0.05), 10.0)  # it dies before it has acknowledged that
         assert lost.frame.name == "0" and not node.flush(0.1)
     with publisher(tmp_path) as node, recon(tmp_path) as client:  # the program, too, has been started again
-        assert node.waiting == 3
+        assert node.num_waiting == 3
         node.publish(picture(3), name="3")
         assert [frame.name for frame in receive(client, 4)] == ["0", "1", "2", "3"] and node.flush(10.0)
 
@@ -136,8 +136,8 @@ def test_what_recon_refuses_is_told_with_its_reason(tmp_path):
     with publisher(tmp_path) as node, recon(tmp_path) as client:
         node.publish(picture(), name="bad")
         client.refuse(wait_for(lambda: client.receive(0.05), 10.0).key, "it cannot be stored")
-        assert node.flush(10.0) and node.acknowledged == 0
-        assert node.refused == (splatnode.RefusedImage("bad", "refused by recon: it cannot be stored"),)
+        assert node.flush(10.0) and node.num_acknowledged == 0
+        assert node.refusals == (splatnode.RefusedImage("bad", "refused by recon: it cannot be stored"),)
 
 
 def test_one_program_or_camera_publishes_at_a_time(tmp_path):
@@ -146,9 +146,9 @@ def test_one_program_or_camera_publishes_at_a_time(tmp_path):
         with pytest.raises(BlockingIOError, match="gives this node images already"):
             publisher(tmp_path)
         with publisher(tmp_path, camera_id="right") as beside:  # another camera
-            assert beside.publish(picture(1)).taken and (node.waiting, beside.waiting) == (1, 1)
+            assert beside.publish(picture(1)).taken and (node.num_waiting, beside.num_waiting) == (1, 1)
     with publisher(tmp_path) as node:
-        assert node.waiting == 1
+        assert node.num_waiting == 1
     with pytest.raises(RuntimeError, match="closed: begin another one"):
         node.publish(picture())
 
@@ -179,7 +179,7 @@ def test_what_cannot_be_used_is_refused_and_costs_nothing(tmp_path, arguments, e
     with publisher(tmp_path) as node:
         with pytest.raises(error, match=told):
             node.publish(**{"image": picture(), **arguments})
-        assert node.waiting == 0 and node.publish(picture()).taken
+        assert node.num_waiting == 0 and node.publish(picture()).taken
 
 
 def test_a_configuration_that_cannot_be_used_is_refused(tmp_path):
