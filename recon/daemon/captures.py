@@ -79,7 +79,9 @@ class FrameSetQueue:
             return []
         alone = next((each for each in self._waiting if not each.camera_id or each.capture_ns is None), None)
         first = alone or min(self._waiting, key=lambda each: each.capture_ns or 0)
-        is_whole = alone is not None or (complete and self._is_whole(now_s))
+        is_whole = alone is not None or self._is_whole(now_s)
+        if alone is None and not complete:
+            return []
         if not is_whole and now_s - first.arrived_s < self._config.wait_s:
             return []
         found = [first] if alone else self._find_set(first)
@@ -124,6 +126,7 @@ class Captures:
         self._network, self._recon, self._seen = network, recon, seen
         self._clients: dict[tuple[int, str], KeyframeClient] = {}
         self._sets = FrameSetQueue(config)
+        self._silent: set[tuple[int, str]] = set()  # captures beside others that have sent nothing yet
         self._resources = contextlib.ExitStack()
         self._poller = zmq.Poller()
         self._next_look_s = -math.inf
@@ -174,11 +177,12 @@ class Captures:
         while True:
             if time.monotonic() >= self._next_look_s:
                 self._look()
-            for client in self._clients.values():
+            for key, client in self._clients.items():
                 while (received := client.receive(0)) is not None:
+                    self._silent.discard(key)
                     self._sets.add(WaitingFrame(client, received, time.monotonic()))
             now_s = time.monotonic()
-            if found := self._sets.take(now_s, complete=now_s - self._opened_s > CONNECT_S):
+            if found := self._sets.take(now_s, complete=not self._silent or now_s - self._opened_s > CONNECT_S):
                 return found
             remaining = deadline - time.monotonic()
             if remaining <= 0:
@@ -202,4 +206,6 @@ class Captures:
         )
         client.register(self._poller)
         self._clients[port, camera_id] = client
-        self._opened_s = time.monotonic() if camera_id else self._opened_s
+        if camera_id:
+            self._opened_s = time.monotonic()
+            self._silent.add((port, camera_id))

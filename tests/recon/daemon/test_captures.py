@@ -24,7 +24,7 @@ from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.logs import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon import ingest
+from splatnode.recon.daemon import captures, ingest
 from splatnode.recon.daemon.captures import FrameSetConfig, FrameSetQueue, WaitingFrame
 from splatnode.recon.daemon.checkpoint.records import read_frame
 from splatnode.recon.daemon.checkpoint.store import Store
@@ -78,6 +78,12 @@ def test_a_frame_waits_for_the_other_cameras_and_no_longer_than_it_is_told():
     assert take_all(queue, 9.0) == [["right_9000"]]  # left has been silent for long
 
 
+def test_frames_wait_until_captures_that_were_just_found_have_sent_something():
+    queue = FrameSetQueue(FrameSetConfig())
+    queue.add(waiting(frame("left", 100)))
+    assert queue.take(0.5, complete=False) == [] and take_all(queue, 0.5) == [["left_100"]]
+
+
 def test_what_has_no_camera_or_no_time_is_alone_and_waits_for_nobody():
     queue = FrameSetQueue(FrameSetConfig())
     for item in (frame("left", 100), frame("", 100), frame("right", None), DroppedFrame("x", "for the test")):
@@ -115,7 +121,9 @@ def plain(monkeypatch):
     monkeypatch.setattr(ingest, "prepare", lambda each, _: SimpleNamespace(name=each.name, frame=each))
 
 
-def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain):
+def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain, monkeypatch):
+    monkeypatch.setattr(captures, "CONNECT_S", 30.0)  # a busy machine connects them one by one
+    patient = FrameSetConfig(wait_s=30.0)
     network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
     with ExitStack() as resources:
         servers = {
@@ -132,7 +140,7 @@ def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_p
                 server.offer(frame(camera_id, ms + offset))
         store = Store(tmp_path / "checkpoint")
         resources.callback(store.close)
-        intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping)
+        intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping, patient)
         thread = threading.Thread(target=intake.run)
         thread.start()
         found: list = []
@@ -144,7 +152,7 @@ def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_p
             return len(found) == 9 and not any(server.num_queued for server in servers.values())
 
         try:
-            wait_for(come, 20.0)
+            wait_for(come, 30.0)
         finally:
             stopping.set()
             thread.join()
