@@ -56,7 +56,7 @@ class Plugin:
         """The module of a kind that there is. Raises ConfigError where one of another package does not load."""
         if kind in cls._names():
             return import_module(f"{cls.package}.{kind}")
-        point, *others = entry_points(group=cls.entry_points, name=kind)
+        point, *others = entry_points(group=cls.entry_points or "", name=kind)
         if others:
             raise ConfigError(f"{kind}: several packages bring a plug-in of this name; uninstall all but one of them")
         brought = f"{kind}: the plug-in {point.value}{f' of {point.dist.name}' if point.dist else ''}"

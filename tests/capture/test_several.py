@@ -11,6 +11,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture import several
 from splatnode.capture.config import CaptureConfig
+from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config
@@ -78,7 +79,11 @@ def test_both_cameras_frames_come_and_ctrl_c_ends_all(tmp_path):
         for each in ("left", "right"):
             with KeyframeClient(network, camera_id=each) as client:
                 received = wait_for(lambda client=client: client.receive(0.05))
-                assert received.frame.camera_id == each and received.frame.name.startswith(f"{each}_")
+                assert (
+                    isinstance(received.frame, Frame)
+                    and received.frame.camera_id == each
+                    and received.frame.name.startswith(f"{each}_")
+                )
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
         assert not [path for path in (tmp_path / "run").iterdir() if path.is_socket()]
