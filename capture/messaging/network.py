@@ -16,6 +16,7 @@ import errno
 import logging
 import math
 import os
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -61,6 +62,10 @@ class Service:
         """Returns the service on which late subscribers ask for the state; it has a socket of its own."""
         return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
 
+    def select_capture(self, camera_id: str) -> Service:
+        """Returns capture's service where several captures run, each with a camera id; itself for the empty one."""
+        return Service(f"{self.name}@{camera_id}", self.pattern, self.tcp_port) if camera_id else self
+
 
 CAPTURE_KEYFRAMES = Service("capture.keyframes", Pattern.QUEUE, 0)
 CAPTURE_PREVIEW = Service("capture.preview", Pattern.BROADCAST, 1)
@@ -72,6 +77,10 @@ CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
 RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured
 RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
 
+
+# Of a capture beside others: a part of the names of its sockets, its spool and its frames.
+CaptureId = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,32}$", max_length=32)]
+_CAPTURE = re.compile(r"capture\.keyframes(?:@([A-Za-z0-9_-]{1,32}))?")
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +123,11 @@ class AlreadyRunning(LockHeld):
 
     def __init__(self, service: Service, pid: int | None) -> None:
         who = f"process {pid}" if pid else "another process"
-        super().__init__(f"{service.name} is offered by {who} already; stop it, or give another network.directory", pid)
+        super().__init__(
+            f"{service.name} is offered by {who} already; stop it, or give another network.directory. Captures "
+            "of several cameras each need a camera_id of their own (over tcp also a network.first_port)",
+            pid,
+        )
 
 
 class NotAllowed(PermissionError):
@@ -292,6 +305,18 @@ def runtime_directory(network: Network) -> Path:
     except NotOwnerOnly as error:
         raise NetworkError(str(error)) from error
     return directory
+
+
+def find_captures(network: Network) -> list[str]:
+    """The camera ids of the captures whose sockets lie in the folder, also of one that was killed; empty: has no id.
+
+    Over tcp there is one for each first port.
+    """
+    if network.tcp is not None:
+        return [""]
+    sockets = (path for path in runtime_directory(network).glob("capture.keyframes*") if path.is_socket())
+    found = (_CAPTURE.fullmatch(path.name) for path in sockets)
+    return sorted(each[1] or "" for each in found if each)
 
 
 def _address(network: Network, service: Service) -> str:

@@ -28,7 +28,14 @@ from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame, Stamp
-from splatnode.capture.odometry import GRAVITY_SIGMA_DEG, GivenPose, Gravity, Motion, make_given_pose
+from splatnode.capture.odometry import (
+    GRAVITY_SIGMA_DEG,
+    MOTION_SIGMA_M,
+    GivenPose,
+    Gravity,
+    Motion,
+    make_given_pose,
+)
 from splatnode.capture.pose_files import create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
@@ -41,8 +48,6 @@ from splatnode.recon.pipeline import check_baseline, reconstruct_source
 from splatnode.recon.replay_source import add_poses, apply_masks
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
-
-LEAST_STEP_SIGMA_M = 0.001  # standard deviation of a motion, however short it is
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
 Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
@@ -88,7 +93,7 @@ def next_motion(
         raise ValueError("motion is that since the photograph before: the first one has none")
     moved = _matrix(step)
     length = float(np.linalg.norm(moved[:3, 3]))
-    usual = max(config.motions_drift * length, LEAST_STEP_SIGMA_M), config.motions_sigma_deg
+    usual = max(config.motions_drift * length, MOTION_SIGMA_M), config.motions_sigma_deg
     return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
 
 

@@ -22,6 +22,7 @@ BENCHMARKS = {
         "soak",
         "siege",
         "capture",
+        "publisher",
     ),
     "quality": (
         "poses",

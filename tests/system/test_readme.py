@@ -557,6 +557,11 @@ def test_live():
     first, further = (", ".join(f"{row[key]:.1f}" for row in rows) for key in ("first_scene_s", "further_s_p95"))
     says(f"| {first} s | `live.json` |", f"same sets | {further} s | `live.json` |")
     says(f"besides decoding | {part(raw('capture')['besides_decoding'], 2)} of a core |")
+    pushed = raw("publisher")
+    each = pushed["median_ms_a_frame"]
+    assert pushed["publisher_over_camera"] <= 0.05
+    less = -100 * pushed["publisher_over_camera"]
+    says(f"{each['publisher']:.2f} ms of processor a frame against {each['camera']:.2f}: {less:.1f} % less")
     soak = raw("soak")
     assert soak["previews_lost"] == 0 and max(soak["memory_change"].values()) < 0.01
     says(f"previews within {soak['preview_latency_ms']['p99']:.0f} ms (99th percentile) | `soak.json` |")
