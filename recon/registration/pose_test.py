@@ -31,6 +31,7 @@ class Residual:
     turn: Array  # (3,) radians, about the camera's axes
     shift: Array  # (3,) along them, in the problem's unit
     probability: float  # that an error as large comes by chance; 1 where images tell nothing
+    squared: float = 0.0  # its length in its own sigmas, squared: by how much the cost falls without the pose
 
     @property
     def sigmas(self) -> float:
@@ -57,9 +58,9 @@ def residuals(
         of_residual = np.eye(6) - known if held[camera] else np.eye(6) + known
         variances, directions = np.linalg.eigh((of_residual + of_residual.T) / 2.0)
         counts = variances > _TOLD
-        squared = (directions.T @ error)[counts] ** 2 / variances[counts]
-        probability = float(chi2.sf(squared.sum(), counts.sum())) if counts.any() else 1.0
-        found[camera] = Residual(turn, shift, probability)
+        squared = float(((directions.T @ error)[counts] ** 2 / variances[counts]).sum())
+        probability = float(chi2.sf(squared, counts.sum())) if counts.any() else 1.0
+        found[camera] = Residual(turn, shift, probability, squared)
     return found
 
 

@@ -118,6 +118,22 @@ def test_a_false_pose_is_named_with_its_residual_and_its_image_placed_by_the_oth
     assert_bounds_hold(estimate, but=deviation.index)
 
 
+@pytest.mark.parametrize(("turned", "named"), [(None, []), (0, [0, 1]), (2, [2, 3])])
+def test_of_a_pair_beside_the_others_both_are_named_as_nothing_tells_which_is_false(
+    turned: int | None, named: list[int]
+) -> None:
+    Ts, graph = noisy(2), matched()
+    if turned is not None:
+        Ts[turned][:3, :3] = Ts[turned][:3, :3] @ Rotation.from_euler("x", 3.0, degrees=True).as_matrix()
+    pairs = {pair: graph.pairs[pair] for pair in ((0, 1), (2, 3), (4, 5))}
+    estimate = estimated(Ts, graph=replace(graph, pairs=pairs))
+    assert estimate.prior_world is not None
+    found = [estimate.graph.keyframes[each.index].frame.frame_id for each in estimate.prior_world.deviations]
+    assert sorted(found) == named
+    held = {estimate.graph.keyframes[index].frame.frame_id for index in estimate.prior_world.held}
+    assert held == set(range(6)) - set(named)
+
+
 def test_images_without_matches_are_where_their_poses_say() -> None:
     names = [frame.name for frame in photographs()]
     graph = matched().remove_keyframes(names[2:]).forget_pairs(names)
