@@ -29,7 +29,7 @@ _OWN_PX = 0.5  # of an observation, at REFERENCE_SIDE, before errors are known
 # true must not be let go for it
 _LESS_SURE = 2.5
 # Of an observation, at REFERENCE_SIDE, at least: what is alike in all of an image does not fall as aligned patches do
-_LEAST_PX = 0.3
+_LEAST_PX = 0.15
 _WIDE_PX = 12.0  # of the robust loss then: what poses do to all observations alike makes none of them an outlier
 # Twice the logarithm of the odds (100 to 1) by which a pose must be likelier false than another to be let go alone
 _DECIDED = 2.0 * math.log(100.0)

@@ -10,10 +10,11 @@ was ended goes on, and further seeds are added.
 from __future__ import annotations
 
 import argparse
+import functools
+import itertools
 import json
 import shlex
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import say
 from splatnode.recon.clock import Clock
-from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
+from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -39,6 +40,7 @@ SETS = tuple(f"{scene}:{views}" for views in (3, 6) for scene in SCENES)
 SIGMA_M, SIGMA_DEG = 0.001, 0.1  # of the poses, at 1 m from the scene
 FALSE_M, FALSE_DEG = 0.03, 3.0
 KINDS = ("clean", "turn", "shift")
+CONFIG = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "quick": True})
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,27 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE")
     args = parser.parse_args()
     found = _read(args.out)
-    for name in args.sets:
+    done, matched = {_key(row) for row in found}, functools.cache(_match)
+    # All sets and kinds of one seed after those of the other, so that what is there at any time is even
+    for seed, name in itertools.product(range(args.seeds), args.sets):
         scene, _, views = name.partition(":")
-        for row in _rows(args.scenes / scene, int(views), args.seeds, {_key(row) for row in found}):
+        for kind in KINDS if int(views) > 3 else KINDS[:1]:
+            if (scene, int(views), kind, seed) in done:
+                continue
+            row = _row(matched(args.scenes / scene, int(views)), kind, seed)
             found.append(row)
             say(_told(row))
             _write(args.out, found)
     say(in_words(found))
+
+
+@dataclass(frozen=True, eq=False)
+class _Set:
+    """A set of photographs, matched."""
+
+    scene: EvaluationScene
+    graph: ViewGraph
+    away: float  # the distance of what they see, in the scene's unit
 
 
 def _key(row: Row) -> tuple[str, int, str, int]:
@@ -95,40 +111,31 @@ def _write(out: Path, found: list[Row]) -> None:
     beside.replace(out)
 
 
-def _rows(folder: Path, views: int, seeds: int, done: set[tuple[str, int, str, int]]) -> Iterator[Row]:
-    """The rows that are not done yet; of each seed all kinds, so that what is there at any time is even."""
-    kinds = KINDS if views > 3 else KINDS[:1]
-    wanted = [(kind, seed) for seed in range(seeds) for kind in kinds if (folder.name, views, kind, seed) not in done]
-    if not wanted:
-        return
+def _match(folder: Path, views: int) -> _Set:
     scene = load_scene(folder)
     names = load_split(folder, list(scene.cameras), views).train
-    config = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "quick": True})
-    away = _distance(scene)
     frames = []
     for frame in scene.frames(names):
         lens = scene.cameras[frame.name].intrinsics_for(frame.width, frame.height)
         frames.append(replace(frame, intrinsics=replace(lens, source="given")))
-    alone = apply_changes(config, {"registration": {"trust_poses": False}})
+    alone = apply_changes(CONFIG, {"registration": {"trust_poses": False}})
     graph = estimate_frame_cameras(frames, load_prior(alone), alone, Clock())[0].graph
-    for kind, seed in wanted:
-        yield _row(scene, graph, config, away, kind, seed)
+    return _Set(scene, graph, _distance(scene))
 
 
-def _row(
-    scene: EvaluationScene, graph: ViewGraph, config: ReconstructionConfig, away: float, kind: str, seed: int
-) -> Row:
+def _row(matched: _Set, kind: str, seed: int) -> Row:
+    scene, graph = matched.scene, matched.graph
     generator = np.random.default_rng(seed)
     false = None if kind == "clean" else int(generator.integers(len(graph.keyframes)))
     true, keyframes = {}, []
     for index, keyframe in enumerate(graph.keyframes):
         true[keyframe.name] = T = scene.cameras[keyframe.name].T_world_camera.copy()
-        T[:3, 3] /= away
+        T[:3, 3] /= matched.away
         told = _disturbed(T, generator, kind if index == false else "clean")
         frame = replace(keyframe.frame, given_pose=make_given_pose(told, SIGMA_M, SIGMA_DEG))
         keyframes.append(replace(keyframe, frame=frame))
     begun = time.process_time()
-    estimate = estimate_cameras(replace(graph, keyframes=tuple(keyframes)), (), config)
+    estimate = estimate_cameras(replace(graph, keyframes=tuple(keyframes)), (), CONFIG)
     seconds = round(time.process_time() - begun, 2)
     given, registration = estimate.prior_world, estimate.registration
     matches = None if false is None else sum(len(pair.matches) for i, pair in graph.pairs.items() if false in i)
