@@ -44,8 +44,9 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
         type=_parse_two_sigmas,
         metavar="METRES,DEGREES",
         help="how unsure each pose is: the standard deviation of its position and of its orientation, absolute in the "
-        "poses' world. With a lens that is told (--intrinsics) the poses then hold the cameras, also where photographs "
-        "share no matches; poses that the photographs contradict are named and let go",
+        "poses' world; a file may tell it for single poses (two more columns of TUM, or sigma_m and sigma_deg in "
+        "transforms.json). With a lens that is told (--intrinsics) the poses then hold the cameras, also where "
+        "photographs share no matches; poses that the photographs contradict are named and let go",
     )
     parser.add_argument(
         "--poses-only-check",
@@ -83,9 +84,12 @@ def _parse_two_sigmas(text: str) -> tuple[float, float]:
     return metres, degrees
 
 
-def trusts_poses(args: argparse.Namespace) -> bool:
-    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far."""
-    return args.poses_sigma is not None and not args.poses_only_check
+def trusts_poses(args: argparse.Namespace, told: bool = False) -> bool:
+    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far.
+
+    `told`: their file says it.
+    """
+    return (told or args.poses_sigma is not None) and not args.poses_only_check
 
 
 def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
