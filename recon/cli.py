@@ -38,7 +38,7 @@ from splatnode.recon.evaluate.report import Bench, explain_missing_seconds, merg
 from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, format_run, run_bench
 from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric.arguments import collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
@@ -90,7 +90,9 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
     if known.poses is not None and trusts_poses(args, told=bool(own)):
         given = add_poses(given, known.poses, args.poses_sigma, own)
         known = replace(known, poses=None)  # they are the photographs' own now
-        config = apply_changes(config, {"registration": {"trust_poses": True}})
+        config = apply_changes(config, {"registration": {"trust_poses": True, **collect_drift_changes(args)}})
+    elif args.poses_drift is not None:
+        raise ValueError("--poses-drift is of poses that hold the cameras: give --poses FILE and --poses-sigma, too")
     needed_bytes = bound_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with hold_result_folder(args.out, needed_bytes), _viewer(args) as show:
         config = set_preview_interval(config, LOOK_EVERY) if args.view else config

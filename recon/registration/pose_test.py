@@ -47,14 +47,15 @@ def residuals(
     Where `problem.given` holds a camera, its residual is against all others; where not, against the images alone.
     """
     held = np.zeros(len(given.sigmas), bool) if problem.given is None else problem.given.is_held
-    blocks, found = covariance.cameras, {}
+    blocks, found, priors = covariance.cameras, {}, given.covariance
     for camera in np.flatnonzero(given.is_held).tolist():
         if not np.isfinite(blocks[camera]).all() or not blocks[camera].any():
             continue
         turn, shift, by_pose = deviation(problem, given, camera)
-        whiten = np.repeat(1.0 / given.sigmas[camera], 3)
-        error = whiten * np.concatenate([turn, shift])
-        known = (whiten[:, None] * by_pose) @ blocks[camera] @ (whiten[:, None] * by_pose).T
+        own = slice(6 * camera, 6 * camera + 6)
+        whiten = np.linalg.inv(np.linalg.cholesky(priors[own, own]))
+        error = whiten @ np.concatenate([turn, shift])
+        known = whiten @ by_pose @ blocks[camera] @ by_pose.T @ whiten.T
         of_residual = np.eye(6) - known if held[camera] else np.eye(6) + known
         variances, directions = np.linalg.eigh((of_residual + of_residual.T) / 2.0)
         counts = variances > _TOLD

@@ -143,9 +143,11 @@ def _first_tolerance(
     """Returns how far the poses' sigmas move points in the worst view, as a multiple of the largest error."""
     known = np.flatnonzero(given.poses.is_held)
     lenses = [problem.views[i].lens for i in known]
-    turns = given.poses.sigmas[known, 0] * np.array(focals)[lenses] / problem.scale[known]
-    # Positions that are known as well as orientations move points as much: how far the scene is is not known yet.
-    most = _FIRST_ERRORS * math.sqrt(2.0) * float(turns.max()) / config.incremental.triangulation.max_error_px
+    per_radian = np.array(focals)[lenses] / problem.scale[known]
+    # Absolute positions that are known as well as orientations move points as much, however far away the scene is
+    of_turns, of_both = math.sqrt(2.0) * given.poses.sigmas[known, 0], given.angle_sigmas[known]
+    angles = of_turns if given.poses.joint is None else np.maximum(of_turns, of_both)
+    most = _FIRST_ERRORS * float((angles * per_radian).max()) / config.incremental.triangulation.max_error_px
     return float(np.clip(most, incremental_mapper.SETTLED_TOLERANCE, _MOST_TOLERANCE))
 
 
