@@ -72,7 +72,7 @@ def main() -> None:
     found = _read(args.out)
     done, matched = {_key(row) for row in found}, functools.cache(_match)
     # All sets and kinds of one seed after those of the other, so that what is there at any time is even
-    for seed, name in itertools.product(range(args.seeds), args.sets):
+    for seed, name in itertools.product(range(args.seeds), map(str, args.sets)):
         scene, _, views = name.partition(":")
         for kind in KINDS if int(views) > 3 else KINDS[:1]:
             if (scene, int(views), kind, seed) in done:

@@ -63,7 +63,7 @@ def test_who_says_how_unsure_poses_are_trusts_them_unless_they_are_only_to_be_ch
 
 
 def test_drift_is_a_share_of_the_way_and_degrees():
-    parser = ArgumentParser()
+    parser = argparse.ArgumentParser()
     add_poses(parser)
     for text, told in (("2%", (0.02, 0.5)), ("1,0.2", (0.01, 0.2))):
         changes = collect_drift_changes(parser.parse_args(["--poses", "p", "--poses-drift", text]))
