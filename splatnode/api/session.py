@@ -122,10 +122,10 @@ class Session:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
         `intrinsics` is this photograph's lens, in place of the session's, and `camera` the id of the camera that
-        took it, of several: photographs of different cameras share no lens. `pose` is where odometry or a tracker says that its
-        camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that is, metres and
-        degrees; default: what the session's `poses_sigma` or `config` says. Two poses or more give the scene metres and
-        their axes, and hold the cameras where their sigmas are told and the lens is. `motion` is how
+        took it, of several: photographs of different cameras share no lens. `pose` is where odometry or a tracker
+        says that its camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that
+        is, metres and degrees; default: what the session's `poses_sigma` or `config` says. Two poses or more give the
+        scene metres and their axes, and hold the cameras where their sigmas are told and the lens is. `motion` is how
         wheels or an IMU say that the camera has moved since the photograph that was given before, whether that was
         taken or not: T_previous_current (4, 4), metres; `motion_sigma`, metres and degrees, is of this motion alone.
         One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
