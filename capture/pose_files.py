@@ -281,11 +281,11 @@ def _make_named_trajectory(
             by_name[name] = T
     _check(names, Ts)
     told = np.zeros((0, 2)) if sigmas is None else _check_sigmas(names, sigmas)
-    by_pose = {names[i]: told[i] for i in np.flatnonzero(np.isfinite(told[:, 0])) if names[i] in by_name}
-    for i in np.flatnonzero(np.isfinite(told[:, 0])):
-        folder = paths[i].rstrip("/").rpartition("/")[0].rpartition("/")[2]
-        if f"{folder}/{names[i]}" in by_camera:
-            by_pose[f"{folder}/{names[i]}"] = told[i]
+    by_pose: dict[str, Array] = {}
+    for path, name, own in zip(paths, names, told, strict=False):
+        folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
+        known = [each for each, held in ((name, by_name), (f"{folder}/{name}", by_camera)) if each in held]
+        by_pose.update({each: own for each in known if np.isfinite(own[0])})
     return Trajectory(by_name, by_camera=by_camera, sigmas_by_name=by_pose)
 
 
