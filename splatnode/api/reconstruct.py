@@ -367,16 +367,14 @@ def reconstruct(
     Raises TypeError and ValueError where an argument is not what it must be, and FileNotFoundError.
     """
     telling = tell or ignore_progress
-    check_count("views", views)
-    check_count("threads", threads)
+    check_counts(views=views, threads=threads)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     source = load_frames(images, views, every_frame, telling, several)
     source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
     source = apply_lens(source, intrinsics, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
-    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
-    flags["registration"] = {"trust_poses": True} if trusted else None
+    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
@@ -407,6 +405,17 @@ def build_config(
 def tolerance_of(preset: str, changes: Changes | None) -> float:
     """The seconds between images of a frame set, by the preset and what differs from it."""
     return build_config(preset, changes, {}, None, of_pictures=False).frame_set_tolerance_s
+
+
+def hold_poses(trusted: bool) -> Mapping[str, bool] | None:
+    """Returns what makes given poses hold the cameras; None: nothing."""
+    return {"trust_poses": True} if trusted else None
+
+
+def check_counts(**values: int | None) -> None:
+    """Raises ValueError for an argument, by its name, that is neither a number of things nor None."""
+    for name, value in values.items():
+        check_count(name, value)
 
 
 def check_count(name: str, value: int | None) -> None:
