@@ -11,6 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.image_arguments import Lens, make_intrinsics
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
 from splatnode.capture.exif import exif_exposure, exif_intrinsics, exif_time, read_tags
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
@@ -35,7 +36,6 @@ _EXIF = b"Exif\0\0"  # before the TIFF structure
 # Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `make_rgb_image`.
 Picture: TypeAlias = Any
 Images: TypeAlias = "str | PathLike[str] | Picture | Sequence[str | PathLike[str]] | Sequence[Picture]"
-Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 LensChoice: TypeAlias = "Lens | Sequence[Lens | None] | Mapping[str, Lens]"
 
 
@@ -175,7 +175,7 @@ def apply_lens(given: Source, lens: LensChoice | None, images: Images) -> Source
     for key, each in known.items():
         of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera, frame.camera_id) == key)
         first = next(of_lens, frames[0])
-        by_key[key] = intrinsics_of(each, first.width, first.height)
+        by_key[key] = make_intrinsics(each, first.width, first.height)
     return apply_lenses(given, Lenses(by_key))
 
 
@@ -192,18 +192,6 @@ def _key_lenses(lens: Any, images: Images) -> Mapping[str, Lens]:
     if len(lens) != len(names):
         raise ValueError(f"intrinsics must be one lens, or as many as there are images, {len(names)}; got {len(lens)}")
     return {name: each for name, each in zip(names, lens, strict=True) if each is not None}
-
-
-def intrinsics_of(lens: Lens, width: int, height: int) -> Intrinsics:
-    """A lens as it may be given, for photographs of this size. Raises TypeError, ValueError."""
-    if isinstance(lens, Intrinsics):
-        return lens
-    K = np.asarray(lens, np.float64) if isinstance(lens, (np.ndarray, list, tuple)) else None
-    if K is None or K.shape != (3, 3):
-        shape = type(lens).__name__ if K is None else str(K.shape)
-        raise TypeError(f"intrinsics must be splatnode.Intrinsics or a matrix K (3, 3), got {shape}")
-    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(width, height, fx, fy, cx, cy, source="given")
 
 
 def lenses(frames: Iterable[Any]) -> dict[str, Intrinsics]:

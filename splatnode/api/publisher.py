@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -14,13 +14,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.image_arguments import Lens, Sigmas, append_motion, make_gravity, make_intrinsics, make_pose
 from splatnode.capture.config import Camera, CaptureConfig, ProgramConfig
 from splatnode.capture.daemon import CaptureSession
 from splatnode.capture.frame import (
     Clock,
     DroppedFrame,
     Frame,
-    Intrinsics,
     Stamp,
     nearest_stamp,
     wall_clock,
@@ -30,18 +30,7 @@ from splatnode.capture.lens_file import assign_lens, check_fits
 from splatnode.capture.masks import apply_mask, parse_mask
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.spool import Spool, SpoolFull
-from splatnode.capture.odometry import (
-    GRAVITY_SIGMA_DEG,
-    MOTION_DRIFT,
-    MOTION_SIGMA_DEG,
-    MOTION_SIGMA_M,
-    SIGMA_DEG,
-    SIGMA_M,
-    GivenPose,
-    Gravity,
-    Motion,
-    make_given_pose,
-)
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.config import merge_config, parse_config, read_yaml
 from splatnode.capture.process.files import LockHeld
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
@@ -53,7 +42,6 @@ SILENT_S = 5.0  # after which status says that the program gives no image
 _LOOK_S = 0.01  # between looks at whether there is room, or all is answered
 
 Picture: TypeAlias = Any  # an array, a PIL image, or the bytes of a JPEG or PNG file
-LensOf: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 
 
 @dataclass(frozen=True)
@@ -163,7 +151,7 @@ class Publisher:
         name: str | None = None,
         captured_at: Stamp | float | None = None,
         camera_id: str | None = None,
-        intrinsics: LensOf | None = None,
+        intrinsics: Lens | None = None,
         mask: npt.ArrayLike | None = None,
         pose: npt.ArrayLike | None = None,
         pose_sigma: tuple[float, float] | None = None,
@@ -196,8 +184,8 @@ class Publisher:
             camera_id,
             intrinsics,
             mask,
-            (_make_pose(pose, pose_sigma), _make_gravity(gravity, gravity_sigma)),
-            (motion, motion_sigma),
+            (make_pose(pose, _pair(pose_sigma)), make_gravity(gravity, gravity_sigma)),
+            (motion, _pair(motion_sigma)),
         )
         deadline = time.monotonic() + wait_s
         while True:
@@ -288,7 +276,7 @@ class Publisher:
         name: str | None,
         captured_at: Stamp | float | None,
         camera_id: str | None,
-        lens: LensOf | None,
+        lens: Lens | None,
         mask: npt.ArrayLike | None,
         told: tuple[GivenPose | None, Gravity | None],
         motion: tuple[npt.ArrayLike | None, tuple[float, float] | None],
@@ -299,7 +287,10 @@ class Publisher:
         made = _read_picture(image)
         taken_at = taken_at or made.captured_at or wall_clock(time.monotonic_ns())
         title = sanitize_text(name or "_".join(filter(None, (by, taken_at.seconds))), LONGEST_NAME)
-        moved = _append_motion(self._motions.get(by), title, *motion)
+        before = self._motions.get(by)
+        if motion[0] is not None and before is None:
+            raise ValueError("motion is that since the image before: the first one of a camera has none")
+        moved = append_motion(before, title, *motion)
         made = replace(
             made,
             name=title,
@@ -310,7 +301,7 @@ class Publisher:
             motion=moved,
         )
         if lens is not None:
-            known = _make_lens(lens, made.width, made.height)
+            known = make_intrinsics(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])
             made = assign_lens(made, known)
         return (made if mask is None else _apply_mask(made, mask)), moved
@@ -322,6 +313,11 @@ def _plain(changes: Mapping[str, Any]) -> dict[str, Any]:
         key: _plain(value) if isinstance(value, Mapping) else str(value) if isinstance(value, PathLike) else value
         for key, value in changes.items()
     }
+
+
+def _pair(sigmas: Sequence[float] | None) -> Sigmas | None:
+    """Two numbers in any sequence, as a tuple."""
+    return None if sigmas is None else tuple(sigmas)  # pyright: ignore[reportReturnType]  # checked where it is used
 
 
 def _check_camera_id(camera_id: str) -> str:
@@ -370,57 +366,3 @@ def _apply_mask(made: Frame, mask: npt.ArrayLike) -> Frame:
     if isinstance(used, DroppedFrame):
         raise ValueError(f"mask: {used.reason}")
     return used
-
-
-def _make_lens(lens: LensOf, width: int, height: int) -> Intrinsics:
-    if isinstance(lens, Intrinsics):
-        return lens
-    K = np.asarray(lens, np.float64)
-    if K.shape != (3, 3):
-        raise TypeError(f"intrinsics must be splatnode.Intrinsics or a matrix K (3, 3), got shape {K.shape}")
-    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(width, height, fx, fy, cx, cy, source="given")
-
-
-def _parse_sigmas(sigma: tuple[float, float], what: str) -> tuple[float, float]:
-    if len(sigma) != 2:
-        raise TypeError(f"{what} must be two numbers, metres and degrees; got {len(sigma)}")
-    return float(sigma[0]), float(sigma[1])
-
-
-def _make_pose(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None) -> GivenPose | None:
-    if pose is None:
-        if sigma is not None:
-            raise ValueError("pose_sigma says how unsure a pose is: give pose, too")
-        return None
-    sigmas = (SIGMA_M, SIGMA_DEG) if sigma is None else _parse_sigmas(sigma, "pose_sigma")
-    return make_given_pose(np.asarray(pose, np.float64), *sigmas)
-
-
-def _append_motion(
-    before: Motion | None, name: str, step: npt.ArrayLike | None, sigma: tuple[float, float] | None
-) -> Motion | None:
-    """The motions up to the image `name`; a chain begins with one that has no motion. Raises TypeError, ValueError."""
-    if step is None:
-        if sigma is not None:
-            raise ValueError("motion_sigma says how unsure a motion is: give motion, too")
-        return Motion(name)
-    if before is None:
-        raise ValueError("motion is that since the image before: the first one of a camera has none")
-    moved = np.asarray(step, np.float64)
-    if moved.shape != (4, 4):
-        raise TypeError(f"motion must be a matrix (4, 4), got shape {moved.shape}")
-    usual = max(MOTION_DRIFT * float(np.linalg.norm(moved[:3, 3])), MOTION_SIGMA_M), MOTION_SIGMA_DEG
-    return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
-
-
-def _make_gravity(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravity | None:
-    if gravity is None:
-        if sigma_deg is not None:
-            raise ValueError("gravity_sigma says how unsure gravity is: give gravity, too")
-        return None
-    down = np.asarray(gravity, np.float64)
-    if down.shape != (3,):
-        raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
-    x, y, z = down.tolist()
-    return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.image_arguments import Sigmas, parse_sigmas
 from splatnode.api.photographs import (
     Images,
     LensChoice,
@@ -28,21 +29,12 @@ from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame, Stamp
-from splatnode.capture.odometry import (
-    GRAVITY_SIGMA_DEG,
-    MOTION_SIGMA_M,
-    GivenPose,
-    Gravity,
-    Motion,
-    make_given_pose,
-)
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
 from splatnode.recon.replay_source import add_poses, apply_masks
@@ -50,7 +42,6 @@ from splatnode.recon.replay_source import add_poses, apply_masks
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
-Sigmas: TypeAlias = "tuple[float, float]"  # metres and degrees
 PosesSigma: TypeAlias = "Sigmas | Mapping[str, Sigmas] | Sequence[Sigmas | None]"
 Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
 
@@ -59,57 +50,7 @@ def sigmas_of(poses_sigma: PosesSigma | None) -> dict[str, float] | None:
     """Returns the settings of `metric` that the standard deviations of all poses change. Raises TypeError."""
     if poses_sigma is None or not _is_of_all(poses_sigma):
         return None
-    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), _parse_sigmas(poses_sigma, "poses_sigma"), strict=True))
-
-
-def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: MetricConfig) -> GivenPose | None:
-    """The pose of one photograph, T_world_camera (4, 4), metres; `sigma` None: as `config` has it.
-
-    Raises TypeError, ValueError.
-    """
-    if pose is None:
-        if sigma is not None:
-            raise ValueError("pose_sigma says how unsure a pose is: give pose, too")
-        return None
-    usual = config.poses_sigma_m, config.poses_sigma_deg
-    return make_given_pose(_matrix(pose), *(usual if sigma is None else _parse_sigmas(sigma, "pose_sigma")))
-
-
-def next_motion(
-    before: Motion | None,
-    name: str,
-    step: npt.ArrayLike | None,
-    sigma: tuple[float, float] | None,
-    config: MetricConfig,
-) -> Motion:
-    """The motions up to photograph `name`: with one `step` more, T_previous_current (4, 4), metres.
-
-    Without a step, or a photograph before it, a chain begins with it. `sigma` None: as `config` has it.
-    Raises TypeError, ValueError.
-    """
-    if step is None and sigma is not None:
-        raise ValueError("motion_sigma says how unsure a motion is: give motion, too")
-    if step is None:
-        return Motion(name)
-    if before is None:
-        raise ValueError("motion is that since the photograph before: the first one has none")
-    moved = _matrix(step)
-    length = float(np.linalg.norm(moved[:3, 3]))
-    usual = max(config.motions_drift * length, MOTION_SIGMA_M), config.motions_sigma_deg
-    return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
-
-
-def gravity_of(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravity | None:
-    """The direction of down in the camera's frame (3,). Raises TypeError, ValueError."""
-    if gravity is None:
-        if sigma_deg is not None:
-            raise ValueError("gravity_sigma says how unsure gravity is: give gravity, too")
-        return None
-    down = np.asarray(gravity, np.float64)
-    if down.shape != (3,):
-        raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
-    x, y, z = down.tolist()
-    return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))
+    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), parse_sigmas(poses_sigma, "poses_sigma"), strict=True))
 
 
 def poses_given(
@@ -152,36 +93,31 @@ def _is_of_all(sigma: PosesSigma) -> bool:
 
 def _list_named_sigmas(sigma: Any, images: Images) -> dict[str, Sigmas]:
     if isinstance(sigma, Mapping):
-        return {frame_name(Path(name)): _parse_sigmas(each, "poses_sigma") for name, each in sigma.items()}
+        return {frame_name(Path(name)): parse_sigmas(each, "poses_sigma") for name, each in sigma.items()}
     names = names_of(images)
     if len(sigma) != len(names):
         raise ValueError(f"poses_sigma must be one for each of the {len(names)} photographs, got {len(sigma)}")
     told = zip(names, sigma, strict=True)
-    return {name: _parse_sigmas(each, "poses_sigma") for name, each in told if each is not None}
+    return {name: parse_sigmas(each, "poses_sigma") for name, each in told if each is not None}
 
 
 def _list_named_poses(
     poses: Mapping[str, Matrix] | Sequence[Matrix | None], images: Images
 ) -> list[tuple[str, npt.NDArray[np.float64]]]:
     if isinstance(poses, Mapping):
-        return [(str(Path(name).parent / frame_name(Path(name))), _matrix(T)) for name, T in poses.items()]
+        return [(str(Path(name).parent / frame_name(Path(name))), parse_matrix(T)) for name, T in poses.items()]
     names = names_of(images)
     if len(poses) != len(names):
         raise ValueError(f"poses must be one for each of the {len(names)} photographs, got {len(poses)}")
-    return [(name, _matrix(T)) for name, T in zip(names, poses, strict=True) if T is not None]
+    return [(name, parse_matrix(T)) for name, T in zip(names, poses, strict=True) if T is not None]
 
 
-def _matrix(T: Any) -> npt.NDArray[np.float64]:
+def parse_matrix(T: Any) -> npt.NDArray[np.float64]:
+    """Returns a pose as a matrix (4, 4). Raises TypeError where it is none."""
     matrix = np.asarray(T, np.float64)
     if matrix.shape != (4, 4):
         raise TypeError(f"a pose must be T_world_camera (4, 4) or None, got shape {matrix.shape}")
     return matrix
-
-
-def _parse_sigmas(sigmas: Any, what: str) -> tuple[float, float]:
-    if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
-        raise TypeError(f"{what} must be metres and degrees, (0.01, 2.0), got {sigmas!r}")
-    return float(sigmas[0]), float(sigmas[1])
 
 
 # What a program knows of a scene's size: measured distances, printed markers, stereo pairs.
@@ -415,10 +351,5 @@ def hold_poses(trusted: bool) -> Mapping[str, bool] | None:
 def check_counts(**values: int | None) -> None:
     """Raises ValueError for an argument, by its name, that is neither a number of things nor None."""
     for name, value in values.items():
-        check_count(name, value)
-
-
-def check_count(name: str, value: int | None) -> None:
-    """Raises ValueError for an argument that is neither a number of things nor None."""
-    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-        raise ValueError(f"{name} must be a whole number of 1 or more, or None, got {value!r}")
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+            raise ValueError(f"{name} must be a whole number of 1 or more, or None, got {value!r}")

@@ -8,16 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
-from splatnode.api.photographs import Lens, Picture, intrinsics_of, lenses, make_frame
+from splatnode.api.image_arguments import append_motion, make_gravity, make_intrinsics, make_pose
+from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
     Changes,
     Scale,
     build_config,
-    check_count,
-    gravity_of,
+    check_counts,
     is_stereo,
-    next_motion,
-    pose_of,
+    parse_matrix,
     sigmas_of,
 )
 from splatnode.api.result import Result, result_of
@@ -81,7 +80,7 @@ class Session:
         Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given. There is no
         limit on the seconds (`budget_s`).
         """
-        check_count("threads", threads)
+        check_counts(threads=threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
         flags = {"seed": seed, "metric": sigmas_of(poses_sigma)}
@@ -144,10 +143,12 @@ class Session:
             frame = self._make_frame(image, number, name or f"{number:04d}.png", captured_at, intrinsics, camera)
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
-            given = pose_of(pose, pose_sigma, self._config.metric)
+            metric = self._config.metric
+            given = make_pose(None if pose is None else parse_matrix(pose), pose_sigma, metric.poses_sigmas)
             self._trust_poses(pose_sigma)
-            moved = next_motion(self._motion, frame.name, motion, motion_sigma, self._config.metric)
-            came = {"given_pose": given, "motion": moved, "gravity": gravity_of(gravity, gravity_sigma)}
+            usual = metric.motions_drift, metric.motions_sigma_deg
+            moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
+            came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
             frame = replace(frame, **came, right=_make_right_image(right, baseline_m))
             self._motion = moved
             self._given.add(frame.name)
@@ -219,13 +220,13 @@ class Session:
         made = make_frame(image, number, name, time.monotonic_ns(), captured_at)
         made = made if camera is None else replace(made, camera_id=sanitize_text(camera, LONGEST_NAME))
         if lens is not None:
-            known = intrinsics_of(lens, made.width, made.height)
+            known = make_intrinsics(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])
             return assign_lens(made, known)
         if self._lens is None:
             return made
         sizes = [*self._sizes, (made.width, made.height)]
-        known = intrinsics_of(self._lens, *sizes[0])
+        known = make_intrinsics(self._lens, *sizes[0])
         check_fits(known, sizes)
         return assign_lens(made, known)
 
