@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, reduce_image
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
-from splatnode.capture.rig import TOLERANCE_S
+from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 
 TRACKED_SIDE = 320  # pixels: the longer side of the images in which corners are tracked is at least this
 MAX_CORNERS = 100
@@ -258,6 +258,7 @@ class FrameSetSelector:
 
     def __init__(self, config: Config, limits: Limits) -> None:
         self.config, self.limits = config, limits
+        self._each_config = msgspec.structs.replace(config, per_second=1e9, patience_s=0.0)  # sets have the pace
         self._selectors: dict[str, Selector] = {}  # by camera id
         self._next_ns = 0  # nothing is examined before
 
@@ -265,9 +266,9 @@ class FrameSetSelector:
         """Whether each frame of a set becomes a keyframe; see `Selector.decide`."""
         if frames[0].stamp_ns < self._next_ns and not self.config.every_frame:
             return [Decision(False, "between two examinations", False) for _ in frames]
-        each_config = msgspec.structs.replace(self.config, per_second=1e9, patience_s=0.0)
         for frame in frames:
-            self._selectors.setdefault(frame.camera_id, Selector(each_config, self.limits))
+            if frame.camera_id not in self._selectors:
+                self._selectors[frame.camera_id] = Selector(self._each_config, self.limits)
         decisions = [self._selectors[frame.camera_id].decide(frame, waiting) for frame in frames]
         takes = any(decision.take for decision in decisions)
         if takes:
@@ -306,7 +307,7 @@ def _is_together(frames: Sequence[Frame], frame: Frame, tolerance_s: float) -> b
     ids = [each.camera_id for each in frames]
     if first is None or second is None or not frame.camera_id or frame.camera_id in ids or not all(ids):
         return False
-    return first.clock is second.clock and 0 <= second.ns - first.ns <= tolerance_s * 1e9
+    return are_taken_together(first, second, tolerance_s)
 
 
 # Keyframes of a recording: chosen as a live camera's are, and thinned evenly where they are more than can be used.

@@ -12,11 +12,11 @@ from typing import Annotated
 import msgspec
 import zmq
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import Frame, Stamp
 from splatnode.capture.messaging.keyframe_queue import READY_EVERY_S, KeyframeClient
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network, find_captures
-from splatnode.capture.rig import TOLERANCE_S
+from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 
 LOOK_S = 0.5  # between looks at whether another capture has come
 MOST_CAPTURES = 32
@@ -47,10 +47,14 @@ class WaitingFrame:
         return self.received.frame.camera_id if isinstance(self.received.frame, Frame) else ""
 
     @property
-    def capture_ns(self) -> int | None:
-        """When it was taken, by its clock; None where nobody knows."""
-        frame = self.received.frame
-        return frame.captured_at.ns if isinstance(frame, Frame) and frame.captured_at is not None else None
+    def captured_at(self) -> Stamp | None:
+        """When it was taken; None where nobody knows."""
+        return self.received.frame.captured_at if isinstance(self.received.frame, Frame) else None
+
+    @property
+    def capture_ns(self) -> int:
+        """When it was taken, by its clock; 0 where nobody knows."""
+        return 0 if self.captured_at is None else self.captured_at.ns
 
 
 class FrameSetQueue:
@@ -77,8 +81,8 @@ class FrameSetQueue:
         self._waiting = [each for each in self._waiting if each.client.served is not False]  # now another recon's
         if not self._waiting:
             return []
-        alone = next((each for each in self._waiting if not each.camera_id or each.capture_ns is None), None)
-        first = alone or min(self._waiting, key=lambda each: each.capture_ns or 0)
+        alone = next((each for each in self._waiting if not each.camera_id or each.captured_at is None), None)
+        first = alone or min(self._waiting, key=lambda each: each.capture_ns)
         is_whole = alone is not None or self._is_whole(now_s)
         if alone is None and not complete:
             return []
@@ -95,17 +99,12 @@ class FrameSetQueue:
 
     def _find_set(self, first: WaitingFrame) -> list[WaitingFrame]:
         """The first frame, and the earliest of each other camera that was taken with it, in order of time."""
-        clock, begin_ns = _clock(first), first.capture_ns or 0
-        found = {first.camera_id: first}
-        for each in sorted(self._waiting, key=lambda each: each.capture_ns or 0):
-            if _clock(each) is clock and (each.capture_ns or 0) - begin_ns <= 1e9 * self._config.tolerance_s:
+        begun, found = first.captured_at, {first.camera_id: first}
+        for each in sorted(self._waiting, key=lambda each: each.capture_ns):
+            stamp = each.captured_at
+            if begun and stamp and are_taken_together(begun, stamp, self._config.tolerance_s):
                 found.setdefault(each.camera_id, each)
-        return sorted(found.values(), key=lambda each: each.capture_ns or 0)
-
-
-def _clock(each: WaitingFrame) -> object:
-    frame = each.received.frame
-    return frame.captured_at.clock if isinstance(frame, Frame) and frame.captured_at is not None else None
+        return sorted(found.values(), key=lambda each: each.capture_ns)
 
 
 class Captures:
