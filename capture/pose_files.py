@@ -271,6 +271,7 @@ def _make_named_trajectory(
     by_name: dict[str, Array] = {}
     by_camera: dict[str, Array] = {}
     shared = {name for name, count in Counter(names).items() if count > 1}  # by cameras, each in its folder
+    keys: list[list[str]] = []  # of each pose, by which it is known
     for path, name, T in zip(paths, names, Ts, strict=True):
         folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
         of_camera = "" if folder in ("", ".", "..") else f"{folder}/{name}"
@@ -280,14 +281,11 @@ def _make_named_trajectory(
             by_camera[of_camera] = T
         if name not in shared:
             by_name[name] = T
+        keys.append([key for key in (of_camera, name if name not in shared else "") if key])
     _check(names, Ts)
     told = np.zeros((0, 2)) if sigmas is None else _check_sigmas(names, sigmas)
-    by_pose: dict[str, Array] = {}
-    for path, name, own in zip(paths, names, told, strict=False):
-        folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
-        known = [each for each, held in ((name, by_name), (f"{folder}/{name}", by_camera)) if each in held]
-        by_pose.update({each: own for each in known if np.isfinite(own[0])})
-    return Trajectory(by_name, by_camera=by_camera, sigmas_by_name=by_pose)
+    known = {key: own for each, own in zip(keys, told, strict=False) if np.isfinite(own[0]) for key in each}
+    return Trajectory(by_name, by_camera=by_camera, sigmas_by_name=known)
 
 
 def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:

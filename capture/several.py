@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from splatnode.capture.messaging.network import CAMERA_ID
 from splatnode.capture.process import python
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.process.logs import event
@@ -21,7 +22,6 @@ LOOK_S = 0.2  # between looks at whether a process has ended
 RESTART_S = 5.0  # before a camera's process that failed is started again
 END_S = 20.0  # for a process to end when it is told to
 EXIT_GOOD, FOR_A_HUMAN = 0, (2, 77)  # starting again does not help these
-_ID = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 
 def list_cameras(raw: Mapping[str, Any]) -> list[str]:
@@ -36,7 +36,7 @@ def list_cameras(raw: Mapping[str, Any]) -> list[str]:
     ):
         raise ConfigError("cameras: expected a camera for each camera id, such as {left: {kind: v4l2, device: ...}}")
     for camera_id in cameras:
-        if not _ID.fullmatch(str(camera_id)):
+        if not re.fullmatch(CAMERA_ID, str(camera_id)):
             raise ConfigError(
                 f"cameras: a camera id must be 1 to 32 letters, digits, - or _; got {sanitize_text(camera_id, 60)!r}"
             )

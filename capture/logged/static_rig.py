@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from splatnode.capture.logged.mcap import Topic, messages, topics
 from splatnode.capture.logged.messages import Cdr, Fields, UnusableMessage, read_picture
@@ -45,12 +46,7 @@ class Transform:
         norm = float(np.linalg.norm(quaternion))
         if not (np.isfinite([*self.translation, norm]).all() and norm > _LEAST_NORM):
             raise UnusableMessage(f"the transform of {sanitize_text(self.child, 100)} is no rigid motion")
-        x, y, z, w = quaternion / norm
-        T[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
+        T[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         T[:3, 3] = self.translation
         return T
 

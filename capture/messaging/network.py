@@ -79,8 +79,9 @@ RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
 
 
 # Of a capture beside others: a part of the names of its sockets, its spool and its frames.
-CaptureId = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,32}$", max_length=32)]
-_CAPTURE = re.compile(r"capture\.keyframes(?:@([A-Za-z0-9_-]{1,32}))?")
+CAMERA_ID = "[A-Za-z0-9_-]{1,32}"  # a regular expression
+CaptureId = Annotated[str, msgspec.Meta(pattern=f"^(?:{CAMERA_ID})?$", max_length=32)]
+_CAPTURE = re.compile(rf"capture\.keyframes(?:@({CAMERA_ID}))?")
 
 log = logging.getLogger(__name__)
 
