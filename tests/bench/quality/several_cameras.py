@@ -32,7 +32,7 @@ from splatnode.recon.evaluate.stability.perturbations import TrialImage, TrialSc
 from splatnode.recon.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
-from tests.bench.quality.lens_assumptions import window
+from tests.bench.quality.lens_assumptions import find_answered, format_answers, window
 
 COUNTS = (6, 9)  # images of a trial
 SETTINGS = ("told", "half", "nothing")  # of the lenses
@@ -155,20 +155,14 @@ def run_scene(
 
 def table(trials: Sequence[Trial]) -> Iterator[str]:
     """Of each mix and setting: trials, answered, wrong, and the share of those that one camera answers."""
-    alone = {(t.scene, t.count, t.setting) for t in trials if t.mix == ONE and t.published and not t.wrong}
+    alone = find_answered([t for t in trials if t.mix == ONE])
     groups: dict[tuple[str, str], list[Trial]] = defaultdict(list)
     for trial in trials:
         groups[trial.mix, trial.setting].append(trial)
     several = [t for t in trials if t.mix != ONE]
     totals = [(("all mixes", setting), [t for t in several if t.setting == setting]) for setting in SETTINGS]
     for (mix, setting), rows in [*sorted(groups.items()), *totals, (("all mixes", "any"), several)]:
-        answerable = [t for t in rows if (t.scene, t.count, t.setting) in alone]
-        good = sum(t.published and not t.wrong for t in answerable)
-        yield (
-            f"{mix:18s} {setting:8s} trials {len(rows):3d}, answered {sum(t.published for t in rows):3d}, "
-            f"wrong {sum(t.wrong for t in rows):2d}; one camera answered {len(answerable):3d}, of these answered and "
-            f"not wrong {good:3d} ({100 * good / max(1, len(answerable)):.0f} %)"
-        )
+        yield f"{mix:18s} {setting:8s} {format_answers(rows, alone, 'one camera')}"
 
 
 def main() -> None:
