@@ -90,27 +90,31 @@ def test_what_ros_2_writes_is_read(tmp_path):
         parse_tf_message(data[:60])
 
 
-def test_what_ros_own_library_writes_is_read():
-    typesys = pytest.importorskip("rosbags.typesys", reason="needs rosbags")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    kinds = store.types
-    stamp = kinds["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
-    moved = kinds["geometry_msgs/msg/Transform"](
-        translation=kinds["geometry_msgs/msg/Vector3"](x=1.0, y=2.0, z=3.0),
-        rotation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-    )
-    each = [
-        kinds["geometry_msgs/msg/TransformStamped"](
-            header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="base"), child_frame_id=child, transform=moved
-        )
-        for child in ("cam", "camera_b")
-    ]
-    name = "tf2_msgs/msg/TFMessage"
-    if name not in kinds:
-        store.register(typesys.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))
-        kinds = store.types
-    data = bytes(store.serialize_cdr(kinds[name](transforms=each), name))
-    assert [(one.child, one.translation) for one in parse_tf_message(data)] == [
+TF_TEXT = "geometry_msgs/TransformStamped[] transforms" + "".join(
+    f"\n{'=' * 80}\nMSG: {name}\n{text}"
+    for name, text in {
+        "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\nTransform transform",
+        "geometry_msgs/Transform": "Vector3 translation\nQuaternion rotation",
+        "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+        "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+        "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+        "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    }.items()
+)
+
+
+def test_what_an_own_writer_of_ros_2_writes_is_read(tmp_path):
+    writing = pytest.importorskip("mcap_ros2.writer", reason="needs mcap-ros2-support")
+    moved = {"translation": {"x": 1.0, "y": 2.0, "z": 3.0}, "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "base"}
+    each = [{"header": header, "child_frame_id": child, "transform": moved} for child in ("cam", "camera_b")]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = writing.Writer(file)
+        known = writer.register_msgdef("tf2_msgs/msg/TFMessage", TF_TEXT)
+        writer.write_message("/tf_static", known, {"transforms": each}, log_time=mcap_files.START_NS)
+        writer.finish()
+    found = read_static_transforms(tmp_path / "a.mcap").values()
+    assert [(one.child, one.translation) for one in found] == [
         ("cam", (1.0, 2.0, 3.0)),
         ("camera_b", (1.0, 2.0, 3.0)),
     ]
