@@ -10,7 +10,7 @@ import heapq
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -79,7 +79,12 @@ class CameraSet:
 
         Raises ValueError where one of the names is none, and what reading the folders raises.
         """
-        return self._form_frame_sets(_select_times(_list_times(self.cameras), names))
+        return self._form_frame_sets(_select_times(self._times, names))
+
+    @cached_property
+    def _times(self) -> _Times:
+        """The time of each photograph of the folders, whose files are read once for it."""
+        return _list_times(self.cameras)
 
     def _form_frame_sets(self, times: _Times) -> Sequence[FrameSet]:
         timed = ((join_name(*key), key[0], stamp) for key, stamp in times.items())
@@ -117,7 +122,7 @@ class CameraSet:
             yield each
 
     def _stream_folders(self, names: Sequence[str]) -> Iterator[Frame | DroppedFrame]:
-        times = _select_times(_list_times(self.cameras), names)
+        times = _select_times(self._times, names)
         streams = {}
         for camera in self.cameras:
             files = tuple(file for camera_id, file in times if camera_id == camera.camera_id)

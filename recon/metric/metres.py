@@ -158,11 +158,10 @@ def _estimate_scale_from_network(snapshot: Snapshot, sigma: float) -> Measuremen
 
 def _add_given_poses(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Snapshot:
     """The snapshot in the world of given poses, with these beside its cameras."""
-    usual = config.poses_sigma_m, config.poses_sigma_deg
     given = {
         name: GivenCameraPose(pose.matrix, pose.sigma_m, pose.sigma_deg) for name, pose in evidence.tracked.items()
     }
-    given |= {name: GivenCameraPose(T, *usual) for name, T in (evidence.poses or {}).items()}
+    given |= {name: GivenCameraPose(T, *config.poses_sigmas) for name, T in (evidence.poses or {}).items()}
     cameras = tuple(replace(camera, given=given.get(camera.name)) for camera in snapshot.cameras)
     return replace(snapshot, cameras=cameras)
 
