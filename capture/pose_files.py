@@ -265,27 +265,26 @@ def _make_named_trajectory(
     paths: Sequence[str], Ts: Array, sigmas: Sequence[Sequence[float]] | Array | None = None
 ) -> Trajectory:
     """As `create_trajectory`; Ts (M, 4, 4), sigmas (M, 2), NaN where a pose tells none."""
-    names = [PurePosixPath(path).name for path in paths]
+    names = [path if "/" not in path and path != "." else PurePosixPath(path).name for path in paths]
     if not names:
         raise ValueError("it holds no poses")
-    by_name: dict[str, Array] = {}
-    by_camera: dict[str, Array] = {}
+    by_name: dict[str, int] = {}  # places of the poses
+    by_camera: dict[str, int] = {}
     shared = {name for name, count in Counter(names).items() if count > 1}  # by cameras, each in its folder
-    keys: list[list[str]] = []  # of each pose, by which it is known
-    for path, name, T in zip(paths, names, Ts, strict=True):
+    for place, (path, name) in enumerate(zip(paths, names, strict=True)):
         folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
         of_camera = "" if folder in ("", ".", "..") else f"{folder}/{name}"
         if (name in shared and not of_camera) or of_camera in by_camera:
             raise ValueError(f"there are two poses of {sanitize_text(of_camera or name, 100)}")
         if of_camera:
-            by_camera[of_camera] = T
+            by_camera[of_camera] = place
         if name not in shared:
-            by_name[name] = T
-        keys.append([key for key in (of_camera, name if name not in shared else "") if key])
+            by_name[name] = place
     _check(names, Ts)
-    told = np.zeros((0, 2)) if sigmas is None else _check_sigmas(names, sigmas)
-    known = {key: own for each, own in zip(keys, told, strict=False) if np.isfinite(own[0]) for key in each}
-    return Trajectory(by_name, by_camera=by_camera, sigmas_by_name=known)
+    told = None if sigmas is None else _check_sigmas(names, sigmas)
+    known = {} if told is None else {key: told[at] for key, at in (by_name | by_camera).items() if told[at, 0] > 0}
+    poses = ({key: Ts[place] for key, place in places.items()} for places in (by_name, by_camera))
+    return Trajectory(next(poses), by_camera=next(poses), sigmas_by_name=known)
 
 
 def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
