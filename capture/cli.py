@@ -24,7 +24,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config, read_yaml
+from splatnode.capture.process.config import load_config, parse_changes, parse_config, parse_layers, read_yaml
 from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.logs import use_structured_lines
 from splatnode.capture.process.terminal import report_items, say, show_progress, show_waiting
@@ -65,9 +65,7 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
     if args.intrinsics is None:
         return load_config(args.config, CaptureConfig, args.set)
     lens = {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
-    return parse_config(
-        merge_config(merge_config(read_yaml(args.config), lens), parse_changes(args.set)), CaptureConfig
-    )
+    return parse_layers([read_yaml(args.config), lens, parse_changes(args.set)], CaptureConfig)
 
 
 def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:

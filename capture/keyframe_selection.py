@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, reduce_image
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 
 TRACKED_SIDE = 320  # pixels: the longer side of the images in which corners are tracked is at least this
@@ -60,7 +61,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Frames that are examined; the others become no keyframes. Higher: more work, finer choice
     per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0
     # Until the next frame is examined, after one that would have been taken but is unusable
-    patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3
+    patience_s: Internal[Annotated[float, msgspec.Meta(ge=0)]] = 0.3
     # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
     backlog: Annotated[int, msgspec.Meta(ge=1)] = 8
 

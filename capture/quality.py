@@ -13,6 +13,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
+
 Image = npt.NDArray[np.uint8]  # (H, W, 3) RGB
 Plane = npt.NDArray  # (H, W) grey levels, uint8, or sums of at most BOX of them, uint16
 
@@ -33,9 +35,13 @@ THUMBNAIL_RATIO = 3.0  # of the largest image's longer side over a thumbnail's: 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blur_px: float = 8.0  # widest edges of a usable frame, pixels at 640; sharp photographs of smooth objects reach 7
-    relative_blur: float = 3.0  # a frame is unusable when its edges are so many times as wide as the sharpest frame's
+    relative_blur: Internal[float] = (
+        3.0  # a frame is unusable when its edges are so many times as wide as the sharpest frame's
+    )
     exposed: float = 0.03  # least share of pixels that are neither black nor white; dark backgrounds are common
-    contrast: float = 3.0  # least standard deviation, grey levels; noise leaves up to 2, real photographs have 20
+    contrast: Internal[float] = (
+        3.0  # least standard deviation, grey levels; noise leaves up to 2, real photographs have 20
+    )
     # A frame is a copy when it differs by less from another; 0.05 is half a pixel of motion, at 640 pixels
     novelty: float = 0.05
 

@@ -15,6 +15,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, KeepAlive
+from splatnode.capture.process.config_keys import Internal
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +28,8 @@ Seconds = Annotated[float, msgspec.Meta(gt=0)]
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     silence_s: Seconds = 5.0  # so long without a frame, a live camera counts as lost
-    first_pause_s: Seconds = 1.0  # before it is opened again; doubled at each failure
-    longest_pause_s: Seconds = 15.0  # to which that pause grows
+    first_pause_s: Internal[Seconds] = 1.0  # before it is opened again; doubled at each failure
+    longest_pause_s: Internal[Seconds] = 15.0  # to which that pause grows
     # After so long without a frame the process ends with 69, and the service manager decides
     give_up_s: Seconds = 300.0
 

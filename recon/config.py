@@ -8,7 +8,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from splatnode.capture.process.config import Plugin, merge_config, parse_config
+from splatnode.capture.process.config import Plugin, build_config, merge_config, replace_former_names
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.metric import measurement as metric
@@ -66,25 +67,26 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     screening: screening.ScreeningConfig = screening.ScreeningConfig()
     matching: matching.MatchingConfig = matching.MatchingConfig()
     registration: registration.RegistrationConfig = registration.RegistrationConfig()
-    verification: evidence.VerificationConfig = evidence.VerificationConfig()
+    verification: Internal[evidence.VerificationConfig] = evidence.VerificationConfig()
     decision: decision.DecisionConfig = decision.DecisionConfig()
     ladder: FallbackConfig = FallbackConfig()
     light: exposure.ExposureConfig = exposure.ExposureConfig()
     denied: transients.TransientMaskConfig = transients.TransientMaskConfig()
-    completion: scene_background.DepthCompletionConfig = scene_background.DepthCompletionConfig()
+    completion: Internal[scene_background.DepthCompletionConfig] = scene_background.DepthCompletionConfig()
     seeding: initialization.GaussianInitializationConfig = initialization.GaussianInitializationConfig()
     background: scene_background.BackgroundConfig = scene_background.BackgroundConfig()
     # In place of completion, seeding and background: a Gaussian a pixel, for comparison
-    pixelwise: initialization.PixelwiseConfig | None = None
-    preview: training.RefinementConfig = PREVIEW  # the refinement after each keyframe
+    pixelwise: Internal[initialization.PixelwiseConfig | None] = None
+    preview: Internal[training.RefinementConfig] = PREVIEW  # the refinement after each keyframe
     optimize: training.RefinementConfig = training.RefinementConfig()  # the refinement after the last keyframe
     metric: metric.MetricConfig = metric.MetricConfig()  # the scale in metres of what is published
     # From how much depth that other views confirm a scene counts as seen, also away from the cameras
-    consistent_depth: npz_files.ConsistentDepthConfig = npz_files.ConsistentDepthConfig()
+    consistent_depth: Internal[npz_files.ConsistentDepthConfig] = npz_files.ConsistentDepthConfig()
     # At most so many in the scene; None: as many as it calls for
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets
-    surplus: float = 2.0  # with such a limit a scene begins with this many times as many; its control leaves the best
+    # With such a limit a scene begins with this many times as many; its control leaves the best
+    surplus: Internal[float] = 2.0
     # For all, from the first photograph on; None: as long as it takes. The daemon has no such limit
     budget_s: Annotated[float, Meta(gt=0)] | None = None
 
@@ -145,7 +147,8 @@ def apply_changes(config: ReconstructionConfig, changes: Mapping[str, Any]) -> R
     kind, prior = tree["prior"]["kind"], changes.get("prior")
     if isinstance(prior, Mapping) and prior.get("kind", kind) != kind:
         tree["prior"] = {}
-    return parse_config(merge_config(tree, changes), ReconstructionConfig)
+    present = replace_former_names(changes, ReconstructionConfig, tree)
+    return build_config(merge_config(tree, present), ReconstructionConfig)
 
 
 def _flatten_plugins(tree: Any) -> Any:

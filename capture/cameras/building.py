@@ -24,6 +24,7 @@ from splatnode.capture.diorama.building.walk import CoarseView, Walk, compute_ov
 from splatnode.capture.diorama.render import Camera
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
+from splatnode.capture.process.config_keys import Internal
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
 BARE = 16.0  # texels a metre, where only surfaces matter: they are the same at every density, and soon made
@@ -38,8 +39,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width: Side = 480  # of an image, pixels
     height: Side = 360  # of an image, pixels
     seed: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 0  # of the building and of the walk
-    noise: float = 1.0  # standard deviation of the sensor noise, grey levels
-    samples: Annotated[int, msgspec.Meta(ge=1, le=4)] = 2  # rays a pixel in each direction
+    noise: Internal[float] = 1.0  # standard deviation of the sensor noise, grey levels
+    samples: Internal[Annotated[int, msgspec.Meta(ge=1, le=4)]] = 2  # rays a pixel in each direction
     # The number of the keyframe from which on the robot is in another room; 0: it is never carried away
     kidnap_at: Annotated[int, msgspec.Meta(ge=0, le=100_000)] = 0
     frames_per_second: FramesPerSecond = 2.0  # by the stamps

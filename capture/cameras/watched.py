@@ -36,6 +36,7 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.lens_file import same_aspect
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.system import is_shortage, outlast
 
 REMEMBERED = 100_000  # photographs that were taken and are no longer there: all may be back
@@ -45,10 +46,10 @@ _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: Path  # the folder that is watched
     existing: bool = True  # whether what lies there at the start is taken, too
-    poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2  # between looks at the folder
+    poll_s: Internal[Annotated[float, msgspec.Meta(gt=0)]] = 0.2  # between looks at the folder
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
     # A file that is not whole, or cannot be read, after so long is left out
-    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0
+    give_up_s: Internal[Annotated[float, msgspec.Meta(gt=0)]] = 60.0
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     # The lens, of all images of its aspect ratio, instead of what their EXIF tells
     intrinsics: Intrinsics | None = None

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.core import library, pointer
 from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Features
 
@@ -150,11 +151,11 @@ class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Local features: many SIFT keypoints with RootSIFT descriptors, also of images with a simulated tilt."""
 
     num_features: int = 8000  # of an image, at most: the strongest
-    contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
+    contrast: Internal[float] = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
     max_longer_side: int = 1600  # larger images are shrunk before features are found, pixels
-    min_longer_side: int = 1000  # smaller images are enlarged, pixels: a third more matches at 640 x 480
+    min_longer_side: Internal[int] = 1000  # smaller images are enlarged, pixels: a third more matches at 640 x 480
     # Pixels at REFERENCE_SIDE: a keypoint of a tilted image this near to a known point is that point
-    snap_px: float = 1.5
+    snap_px: Internal[float] = 1.5
 
 
 def extract(image: Image, config: FeatureConfig) -> Features:

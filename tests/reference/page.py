@@ -10,16 +10,18 @@ from typing import Any
 
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.process.config import Plugin
+from splatnode.capture.process.config_keys import has_fields
 from splatnode.recon.config import PRESETS
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.config import DaemonConfig as Daemon
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
-from tests.reference.options import REQUIRED, Option, Section, has_fields, sections
+from tests.reference.options import REQUIRED, Option, Section, sections
 
 _INTRODUCTION = f"""# Configuration
 
 A configuration is a YAML file that holds only what differs from the defaults. A key that does not exist is refused; the
-message lists the keys that do. The dots in a name stand for levels of the file: `selection.coverage` is
+message lists the keys that do, and the nearest one. A key of the release before is read in this release, and told. The
+dots in a name stand for levels of the file: `selection.coverage` is
 
 ```yaml
 selection:
@@ -131,20 +133,22 @@ def _as_in_files(value: Any) -> str:
 
 
 def _presets() -> str:
-    """What each preset changes, as a list."""
-    usual = _values_of(Reconstruction())
+    """What each preset changes of the keys that are listed, as a list; that it sets constants, too, is only said."""
+    documented, usual = _values_of(Reconstruction()), _values_of(Reconstruction(), internal=True)
     lines = []
     for name, preset in PRESETS.items():
-        changed = [
-            f"`{key[1]}: {_as_in_files(value)}`"
-            for key, value in _values_of(preset).items()
+        changed = {
+            key: f"`{key[1]}: {_as_in_files(value)}`"
+            for key, value in _values_of(preset, internal=True).items()
             if value != usual[key] and _as_in_files(value) != _as_in_files(usual[key])
-        ]
-        lines.append(f"- `{name}`: {', '.join(changed) or 'the defaults'}")
+        }
+        shown = [text for key, text in changed.items() if key in documented]
+        shown += ["constants that no file sets"] if len(shown) < len(changed) else []
+        lines.append(f"- `{name}`: {', '.join(shown) or 'the defaults'}")
     return "\n".join(lines)
 
 
-def _values_of(config: Reconstruction) -> dict[tuple[str, str], Any]:
+def _values_of(config: Reconstruction, internal: bool = False) -> dict[tuple[str, str], Any]:
     """By the kind of plug-in and the name of an option."""
-    found = sections(Reconstruction, config)
+    found = sections(Reconstruction, config, internal=internal)
     return {(each.kind, option.name): option.default for each in found for option in each.options}
