@@ -116,8 +116,9 @@ def keys(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Waits for a heartbeat of each process and prints it; 75 where one is silent. `--seen`: what it tells is known.
+    """Waits for a heartbeat of each process and prints it; 75 where one is silent.
 
+    `--acknowledge`: what it tells is known.
     A capture that has come to the end of its recording is not silent.
     """
     network = (
@@ -135,7 +136,7 @@ def status(args: argparse.Namespace) -> int:
                 silent = f"{room}: {ended}"
             for line in [silent] if fields is None else describe_heartbeat(room, fields):
                 say(line)
-    if args.seen:
+    if args.acknowledge:
         for room, answer in mark_problems_seen(network, [room for room, fields in found.items() if fields]).items():
             say(f"{room}: {answer}")
     heard = {room: bool(fields) for room, fields in found.items()} | ({"capture": True} if ended else {})

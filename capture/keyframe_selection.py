@@ -59,7 +59,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Or when no homography explains so much of their motion, in longer sides of the image (median)
     parallax: Share = 0.01
     # Frames that are examined; the others become no keyframes. Higher: more work, finer choice
-    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0
+    max_fps: Annotated[float, msgspec.Meta(gt=0)] = 8.0
     # Until the next frame is examined, after one that would have been taken but is unusable
     patience_s: Internal[Annotated[float, msgspec.Meta(ge=0)]] = 0.3
     # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
@@ -122,7 +122,7 @@ class Selector:
             raise
 
     def _examine(self, frame: Frame, waiting: int) -> Decision:
-        self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
+        self._next_ns = frame.stamp_ns + round(1e9 / self.config.max_fps)
         small = reduce_image(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         reason, adds = self._explain_decision(grey, strictness=1 + waiting / self.config.backlog)

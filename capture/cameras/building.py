@@ -43,7 +43,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     samples: Internal[Annotated[int, msgspec.Meta(ge=1, le=4)]] = 2  # rays a pixel in each direction
     # The number of the keyframe from which on the robot is in another room; 0: it is never carried away
     kidnap_at: Annotated[int, msgspec.Meta(ge=0, le=100_000)] = 0
-    frames_per_second: FramesPerSecond = 2.0  # by the stamps
+    fps: FramesPerSecond = 2.0  # by the stamps
     pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are made
 
 
@@ -54,7 +54,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
 def _frames(config: Config) -> Iterator[Frame]:
     for index in range(config.keyframes):
-        stamp_ns = round(index / config.frames_per_second * 1e9)
+        stamp_ns = round(index / config.fps * 1e9)
         image, captured_at = render_image(config, index), Stamp(stamp_ns, Clock.RECORDING)
         yield Frame(index, frame_name(index), stamp_ns, image, intrinsics=None, captured_at=captured_at)
 

@@ -106,7 +106,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
-    """["camera.loops=2", "camera.frames-per-second=5"] -> {"camera": {"loops": 2, "frames_per_second": 5}}."""
+    """["camera.loops=2", "camera.max-pixels=5"] -> {"camera": {"loops": 2, "max_pixels": 5}}."""
     tree: dict[str, Any] = {}
     for change in changes:
         key, equals, value = change.partition("=")

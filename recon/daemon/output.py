@@ -221,7 +221,7 @@ class OccupancyPublisher:
             self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers))
         except WireError as error:
             log.warning("the map of %s cannot be sent: %s", scene_id, error)
-            return f"the map is too large: {error}; choose a larger map.voxel"
+            return f"the map is too large: {error}; choose a larger occupancy.voxel"
         return ""
 
 

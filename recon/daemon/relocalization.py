@@ -44,7 +44,7 @@ DAMPING = 1e-9  # added to the normal matrix, which points in one line leave sin
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Relocalisation: where in the finished scene a preview was taken, and whether the camera has moved since."""
 
-    every_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
+    interval_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
     num_features: Internal[int] = 2000  # of a preview, at most
     longer_side: Internal[int] = 800  # of the preview in which features are found, pixels
     keyframes: Internal[int] = 3  # with which a preview is compared: those with the most matches
@@ -205,7 +205,7 @@ class Tracker:
 
 def _feature_config(config: TrackingConfig) -> features.FeatureConfig:
     side = config.longer_side
-    return features.FeatureConfig(num_features=config.num_features, max_longer_side=side, min_longer_side=side)
+    return features.FeatureConfig(max_num_features=config.num_features, max_image_size=side, min_longer_side=side)
 
 
 def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -333,7 +333,7 @@ class Watcher:
 
     def run(self) -> None:
         """Until the daemon stops."""
-        if self._config.every_s <= 0:
+        if self._config.interval_s <= 0:
             return
         receiving = threading.Thread(target=self._previews.run, name="previews", daemon=True)
         receiving.start()
@@ -343,7 +343,7 @@ class Watcher:
     def _watch(self) -> None:
         watched: FinalScene | None = None
         tracker = None
-        while not self._stopping.wait(self._config.every_s):
+        while not self._stopping.wait(self._config.interval_s):
             finished = self._finished()
             if finished is not watched:
                 watched, tracker, self.motion, self.tracked = finished, None, None, None

@@ -45,7 +45,7 @@ class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     candidates: Internal[candidates.PairSelectionConfig] = candidates.PairSelectionConfig()
     pair_matching: Internal[matching_pair_matching.PairMatchingConfig] = matching_pair_matching.PairMatchingConfig()
     tilting: Internal[matching_pair_matching.AffineSimulationConfig] = matching_pair_matching.AffineSimulationConfig()
-    moving: MovingObjectsConfig = MovingObjectsConfig()
+    dynamic_objects: MovingObjectsConfig = MovingObjectsConfig()
 
 
 T = TypeVar("T")

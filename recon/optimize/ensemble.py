@@ -31,7 +31,7 @@ class EnsembleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     members: Annotated[int, Meta(ge=1)] = 1  # scenes that are refined; 1: that one, and nothing after it
     # Steps of the refinement after them, on photographs as often as on pseudo views; nothing is pruned any more
     iterations: Internal[Annotated[int, Meta(ge=1)]] = 400
-    # Its step sizes of Gaussians, of those in `optimize.rates`
+    # Its step sizes of Gaussians, of those in `optimize.lr`
     rates: Internal[Annotated[float, Meta(gt=0, le=1)]] = 0.3
     # For each photograph; at most as many as there are steps on them
     pseudo_views: Internal[Annotated[int, Meta(ge=1)]] = 6

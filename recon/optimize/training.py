@@ -75,7 +75,7 @@ class RefinementConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     checkpoints: Internal[tuple[int, ...]] = (150,)
     looks: Internal[tuple[int, ...]] = ()  # iterations after which it is shown, too, to somebody who watches
     half_resolution_share: Internal[Share] = 0.0  # share of the iterations, at the start, on images of half the size
-    dssim: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
+    ssim_lambda: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
     # Largest opacity of what photographs seeded, as the refinement of a begun scene starts: soft Gaussians settle more
     # freely, in a hundred steps and more, so they are left as seeded where a time limit may end it. null: as seeded
     first_opacity: Internal[Annotated[float, Meta(gt=0, lt=1)] | None] = 0.1
@@ -84,8 +84,8 @@ class RefinementConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     )  # LPIPS of renders against photographs
     dropout: optimize_ensemble.DropoutConfig = optimize_ensemble.DropoutConfig()
     refine_poses: bool = True  # whether cameras are refined together with the Gaussians
-    rates: LearningRates = LearningRates()
-    regularise: regularizers.RegularizerConfig = (
+    lr: LearningRates = LearningRates()  # Adam's learning rates at the start; lengths over the median depth
+    regularizers: regularizers.RegularizerConfig = (
         regularizers.RegularizerConfig()
     )  # losses beside the photometric one; none by default
     # Density control, which adds and removes Gaussians; None: their number stays
@@ -185,7 +185,7 @@ def _run_refinement(
 
 def _make_agreement_config(config: RefinementConfig) -> RefinementConfig:
     """Returns the configuration of the refinement after an ensemble."""
-    given, rates = config.ensemble, config.rates
+    given, rates = config.ensemble, config.lr
     shorter = {name: given.rates * getattr(rates, name) for name in PARAMETERS}
     return msgspec.structs.replace(
         config,
@@ -193,7 +193,7 @@ def _make_agreement_config(config: RefinementConfig) -> RefinementConfig:
         checkpoints=(),
         looks=(),
         half_resolution_share=0.0,
-        rates=msgspec.structs.replace(rates, **shorter),
+        lr=msgspec.structs.replace(rates, **shorter),
         control=None,
     )
 

@@ -227,7 +227,7 @@ _NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 class ExposureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The light of photographs that were exposed differently: what brings each to that of the others."""
+    """Exposure compensation: a gain for each image, so that all have the brightness of the others."""
 
     enabled: bool = True  # bring photographs of different exposure or white balance to one light
     # Gains that differ by less, as a share, in each channel, from the median of all, or from those of the photograph

@@ -107,7 +107,8 @@ def visibility(image: Float32, scale: float) -> Float32:
     return np.asarray(MASKING_STD / np.sqrt(variance + MASKING_STD**2), np.float32)
 
 
-# Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and depth.
+# Gaussian initialization: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour
+# and depth.
 #
 # A piece is as large as its error allows (`partition`), with the same visible error everywhere (contrast masking):
 # that is the best use of a number of Gaussians. Errors are measured in photographs of a fixed size, so that the number
@@ -127,8 +128,8 @@ ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
 
 
 class GaussianInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and
-    depth."""
+    """Gaussian initialization: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal
+    colour and depth."""
 
     depth_tolerance: Internal[float] = 0.02  # theta of equation 16, relative to the depth
     # A pixel is redundant only beside a point whose footprint is at most this larger
@@ -439,7 +440,7 @@ class SceneInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fiel
     """Which Gaussians a scene begins with."""
 
     completion: scene_background.DepthCompletionConfig = scene_background.DepthCompletionConfig()
-    seeding: GaussianInitializationConfig = GaussianInitializationConfig()
+    initialization: GaussianInitializationConfig = GaussianInitializationConfig()
     background: scene_background.BackgroundConfig = scene_background.BackgroundConfig()
     pixelwise: PixelwiseConfig | None = None  # in place of seeding: a Gaussian a pixel that stereo knows
     max_gaussians: int | None = None  # None: as many as the photographs call for
@@ -480,10 +481,10 @@ def initialize_scene(
     if config.pixelwise is not None:
         surfaces = pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
         return Scene(_views(dense, shares, images, masks, exposures, lenses), concatenate([surfaces, *shells]))
-    surfaces = initialize_gaussians(dense, pictures, config.seeding)
+    surfaces = initialize_gaussians(dense, pictures, config.initialization)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
-        surfaces = initialize_gaussians(dense, pictures, config.seeding, limit)
+        surfaces = initialize_gaussians(dense, pictures, config.initialization, limit)
     return Scene(
         _views(pointmaps, shares, images, masks, exposures, lenses),
         concatenate([surfaces, *shells]),

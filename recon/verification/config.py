@@ -41,7 +41,7 @@ class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Largest bound of the focal length for it, by which the distance is uncertain, too
     exact_focal_percent: Internal[float] = 10.0
     # Largest bound of a position that the user accepts, of the distance to the scene; None: any
-    require_percent: float | None = None
+    max_position_error_percent: float | None = None
     # Least log-odds that published poses are right: 0 is more likely right than not, after all bounds
     min_log_odds: Internal[float] = 0.0
 

@@ -87,7 +87,7 @@ def next_motion(
         raise ValueError("motion is that since the photograph before: the first one has none")
     moved = _matrix(step)
     length = float(np.linalg.norm(moved[:3, 3]))
-    usual = max(config.motions_drift * length, LEAST_STEP_SIGMA_M), config.motions_sigma_deg
+    usual = max(config.odometry_drift * length, LEAST_STEP_SIGMA_M), config.odometry_sigma_deg
     return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
 
 
@@ -182,7 +182,7 @@ def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
         if isinstance(each, Marker):
             changes |= _make_marker_settings(each)
         elif isinstance(each, Stereo):
-            changes |= {"stereo_m": each.baseline_m, "stereo_sigma_m": each.sigma_m}
+            changes |= {"stereo_baseline_m": each.baseline_m, "stereo_baseline_sigma_m": each.sigma_m}
         else:
             baselines.append(_baseline(each, of_pictures))
     if baselines:
@@ -231,8 +231,8 @@ def _list_scale_sources(scale: object) -> Sequence[object]:
 
 def _make_marker_settings(marker: Marker) -> dict[str, Any]:
     return {
-        "marker_m": marker.side_m,
-        "marker_sigma_m": marker.sigma_m,
+        "marker_size_m": marker.side_m,
+        "marker_size_sigma_m": marker.sigma_m,
         "marker_dictionary": marker.dictionary,
     }
 

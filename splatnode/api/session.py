@@ -81,7 +81,7 @@ class Session:
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress
-        self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH, patience_s=0.0), Limits())
+        self._selector = Selector(Selection(every_frame=every_frame, max_fps=_EACH, patience_s=0.0), Limits())
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()

@@ -35,8 +35,9 @@ no options of its own: from the node's file, `splatnode view FILE` takes how to 
 The options that are changed most often:
 
 - `camera`: which camera, or which folder or video in its place
-- `selection.every_frame`, `selection.coverage`, `selection.per_second`: how many keyframes are taken
-- `max_views`, `settle_s`, `lost_after`: when the node goes on with a next scene, makes it anew, begins another place
+- `selection.every_frame`, `selection.coverage`, `selection.max_fps`: how many keyframes are taken
+- `max_views`, `idle_finalize_s`, `new_submap_after`: when the node goes on with a next submap, finalizes it, begins
+  another
 - `reconstruction.size`, `reconstruction.max_gaussians`: how fine and how large a scene is
 
 In the tables, `None` stands for `null` in a file. An option whose unit is – is a count, a factor, a choice or a text.
@@ -48,7 +49,7 @@ This page is made from the code and its comments by `python -m tests.reference`;
 _CAPTURE = "The camera's process: `splatnode capture FILE` and `splatnode record FILE`."
 _DAEMON = (
     "The node's process that makes scenes: `splatnode recon FILE`. It also has all options of the next part, "
-    "with `reconstruction.` before their names: `reconstruction.size`, `reconstruction.metric.marker_m` (which "
+    "with `reconstruction.` before their names: `reconstruction.size`, `reconstruction.metric.marker_size_m` (which "
     "`--marker 100mm` sets, too). Poses come with the keyframes (`given_pose`, [Metres](metres.md#live))."
 )
 _RECONSTRUCTION = (
@@ -75,7 +76,7 @@ def page() -> str:
 def unit(option: Option) -> str:
     """By the end of the option's name, else by what stands between two commas or colons of the description."""
     name = option.name.rpartition(".")[2]
-    if name.endswith("per_second"):
+    if name.endswith("fps"):
         return _PER_SECOND
     if suffix := next((suffix for suffix in _SUFFIXES if name.endswith(suffix)), None):
         return _SUFFIXES[suffix]

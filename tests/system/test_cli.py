@@ -311,9 +311,9 @@ def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):
 
 
 def test_a_box_may_begin_with_a_minus():
-    argv = ["export", "scene.ply", "--to", "ply", "--crop", "-1,-.5,0,1,2.5,3", "--only-seen"]
+    argv = ["export", "scene.ply", "--to", "ply", "--crop", "-1,-.5,0,1,2.5,3", "--multi-view-only"]
     args = command_line.build_parser().parse_args(argv)
-    assert args.crop == (-1, -0.5, 0, 1, 2.5, 3) and args.only_seen and args.scene.name == "scene.ply"
+    assert args.crop == (-1, -0.5, 0, 1, 2.5, 3) and args.multi_view_only and args.scene.name == "scene.ply"
 
 
 def test_doctor_finds_the_core_and_what_it_needs(capsys):

@@ -1,7 +1,8 @@
 """The interface of losses beside the photometric one. A new loss is one new file in this folder.
 
 Its module has a `Config`, a subclass of Schedule with what is particular to it, and
-`prepare(config, supervision, seed) -> Loss`. A configuration names it by its module under `optimize.regularise.losses`.
+`prepare(config, supervision, seed) -> Loss`. A configuration names it by its module, under
+`optimize.regularizers.losses`.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def main() -> None:
 
 def _rows(scene: EvaluationScene, folder: Path, views: int, seeds: int) -> list[Row]:
     names = load_split(folder, list(scene.cameras), views).train
-    config = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "quick": True})
+    config = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "no_fallbacks": True})
     away = _distance(scene)
     frames = []
     for frame in scene.frames(names):

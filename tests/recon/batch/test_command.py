@@ -154,12 +154,29 @@ def test_programs_get_the_counts(tmp_path, capsys):
 
 
 def test_each_replay_gets_the_options_that_were_given():
-    given = ["--preset", "preview", "--size", "320", "--require", "2.5", "--quick", "--only-seen", "--views", "6"]
+    given = [
+        "--preset",
+        "preview",
+        "--size",
+        "320",
+        "--max-position-error",
+        "2.5",
+        "--no-fallbacks",
+        "--multi-view-only",
+        "--views",
+        "6",
+    ]
     parser = command_line.build_parser()
     made = replay_options(parser.parse_args(["batch", "a", "--out", "b", *given]))
     assert sorted(made) == sorted(given)
     there = parser.parse_args(["replay", "a", "--out", "b", *made])
-    assert (there.preset, there.size, there.require, there.quick, there.views) == ("preview", 320, 2.5, True, 6)
+    assert (there.preset, there.size, there.max_position_error, there.no_fallbacks, there.views) == (
+        "preview",
+        320,
+        2.5,
+        True,
+        6,
+    )
     assert replay_options(parser.parse_args(["batch", "a", "--out", "b", "--resume", "--cores", "1"])) == []
 
 

@@ -34,12 +34,12 @@ def test_every_preset_is_a_method():
 
 
 def test_the_papers_schedule_and_weights():
-    losses = CONFIGS["paper"].optimize.regularise.losses
+    losses = CONFIGS["paper"].optimize.regularizers.losses
     weights = {name: loss.config.weight for name, loss in losses.items()}
     assert weights == {"point_render": 0.25, "depth": 0.05, "normal": 0.01, "semantic": 0.5}
     assert CONFIGS["paper"].optimize.iterations == 1000
     assert [losses[name].config.weight_at(0.1) > 0 for name in ("point_render", "depth")] == [True, False]
-    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularizers.RegularizerConfig())
+    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularizers=regularizers.RegularizerConfig())
     assert without == CONFIGS["instantsplat-xl"].optimize
 
 
@@ -76,8 +76,8 @@ def test_a_start_with_surroundings_differs_in_nothing_else():
     for name in expand_method_names(["surrounded"]):
         plain, around = name.split("+")
         without = msgspec.structs.replace(CONFIGS[name].pixelwise, surroundings="none")
-        losses = msgspec.structs.replace(CONFIGS[name].optimize.regularise, min_confidence=0.3)
-        optimize = msgspec.structs.replace(CONFIGS[name].optimize, regularise=losses)
+        losses = msgspec.structs.replace(CONFIGS[name].optimize.regularizers, min_confidence=0.3)
+        optimize = msgspec.structs.replace(CONFIGS[name].optimize, regularizers=losses)
         assert msgspec.structs.replace(CONFIGS[name], pixelwise=without, optimize=optimize) == CONFIGS[plain]
         assert CONFIGS[name].pixelwise.surroundings == around
         assert select_start_config(name) == select_start_config(plain) and not methods.is_variant(name)
@@ -90,12 +90,12 @@ def test_the_ablation_changes_one_part_at_a_time():
     for part in parts:
         name = part.replace("_", "-")
         alone, without = (
-            CONFIGS[each].optimize.regularise.losses for each in (f"instantsplat-xl+{name}", f"paper-{name}")
+            CONFIGS[each].optimize.regularizers.losses for each in (f"instantsplat-xl+{name}", f"paper-{name}")
         )
-        assert alone == {part: whole.optimize.regularise.losses[part]}
+        assert alone == {part: whole.optimize.regularizers.losses[part]}
         assert [other for other in parts if other not in without] == [part]
     assert not CONFIGS["paper-pose-refinement"].optimize.refine_poses
-    assert CONFIGS["paper-pseudo-views"].optimize.regularise.pseudo_views == 0
+    assert CONFIGS["paper-pseudo-views"].optimize.regularizers.pseudo_views == 0
     thick = CONFIGS["paper-down-sampling"]
     assert thick.optimize == whole.optimize and thick.pixelwise != whole.pixelwise
     assert set(methods.list_names()) <= CONFIGS.keys() and methods.is_variant("paper-depth")
