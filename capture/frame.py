@@ -264,12 +264,12 @@ class Frame:
     gravity: Gravity | None = None  # in its camera's frame; None: nobody knows
     right: RightImage | None = field(default=None, repr=False)  # of a stereo camera, whose left image is `image`
     exposure: ExposureSettings | None = None  # as its camera or its EXIF tells; None: nobody knows
-    camera: str = (
-        ""  # which camera took it through which lens, as EXIF tells: different ones share none; empty: unknown
-    )
+    camera: str = ""  # make, model and lens, as EXIF tells: different ones share no lens; empty: unknown
+    camera_id: str = ""  # of several cameras, which one: what a robot or a folder calls it; empty: there is one
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", sanitize_text(self.name, LONGEST_NAME))
+        for text in ("name", "camera", "camera_id"):
+            object.__setattr__(self, text, sanitize_text(getattr(self, text), LONGEST_NAME))
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}")
         if not 1 <= self.width <= LARGEST_SIDE or not 1 <= self.height <= LARGEST_SIDE:
@@ -336,10 +336,11 @@ def make_frame(
     right: RightImage | None = None,
     exposure: ExposureSettings | None = None,
     camera: str = "",
+    camera_id: str = "",
 ) -> Frame | DroppedFrame:
     """Makes a Frame of what a camera or a file gave; drops it, with the reason, where it is out of a Frame's bounds."""
     try:
-        came = given_pose, motion, gravity, right, exposure, camera
+        came = given_pose, motion, gravity, right, exposure, camera, camera_id
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
@@ -348,7 +349,7 @@ def make_frame(
 def rename_frame(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
     known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
-    came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure, frame.camera
+    came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure, frame.camera, frame.camera_id
     return make_frame(frame_id, name, stamp_ns, *known, *came)
 
 

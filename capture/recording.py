@@ -23,18 +23,13 @@ from msgspec import UNSET, UnsetType
 from splatnode.capture.frame import (
     Baseline,
     DroppedFrame,
-    ExposureSettings,
     Frame,
-    Intrinsics,
     RightImage,
-    Stamp,
     grey,
     make_frame,
-    make_optional_field,
-    read_optional_field,
 )
+from splatnode.capture.frame_meta import FrameMeta, describe_frame, read_frame_fields
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.files import read_bounded, sync_folder
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast
@@ -60,18 +55,12 @@ class _Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sha256: str
 
 
-class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"):
-    name: str
+class _Line(FrameMeta, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
+    name: str  # these two are told apart from what is damaged below
     stamp_ns: int
-    intrinsics: Intrinsics | None
     file: str
     sha256: str
-    captured_at: Stamp | None = None  # earlier recordings do not tell
-    given_pose: GivenPose | UnsetType = UNSET
-    motion: Motion | UnsetType = UNSET
-    gravity: Gravity | UnsetType = UNSET
     right: _Right | UnsetType = UNSET
-    exposure: ExposureSettings | UnsetType = UNSET
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -112,14 +101,8 @@ class Recorder:
         content = _file_of(item)
         path = self.folder / f"{self.frames:06d}{'.jpg' if content.startswith(_JPEG) else '.png'}"
         digest = _write(path, content)
-        moved = (
-            make_optional_field(item.given_pose),
-            make_optional_field(item.motion),
-            make_optional_field(item.gravity),
-        )
         right = UNSET if item.right is None else self._write_right(item.right)
-        known = path.name, digest, item.captured_at, *moved, right, make_optional_field(item.exposure)
-        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, *known))
+        self._append(_Line(file=path.name, sha256=digest, right=right, **describe_frame(item)))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
             self._sync()
@@ -196,14 +179,8 @@ class FrameRecording:
             return DroppedFrame(line.name, str(error))
         except OSError as error:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
-        known = image, line.intrinsics, content, line.captured_at
-        moved = (
-            read_optional_field(line.given_pose),
-            read_optional_field(line.motion),
-            read_optional_field(line.gravity),
-        )
         return make_frame(
-            frame_id, line.name, line.stamp_ns, *known, None, *moved, right, read_optional_field(line.exposure)
+            frame_id, line.name, line.stamp_ns, image, encoded=content, right=right, **read_frame_fields(line)
         )
 
     def _images(self, line: _Line, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8], RightImage | None]:

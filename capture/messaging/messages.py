@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -19,14 +19,11 @@ from msgspec import UNSET, UnsetType
 from splatnode.capture.frame import (
     Baseline,
     DroppedFrame,
-    ExposureSettings,
     Frame,
-    Intrinsics,
     RightImage,
-    Stamp,
     make_optional_field,
-    read_optional_field,
 )
+from splatnode.capture.frame_meta import FrameMeta, describe_frame, read_frame_fields
 from splatnode.capture.image_file import UnusableImage, decode_image, encode_jpeg
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import (
@@ -44,7 +41,6 @@ from splatnode.capture.messaging.wire import (
     encode,
     plain_header,
 )
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 
 # The pixels of a frame as arrays of a message: its image, then its mask and its right image, where it has these.
@@ -52,27 +48,15 @@ from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_
 Array = npt.NDArray[np.generic]
 
 
-class FrameFields(Protocol):
-    """The fields of a header that describe a frame, beside its arrays."""
+class StoredFrameMeta(FrameMeta, frozen=True, kw_only=True):
+    """FrameMeta, and the baseline of a right image. That image is the last of the arrays."""
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def stamp_ns(self) -> int: ...
-    @property
-    def intrinsics(self) -> Intrinsics | None: ...
-    @property
-    def captured_at(self) -> Stamp | None: ...
-    @property
-    def given_pose(self) -> GivenPose | UnsetType: ...
-    @property
-    def motion(self) -> Motion | UnsetType: ...
-    @property
-    def gravity(self) -> Gravity | UnsetType: ...
-    @property
-    def exposure(self) -> ExposureSettings | UnsetType: ...
-    @property
-    def baseline(self) -> Baseline | UnsetType: ...
+    baseline: Baseline | UnsetType = UNSET
+
+
+def describe_stored_frame(frame: Frame) -> dict[str, Any]:
+    """Returns the fields of StoredFrameMeta by name."""
+    return {**describe_frame(frame), "baseline": make_optional_field(frame.right and frame.right.baseline)}
 
 
 def arrays_of(frame: Frame) -> list[Array]:
@@ -82,7 +66,7 @@ def arrays_of(frame: Frame) -> list[Array]:
     return [frame.image, *mask, *right]
 
 
-def frame_in(header: FrameFields, frame_id: int, arrays: Sequence[npt.NDArray]) -> Frame:
+def frame_in(header: StoredFrameMeta, frame_id: int, arrays: Sequence[npt.NDArray]) -> Frame:
     """The frame of which `arrays_of` gave the arrays; it has a right image if its header tells a baseline.
 
     Raises ValueError where they are not that: the mask's and the right image's size must be the image's.
@@ -97,14 +81,9 @@ def frame_in(header: FrameFields, frame_id: int, arrays: Sequence[npt.NDArray]) 
         header.name,
         header.stamp_ns,
         image,
-        header.intrinsics,
-        captured_at=header.captured_at,
         mask=_mask(image, masks[0]) if masks else None,
-        given_pose=read_optional_field(header.given_pose),
-        motion=read_optional_field(header.motion),
-        gravity=read_optional_field(header.gravity),
-        exposure=read_optional_field(header.exposure),
         right=None if header.baseline is UNSET else RightImage(arrays[-1], header.baseline),
+        **read_frame_fields(header),
     )
 
 
@@ -122,20 +101,13 @@ MOST_HELD = 64  # frames that a client may hold without acknowledging them
 DELIVERY_PARTS = 2  # that come before a frame's own
 
 
-class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
+class FrameHeader(StoredFrameMeta, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
     """A Frame; its arrays are its image and, where it has these, its mask and its right image."""
 
+    session: SessionId  # these three as every Header has them
+    sequence: Sequential
+    mono_ns: Sequential
     frame_id: Sequential
-    name: Name
-    stamp_ns: Sequential
-    intrinsics: Intrinsics | None
-    captured_at: Stamp | None = None
-    # Left out where there is none: a receiver that does not know it takes all keyframes without one
-    given_pose: GivenPose | UnsetType = UNSET
-    motion: Motion | UnsetType = UNSET
-    gravity: Gravity | UnsetType = UNSET
-    exposure: ExposureSettings | UnsetType = UNSET
-    baseline: Baseline | UnsetType = UNSET  # likewise; where it is there, the last array is the right image
 
 
 class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
@@ -203,19 +175,7 @@ def encode_frame(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part
     if isinstance(frame, DroppedFrame):
         name = sanitize_text(frame.name, LONGEST_NAME) or "?"
         return encode(DroppedHeader(**numbering.next(), name=name, reason=sanitize_text(frame.reason, LONGEST_TEXT)))
-    header = FrameHeader(
-        **numbering.next(),
-        frame_id=frame.frame_id,
-        name=frame.name,
-        stamp_ns=frame.stamp_ns,
-        intrinsics=frame.intrinsics,
-        captured_at=frame.captured_at,
-        given_pose=make_optional_field(frame.given_pose),
-        motion=make_optional_field(frame.motion),
-        gravity=make_optional_field(frame.gravity),
-        exposure=make_optional_field(frame.exposure),
-        baseline=make_optional_field(frame.right and frame.right.baseline),
-    )
+    header = FrameHeader(**numbering.next(), frame_id=frame.frame_id, **describe_stored_frame(frame))
     return encode(header, arrays_of(frame))
 
 

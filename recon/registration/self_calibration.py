@@ -107,6 +107,8 @@ def _may_share(one: Keyframe, other: Keyframe, across_sizes: bool) -> bool:
     """Whether two frames may have been taken through one lens."""
     if _nominal(one) != _nominal(other):
         return False
+    if one.frame.camera_id != other.frame.camera_id:
+        return False
     cameras = one.frame.camera, other.frame.camera
     if all(cameras) and cameras[0] != cameras[1]:
         return False

@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from msgspec import UNSET, UnsetType
 
-from splatnode.capture.frame import Baseline, ExposureSettings, Frame, Intrinsics, Stamp, make_optional_field
-from splatnode.capture.messaging.messages import arrays_of, frame_in
+from splatnode.capture.frame import Frame
+from splatnode.capture.messaging.messages import StoredFrameMeta, arrays_of, describe_stored_frame, frame_in
 from splatnode.capture.messaging.spool import read_message, write_message
 from splatnode.capture.messaging.wire import Limits, Message, SessionId, WireError, decode, encode
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.files import make_owner_only_folder, remove_leftovers, sync_folder
 from splatnode.capture.process.system import raise_shortage
 
@@ -247,21 +245,12 @@ def remove_rebuild_requests(directory: Path, *names: str) -> None:
 FRAME_FILE = re.compile(r"[0-9]{12,18}\.frame")
 
 
-class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FrameRecord(StoredFrameMeta, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A stored keyframe; its arrays are its image and, where it has these, its mask and its right image."""
 
     version: int
     session: str
     sequence: int
-    name: str
-    stamp_ns: int
-    intrinsics: Intrinsics | None
-    captured_at: Stamp | None = None
-    given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message; and those below
-    motion: Motion | UnsetType = UNSET
-    gravity: Gravity | UnsetType = UNSET
-    exposure: ExposureSettings | UnsetType = UNSET
-    baseline: Baseline | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,10 +266,8 @@ def file_name(number: int) -> str:
 
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
-    moved = make_optional_field(frame.given_pose), make_optional_field(frame.motion), make_optional_field(frame.gravity)
-    baseline = make_optional_field(frame.right and frame.right.baseline)
-    known = frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at
-    header = FrameRecord(VERSION, *key, *known, *moved, make_optional_field(frame.exposure), baseline)
+    session, sequence = key
+    header = FrameRecord(version=VERSION, session=session, sequence=sequence, **describe_stored_frame(frame))
     write_message(path, encode(header, arrays_of(frame)))
 
 

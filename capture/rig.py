@@ -1,0 +1,93 @@
+"""Several cameras on one robot: where they stand to each other, and which of their images were taken together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Intrinsics, Stamp
+from splatnode.capture.odometry import rigid_problem
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
+
+TOLERANCE_S = 0.02  # between images that were taken together, where nobody tells any
+SIGMA_M, SIGMA_DEG = 0.001, 0.1  # of a camera's pose on its rig, where nobody tells any: as calibrated with a board
+
+
+@dataclass(frozen=True)
+class RigCamera:
+    """A camera of a rig. Its pose is T_rig_camera in metres, row by row; the camera looks along z, x right, y down.
+
+    Raises ValueError where the pose is no rigid motion, or a number is out of bounds.
+    """
+
+    camera_id: str
+    T_rig_camera: tuple[float, ...] | None = None  # None: nobody knows, the images tell
+    sigma_m: float = SIGMA_M  # standard deviation of the position in each direction, metres
+    sigma_deg: float = SIGMA_DEG  # of the orientation about each axis, degrees
+    intrinsics: Intrinsics | None = None
+
+    def __post_init__(self) -> None:
+        if not self.camera_id or sanitize_text(self.camera_id, LONGEST_NAME) != self.camera_id:
+            raise ValueError(f"a camera id must be 1 to {LONGEST_NAME} printable letters, got {self.camera_id[:40]!a}")
+        if not (0 < self.sigma_m < math.inf and 0 < self.sigma_deg <= 180):
+            raise ValueError(
+                "the sigmas of a camera on its rig must be above 0 and finite, up to 180 degrees; "
+                f"got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
+            )
+        if self.T_rig_camera is not None and (problem := rigid_problem(self.T_rig_camera)):
+            raise ValueError(f"the pose of {self.camera_id} on its rig must be {problem}")
+
+    @property
+    def matrix(self) -> npt.NDArray[np.float64] | None:
+        """T_rig_camera (4, 4); None where nobody knows it."""
+        return None if self.T_rig_camera is None else np.array(self.T_rig_camera, np.float64).reshape(4, 4)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras whose relative poses do not change. Raises ValueError for fewer than two, or two of one camera id."""
+
+    cameras: tuple[RigCamera, ...]
+
+    def __post_init__(self) -> None:
+        ids = [camera.camera_id for camera in self.cameras]
+        if len(ids) < 2 or len(set(ids)) != len(ids):
+            raise ValueError(f"a rig must have two cameras or more, each with its own camera id; got {ids}")
+
+    def find_camera(self, camera_id: str) -> RigCamera | None:
+        """Returns the camera with this id; None where the rig has none."""
+        return next((camera for camera in self.cameras if camera.camera_id == camera_id), None)
+
+
+@dataclass(frozen=True)
+class FrameSet:
+    """Images that the cameras of one robot took together: at most one of each camera."""
+
+    names: Mapping[str, str]  # of the frames, by camera id
+    stamp: Stamp  # the earliest of them
+
+
+def form_frame_sets(frames: Iterable[tuple[str, str, Stamp]], tolerance_s: float = TOLERANCE_S) -> Sequence[FrameSet]:
+    """Groups frames, given by name, camera id and time, into those that were taken together; in order of time.
+
+    Every frame with a camera id is in exactly one set, if need be alone. All of a set are within `tolerance_s` of its
+    earliest. Times of different clocks are never together.
+    """
+    sets: list[tuple[dict[str, str], dict[str, Stamp]]] = []
+    for name, camera_id, stamp in sorted(frames, key=lambda each: (each[2].clock.value, each[2].ns, each[1], each[0])):
+        if not camera_id:
+            continue
+        if sets:
+            names, stamps = sets[-1]
+            first = min(stamps.values(), key=lambda each: each.ns)
+            together = first.clock is stamp.clock and stamp.ns - first.ns <= tolerance_s * 1e9
+            if together and camera_id not in names:
+                names[camera_id], stamps[camera_id] = name, stamp
+                continue
+        sets.append(({camera_id: name}, {camera_id: stamp}))
+    return [FrameSet(MappingProxyType(names), min(stamps.values(), key=lambda each: each.ns)) for names, stamps in sets]
