@@ -55,7 +55,7 @@ def find_nearest_key(key: str, keys: Iterable[str]) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class KeyPlace:
-    """Where a Struct stands: its path in the file, for people, and in the room's table of former names."""
+    """The place of a Struct: its path in the file, for people, and in the room's table of former names."""
 
     where: str = ""
     section: str = ""

@@ -166,7 +166,7 @@ def test_the_drivers_stamps_are_told_by_the_wall_clock():
 
 @pytest.mark.parametrize("padding", [0, 16])
 def test_raw_frames_are_decoded_line_by_line(padding):
-    (frame,) = frames(Driver(padding=padding), 1, pixels="YUYV")
+    (frame,) = frames(Driver(padding=padding), 1, fourcc="YUYV")
     assert np.abs(frame.image.astype(int) - IMAGE).mean() < 5 and frame.encoded is None
 
 
@@ -191,7 +191,7 @@ def test_a_lens_of_another_aspect_ratio_ends_the_camera_before_a_frame():
 @pytest.mark.parametrize(("event", "reason"), [("error", "driver says"), ("short", "truncated")])
 @pytest.mark.parametrize("pixels", ["MJPG", "YUYV"])
 def test_damaged_frames_are_left_out(event, reason, pixels):
-    before, damaged, after = frames(Driver(events={1: event}), 3, pixels=pixels)
+    before, damaged, after = frames(Driver(events={1: event}), 3, fourcc=pixels)
     assert isinstance(damaged, DroppedFrame) and reason in damaged.reason
     assert (before.frame_id, after.frame_id) == (0, 1)
 
