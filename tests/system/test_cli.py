@@ -52,6 +52,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
         "splatnode.capture.calibration.verb",
+        "splatnode.capture.former_names",
         "splatnode.capture.process.arguments",
         "splatnode.capture.process.config_text",
         "splatnode.capture.process.logs",
@@ -62,11 +63,13 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.command_line",
         "splatnode.recon.batch.verb",
         "splatnode.recon.evaluate.verbs",
+        "splatnode.recon.former_names",
         "splatnode.recon.jobs.arguments",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.replay_verb",
         "splatnode.recon.shared_arguments",
         "splatnode.recon.verbs",
+        "splatnode.viewer.former_names",
         "splatnode.viewer.verbs",
     ]
     assert heavy == "[]"
