@@ -131,6 +131,17 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     assert [path.name for path in out.iterdir()] == ["a"]
 
 
+def test_a_batch_that_the_release_before_began_is_resumed(tmp_path):
+    former = ["splatnode", "replay", "--require", "2.5", "--quick", "--only-seen"]
+    present = ["splatnode", "replay", "--max-position-error", "2.5", "--no-fallbacks", "--multi-view-only"]
+    with Ledger(tmp_path, former):
+        pass
+    with Ledger(tmp_path, present):
+        pass
+    with pytest.raises(OtherBatch, match="other options"):
+        Ledger(tmp_path, [*present, "--size", "64"]).__enter__()
+
+
 def test_a_batch_is_not_begun_twice_nor_gone_on_with_otherwise(tmp_path):
     out = tmp_path / "out"
     ran(out, BatchRecording("a", GOOD))
