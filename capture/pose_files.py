@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -104,6 +105,8 @@ class Trajectory:
     by_name: Mapping[str, Array] = field(default_factory=dict)
     seconds: Array = field(default_factory=lambda: np.zeros(0))  # (M,) rising
     Ts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (M, 4, 4)
+    # Of several cameras: by the folder and the name of the photograph, left/0001.jpg
+    by_camera: Mapping[str, Array] = field(default_factory=dict)
 
     def find_poses(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
         """The poses of the frames that have one, by their names."""
@@ -112,8 +115,9 @@ class Trajectory:
 
     def pose_of(self, frame: Frame) -> Array | None:
         """Returns the pose of one frame, T_world_camera (4, 4); None where it has none."""
-        if self.by_name:
-            return self.by_name[known] if (known := self.names(frame.name)) else None
+        if self.by_name or self.by_camera:
+            named = self.by_camera if "/" in frame.name else self.by_name
+            return named[known] if (known := self.names(frame.name)) else None
         if frame.captured_at is not None:
             found = self._interpolate_pose(frame.captured_at.ns / 1e9)
             if found is not None or frame.captured_at.clock is Clock.RECORDING:
@@ -126,8 +130,12 @@ class Trajectory:
         return bool((self.seconds == np.floor(self.seconds)).all() and (self.seconds < 1e6).all())
 
     def names(self, photograph: str) -> str:
-        """The name by which it knows the photograph, which may lack the suffix; empty where it does not."""
-        return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in self.by_name), "")
+        """The name by which it knows the photograph, which may lack the suffix; empty where it does not.
+
+        Of several cameras it must know it with its camera's folder: photographs of two cameras may have one name.
+        """
+        named = self.by_camera if "/" in photograph else self.by_name
+        return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in named), "")
 
     def _interpolate_pose(self, seconds: float) -> Array | None:
         """The pose at this time, between its two neighbours; None where they are too far away."""
@@ -150,9 +158,10 @@ def poses_of(trajectory: Trajectory, frames: Sequence[Frame | DroppedFrame], whe
     found = trajectory.find_poses(frames)
     if not found and any(isinstance(each, Frame) for each in frames):
         first = sanitize_text(next(each.name for each in frames if isinstance(each, Frame)), 100)
+        known = [*trajectory.by_camera, *trajectory.by_name]
         has = (
-            f"photographs such as {sanitize_text(min(trajectory.by_name), 100)}"
-            if trajectory.by_name
+            f"photographs such as {sanitize_text(min(known), 100)}"
+            if known
             else (f"the times {trajectory.seconds[0]:.3f} to {trajectory.seconds[-1]:.3f} s")
         )
         raise PosesFileError(
@@ -219,12 +228,19 @@ def _make_named_trajectory(paths: Sequence[str], Ts: Array) -> Trajectory:
     if not names:
         raise ValueError("it holds no poses")
     by_name: dict[str, Array] = {}
-    for name, T in zip(names, Ts, strict=True):
-        if name in by_name:
-            raise ValueError(f"there are two poses of {sanitize_text(name, 100)}")
-        by_name[name] = T
+    by_camera: dict[str, Array] = {}
+    shared = {name for name, count in Counter(names).items() if count > 1}  # by cameras, each in its folder
+    for path, name, T in zip(paths, names, Ts, strict=True):
+        folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
+        of_camera = "" if folder in ("", ".", "..") else f"{folder}/{name}"
+        if (name in shared and not of_camera) or of_camera in by_camera:
+            raise ValueError(f"there are two poses of {sanitize_text(of_camera or name, 100)}")
+        if of_camera:
+            by_camera[of_camera] = T
+        if name not in shared:
+            by_name[name] = T
     _check(names, Ts)
-    return Trajectory(by_name)
+    return Trajectory(by_name, by_camera=by_camera)
 
 
 def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:

@@ -25,6 +25,13 @@ def _camera_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _capture_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--camera-id", metavar="ID", help="of this capture, where several run beside one recon (camera_id)"
+    )
+    _camera_arguments(parser)
+
+
 def _config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write", type=Path, metavar="DIR", help="write them into this folder, which must be new or empty"
@@ -66,7 +73,7 @@ def _status_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("capture", "run the camera's process", _camera_arguments, import_lazily("splatnode.capture.cli", "capture")),
+    Verb("capture", "run the camera's process", _capture_arguments, import_lazily("splatnode.capture.cli", "capture")),
     Verb(
         "record",
         "write what a camera sees into a folder",

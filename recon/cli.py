@@ -44,7 +44,7 @@ from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
-from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_paths
+from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_sources
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.result import LIVE_PICTURE
 from splatnode.recon.result.folder import hold_result_folder
@@ -62,9 +62,10 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
-    path, listed = parse_paths(args.source)
-    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args))
-    _check_apart(args.out, path)
+    path, listed, cameras = parse_sources(args.source, args.cameras, config.frame_set_tolerance_s)
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args), cameras)
+    for source in [path] if cameras is None else [path, *(camera.path for camera in cameras.cameras)]:
+        _check_apart(args.out, source)
     if not args.map and is_map_set(args.out):
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
     if args.map and args.multi_view_only:
@@ -251,6 +252,7 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
         "budget_s": args.budget_s,
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
+        "frame_set_tolerance_s": args.frame_set_tolerance,
         "no_fallbacks": args.no_fallbacks or None,
         "decision": None
         if args.max_position_error is None

@@ -10,6 +10,7 @@ from msgspec import Meta
 
 from splatnode.capture.process.config import Plugin, build_config, merge_config, replace_former_names
 from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.rig import TOLERANCE_S
 from splatnode.recon import former_names
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import view_graph as matching
@@ -83,6 +84,8 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     preview: Internal[training.RefinementConfig] = PREVIEW  # the refinement after each keyframe
     optimize: training.RefinementConfig = training.RefinementConfig()  # the refinement after the last keyframe
     metric: metric.MetricConfig = metric.MetricConfig()  # the scale in metres of what is published
+    # Images of several cameras were taken together, as a frame set, where their times are no further apart; seconds
+    frame_set_tolerance_s: Annotated[float, Meta(gt=0, le=10)] = TOLERANCE_S
     # From how much depth that other views confirm a scene counts as seen, also away from the cameras
     consistent_depth: Internal[npz_files.ConsistentDepthConfig] = npz_files.ConsistentDepthConfig()
     # At most so many in the scene; None: as many as it calls for

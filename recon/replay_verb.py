@@ -32,7 +32,22 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or "
         "seconds of one (film.mp4#t=10,20.5), or an image topic of an MCAP file (drive.mcap#/front/image), or an "
         "episode of a LeRobot data set (pusht#3/CAMERA), or what `splatnode record` wrote; of a film, and of more than "
-        "30 photographs, keyframes are chosen as a live camera's are",
+        "30 photographs, keyframes are chosen as a live camera's are; several folders, or several films, are those of "
+        "several cameras",
+    )
+    parser.add_argument(
+        "--cameras",
+        type=names,
+        metavar="A,B,C",
+        help="the cameras of one robot that SOURCE has, or all: the folders in a folder, the image topics of an MCAP "
+        "file, the cameras of an episode (pusht#3); of several sources, their names. They get one scene, and each its "
+        "own lens",
+    )
+    parser.add_argument(
+        "--frame-set-tolerance",
+        type=seconds,
+        metavar="S",
+        help="seconds between images of several cameras that were taken together (default: 0.02)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     add_reconstruction_options(parser)

@@ -140,9 +140,10 @@ def _load_poses(file: Path, paths: list[Path]) -> Trajectory:
     from splatnode.capture.pose_files import read_poses  # brings what interpolates
 
     poses = read_poses(file)
-    if poses.by_name and not any(poses.names(frame_name(path)) for path in paths):
+    known = [*poses.by_camera, *poses.by_name]
+    if known and not any(poses.names(frame_name(path)) for path in paths):
         raise ValueError(
-            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(poses.by_name), 100)}, and none of "
+            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(known), 100)}, and none of "
             "those "
             f"here, such as {frame_name(paths[0])}; give the poses of these photographs"
         )
@@ -329,6 +330,7 @@ def select_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
         inside = sorted(frame_name(child) for child in folder.iterdir() if child.is_dir() and image_paths(child))
         hidden = [f"{each.name}: {each.reason}" for each in _hidden_images(folder)]
         advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
+        advice += ", or all of them as the cameras of one robot with --cameras all" if len(inside) > 1 else ""
         advice = f"{hidden[0]}{f', and {len(hidden) - 1} more' if len(hidden) > 1 else ''}" if hidden else advice
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
     suffixes = sorted({path.suffix.lower() for path in paths})

@@ -16,7 +16,7 @@ import errno
 import logging
 import math
 import os
-import tempfile
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -30,7 +30,13 @@ from zmq.utils.monitor import recv_monitor_message
 from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
-from splatnode.capture.process.files import LockHeld, NotOwnerOnly, exclusive, make_owner_only_folder
+from splatnode.capture.process.files import (
+    LockHeld,
+    NotOwnerOnly,
+    default_runtime_directory,
+    exclusive,
+    make_owner_only_folder,
+)
 from splatnode.capture.process.logs import is_logged
 from splatnode.capture.process.system import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.text import sanitize_text
@@ -56,6 +62,10 @@ class Service:
         """Returns the service on which late subscribers ask for the state; it has a socket of its own."""
         return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
 
+    def select_capture(self, camera_id: str) -> Service:
+        """Returns capture's service where several captures run, each with a camera id; itself for the empty one."""
+        return Service(f"{self.name}@{camera_id}", self.pattern, self.tcp_port) if camera_id else self
+
 
 CAPTURE_KEYFRAMES = Service("capture.keyframes", Pattern.QUEUE, 0)
 CAPTURE_PREVIEW = Service("capture.preview", Pattern.BROADCAST, 1)
@@ -67,6 +77,10 @@ CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
 RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured
 RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
 
+
+# Of a capture beside others: a part of the names of its sockets, its spool and its frames.
+CaptureId = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,32}$", max_length=32)]
+_CAPTURE = re.compile(r"capture\.keyframes(?:@([A-Za-z0-9_-]{1,32}))?")
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +123,11 @@ class AlreadyRunning(LockHeld):
 
     def __init__(self, service: Service, pid: int | None) -> None:
         who = f"process {pid}" if pid else "another process"
-        super().__init__(f"{service.name} is offered by {who} already; stop it, or give another network.directory", pid)
+        super().__init__(
+            f"{service.name} is offered by {who} already; stop it, or give another network.directory. Captures "
+            "of several cameras each need a camera_id of their own (over tcp also a network.first_port)",
+            pid,
+        )
 
 
 class NotAllowed(PermissionError):
@@ -281,7 +299,7 @@ def _notice_dead_links(socket: zmq.Socket) -> None:
 
 def runtime_directory(network: Network) -> Path:
     """The private folder of sockets and locks, made where it is absent. Raises NetworkError where it is not private."""
-    directory = network.directory or _default_directory()
+    directory = network.directory or default_runtime_directory()
     try:
         make_owner_only_folder(directory, "network.directory (or $XDG_RUNTIME_DIR), for each process,", ours=False)
     except NotOwnerOnly as error:
@@ -289,12 +307,16 @@ def runtime_directory(network: Network) -> Path:
     return directory
 
 
-def _default_directory() -> Path:
-    if os.environ.get("RUNTIME_DIRECTORY"):
-        return Path(os.environ["RUNTIME_DIRECTORY"].split(":")[0])
-    if os.environ.get("XDG_RUNTIME_DIR"):
-        return Path(os.environ["XDG_RUNTIME_DIR"], "splatnode")
-    return Path(tempfile.gettempdir(), f"splatnode-{os.getuid()}")
+def find_captures(network: Network) -> list[str]:
+    """The camera ids of the captures whose sockets lie in the folder, also of one that was killed; empty: has no id.
+
+    Over tcp there is one for each first port.
+    """
+    if network.tcp is not None:
+        return [""]
+    sockets = (path for path in runtime_directory(network).glob("capture.keyframes*") if path.is_socket())
+    found = (_CAPTURE.fullmatch(path.name) for path in sockets)
+    return sorted(each[1] or "" for each in found if each)
 
 
 def _address(network: Network, service: Service) -> str:

@@ -13,6 +13,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
@@ -53,12 +54,40 @@ class Plugin:
     package: ClassVar[str]
     needs: ClassVar[tuple[str, ...]] = ("Config",)
     usual: ClassVar[str | None] = None
+    entry_points: ClassVar[str | None] = None  # the group by which other packages bring plug-ins; None: none may
     kind: str
     config: Any  # the module's Config
 
     @property
     def module(self) -> ModuleType:
-        return import_module(f"{self.package}.{self.kind}")
+        return self.load_module(self.kind)
+
+    @classmethod
+    def load_module(cls, kind: str) -> ModuleType:
+        """The module of a kind that there is. Raises ConfigError where one of another package does not load."""
+        if kind in cls._names():
+            return import_module(f"{cls.package}.{kind}")
+        point, *others = entry_points(group=cls.entry_points or "", name=kind)
+        if others:
+            raise ConfigError(f"{kind}: several packages bring a plug-in of this name; uninstall all but one of them")
+        brought = f"{kind}: the plug-in {point.value}{f' of {point.dist.name}' if point.dist else ''}"
+        try:
+            module = point.load()
+        except Exception as error:  # it is another's code
+            raise ConfigError(
+                f"{brought} does not load ({type(error).__name__}: {sanitize_text(error)}); install that package anew, "
+                "or choose another kind"
+            ) from error
+        missing = [needed for needed in cls.needs if not hasattr(module, needed)]
+        if missing:
+            raise ConfigError(f"{brought} has no {' and no '.join(missing)}; it must be a module that has both")
+        return module
+
+    @classmethod
+    def kinds_elsewhere(cls) -> list[str]:
+        """The names of plug-ins that other packages bring; none of them is imported. Ours count before theirs."""
+        found = entry_points(group=cls.entry_points) if cls.entry_points else ()
+        return sorted({point.name for point in found}.difference(cls._names()))
 
     @classmethod
     def kinds(cls) -> list[str]:
@@ -171,9 +200,13 @@ def _replace_names(raw: Any, schema: Any, base: Any, place: KeyPlace) -> Any:
         }
     if isinstance(schema, type) and issubclass(schema, Plugin):
         kind = raw.get("kind", base.get("kind", schema.usual))
-        if not schema.is_kind(kind):
+        if not (schema.is_kind(kind) or kind in schema.kinds_elsewhere()):
             return raw  # which is refused where the whole is read
-        place, schema = dataclasses.replace(place, kind=str(kind)), _import_kind(schema, kind).Config
+        try:
+            module = schema.load_module(str(kind))
+        except ConfigError:
+            return raw  # likewise
+        place, schema = dataclasses.replace(place, kind=str(kind)), module.Config
     if not has_fields(schema):
         return raw
     place, types, result = place.enter(schema), list_field_types(schema), {}
@@ -228,18 +261,16 @@ def _add_kind(kind: object, raw: Any) -> Any:
     return {"kind": kind, **raw} if isinstance(raw, Mapping) else raw
 
 
-def _import_kind(schema: type[Plugin], kind: object) -> ModuleType:
-    return import_module(f"{schema.package}.{kind}")
-
-
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
-    if not schema.is_kind(kind):
-        raise ConfigError(
-            f"{join_keys(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got "
-            f"{sanitize_text(repr(kind), 100)}"
-        )
-    module = _import_kind(schema, kind)
+    elsewhere = schema.kinds_elsewhere()
+    if not (kind in elsewhere or schema.is_kind(kind)):
+        known = ", ".join([*schema.kinds(), *elsewhere])
+        raise ConfigError(f"{join_keys(where, 'kind')}: expected one of {known}, got {sanitize_text(repr(kind), 100)}")
+    try:
+        module = schema.load_module(str(kind))
+    except ConfigError as error:
+        raise ConfigError(f"{join_keys(where, 'kind')}: {error}") from error
     rest = {key: value for key, value in raw.items() if key != "kind"}
     return schema(kind, build_config(rest, module.Config, where))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,7 +22,7 @@ from scipy.special import chdtr
 from splatnode.capture.config import PreviewHeader, decode_preview
 from splatnode.capture.frame import Intrinsics, Stamp
 from splatnode.capture.lenses.undistort import undistort_image
-from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.config_keys import Internal
@@ -252,6 +253,7 @@ log = logging.getLogger(__name__)
 
 READ_S = 0.05  # between reads: a queue that is full keeps the oldest, and this one holds what a second brings
 RETRY_S = 1.0  # after the connection failed
+LOOK_S = 1.0  # between looks at which captures there are
 
 
 class PreviewReceiver:
@@ -274,17 +276,23 @@ class PreviewReceiver:
         """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
         while not self._stopping.is_set():
             try:
-                with Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader) as subscriber:
-                    self._receive(subscriber)
+                camera_id = self._find_first()
+                with Subscriber(CAPTURE_PREVIEW.select_capture(camera_id), self._network, PreviewHeader) as subscriber:
+                    self._receive(subscriber, camera_id)
             except NotAllowed:  # which the keyframes' connection tells, too
                 self._stopping.wait(RETRY_S)
             except Exception as error:  # a key's file, for one, may be written just now
                 self._report_unconnected(error)
                 self._stopping.wait(RETRY_S)
 
-    def _receive(self, subscriber: Subscriber) -> None:
-        """Raises NotAllowed."""
+    def _find_first(self) -> str:
+        """The camera id of the capture that is watched: of several the first, in the order of their ids."""
+        return next(iter(find_captures(self._network)), "")
+
+    def _receive(self, subscriber: Subscriber, camera_id: str) -> None:
+        """Until another capture is to be watched. Raises NotAllowed."""
         self._unconnected = ""
+        next_look_s = time.monotonic() + LOOK_S
         before = self._refused
         while not self._stopping.wait(READ_S):
             newest = subscriber.latest(0)
@@ -293,6 +301,10 @@ class PreviewReceiver:
             if newest is not None:
                 with self._lock:
                     self._newest = newest
+            if time.monotonic() >= next_look_s:
+                next_look_s = time.monotonic() + LOOK_S
+                if self._find_first() != camera_id:
+                    return
 
     def _report_unconnected(self, error: Exception) -> None:
         """Once, however long it lasts."""

@@ -12,6 +12,7 @@ import msgspec
 
 from splatnode.capture.process.files import is_disk_error
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
 from splatnode.recon.daemon.atlas.pose_graph import EdgeKind
@@ -20,10 +21,11 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.finalizer import InactiveSubmaps
 from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
-from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
 from splatnode.recon.daemon.output import Output, PublishedSnapshot
 from splatnode.recon.daemon.status import PLACES, SubmapStatus
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
+from splatnode.recon.frames.keyframe import Keyframe
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +109,7 @@ class Worker:
         found = self._restore()
         self.loading = 0
         if found is not None:
-            self._backlog = [ArrivedKeyframe(keyframe, time.monotonic()) for keyframe in found.new]
+            self._backlog = number_frame_sets(found.new, self._config.frame_sets.tolerance_s)
             self._run_step(lambda: self.place.resume(found))
         give_back_memory()
         while not self._stopping.is_set():
@@ -155,7 +157,10 @@ class Worker:
     def _take_events(self, wait_s: float) -> Sequence[Event]:
         """Returns the events to process next: first what an earlier process stored, a batch at a time."""
         if self._backlog:
-            events, self._backlog = self._backlog[:BATCH], self._backlog[BATCH:]
+            count = min(BATCH, len(self._backlog))
+            while count < len(self._backlog) and are_one_set(self._backlog[count - 1], self._backlog[count]):
+                count += 1
+            events, self._backlog = self._backlog[:count], self._backlog[count:]
             return events
         return self._inbox.dequeue(wait_s)
 
@@ -225,6 +230,19 @@ class Worker:
     def _report_problem(self, problem: str) -> None:
         self.problem = problem
         log.error("%s", problem)
+
+
+def number_frame_sets(keyframes: Sequence[Keyframe], tolerance_s: float) -> list[ArrivedKeyframe]:
+    """Keyframes that an earlier process stored, each with the number of its frame set, those of one side by side."""
+    frames = [each.frame for each in keyframes]
+    timed = [(each.name, each.camera_id, each.captured_at) for each in frames if each.captured_at is not None]
+    sets = {name: number for number, each in enumerate(form_frame_sets(timed, tolerance_s)) if len(each.names) > 1
+            for name in each.names.values()}  # fmt: skip
+    first = {number: index for index, each in reversed(list(enumerate(frames)))
+             if (number := sets.get(each.name)) is not None}  # fmt: skip
+    order = sorted(range(len(frames)), key=lambda index: (first.get(sets.get(frames[index].name, -1), index), index))
+    now_s = time.monotonic()
+    return [ArrivedKeyframe(keyframes[index], now_s, sets.get(frames[index].name)) for index in order]
 
 
 def _format_keyframe_count(number: int) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.calibration.board import DICTIONARIES
+from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.registration.undistortion import radial_of
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -102,8 +103,8 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # of wheels is not exactly what it is taken for
     odometry_scale_sigma: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.01
     # Standard deviation of a motion that comes without one: in each direction, as a share of its length
-    odometry_drift: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.02
-    odometry_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = 2.0  # and about each axis, degrees
+    odometry_drift: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = MOTION_DRIFT
+    odometry_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = MOTION_SIGMA_DEG  # and about each axis, degrees
     # Metres between the cameras of given stereo pairs; nothing: none are given
     stereo_baseline_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] | None = None
     # Standard deviation of that distance, metres

@@ -32,7 +32,7 @@ from splatnode.recon.metric.stereo import (
 )
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.snapshot import InGivenWorld, Snapshot, format_rounded_up
+from splatnode.recon.result.snapshot import GivenCameraPose, InGivenWorld, Snapshot, format_rounded_up
 from splatnode.recon.result.verdict import Scale, join_sentences
 
 # Of the scene's size: a grid as coarse as its coordinates may be. A render then has 40 dB against the same elsewhere.
@@ -66,6 +66,8 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
     unit = agreed.metres_per_unit
     to_metres = Similarity(unit, np.eye(3), np.zeros(3)) if aligned is None else aligned.rescale(unit)
     metric = _transform_snapshot(snapshot, to_metres)
+    if aligned is not None:
+        metric = _add_given_poses(metric, config, evidence)
     return replace(metric, scale=Scale(True, source, (low, high)))
 
 
@@ -152,6 +154,17 @@ def _estimate_scale_from_network(snapshot: Snapshot, sigma: float) -> Measuremen
     if loaded is None:
         return "no weights of the metric network: splatnode weights list tells where they are had"
     return estimate_scale_from_network(snapshot, MetricDepth(loaded.name, loaded), sigma)
+
+
+def _add_given_poses(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Snapshot:
+    """The snapshot in the world of given poses, with these beside its cameras."""
+    usual = config.poses_sigma_m, config.poses_sigma_deg
+    given = {
+        name: GivenCameraPose(pose.matrix, pose.sigma_m, pose.sigma_deg) for name, pose in evidence.tracked.items()
+    }
+    given |= {name: GivenCameraPose(T, *usual) for name, T in (evidence.poses or {}).items()}
+    cameras = tuple(replace(camera, given=given.get(camera.name)) for camera in snapshot.cameras)
+    return replace(snapshot, cameras=cameras)
 
 
 def _transform_snapshot(snapshot: Snapshot, by: Similarity) -> Snapshot:

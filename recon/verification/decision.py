@@ -459,12 +459,16 @@ def _refuse_contradictions(case: VerificationCase, against: str) -> Verdict:
 
 
 def _find_other_lens_frames(case: VerificationCase) -> list[str]:
-    """Frames whose size says that another lens took them than most; none where the camera was calibrated."""
+    """Frames whose size says that another lens took them than most; none where the camera was calibrated.
+
+    A camera with an id has its own lens anyhow, of which all of its images tell.
+    """
     keyframes = [case.graph.keyframes[camera.index] for camera in case.registration.cameras]
     sizes = [tuple(sorted((keyframe.frame.width, keyframe.frame.height))) for keyframe in keyframes]
     common = max(sorted(set(sizes)), key=sizes.count)
     others = [keyframe for keyframe, size in zip(keyframes, sizes, strict=True) if size != common]
-    return [keyframe.name for keyframe in others if keyframe.frame.intrinsics is None]
+    unknown = [keyframe for keyframe in others if keyframe.frame.intrinsics is None]
+    return [keyframe.name for keyframe in unknown if not keyframe.frame.camera_id]
 
 
 # The check of lenses that bend lines by more than two radial coefficients can tell, as a fisheye's do.

@@ -15,6 +15,7 @@ from splatnode.api.photographs import (
     Images,
     LensChoice,
     Masks,
+    SeveralCameras,
     apply_lens,
     lenses,
     list_images,
@@ -26,8 +27,15 @@ from splatnode.api.photographs import (
 from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Baseline as Apart
-from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.odometry import GRAVITY_SIGMA_DEG, GivenPose, Gravity, Motion, make_given_pose
+from splatnode.capture.frame import DroppedFrame, Frame, Stamp
+from splatnode.capture.odometry import (
+    GRAVITY_SIGMA_DEG,
+    MOTION_SIGMA_M,
+    GivenPose,
+    Gravity,
+    Motion,
+    make_given_pose,
+)
 from splatnode.capture.pose_files import create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
@@ -40,8 +48,6 @@ from splatnode.recon.pipeline import check_baseline, reconstruct_source
 from splatnode.recon.replay_source import add_poses, apply_masks
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
-
-LEAST_STEP_SIGMA_M = 0.001  # standard deviation of a motion, however short it is
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
 Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
@@ -87,7 +93,7 @@ def next_motion(
         raise ValueError("motion is that since the photograph before: the first one has none")
     moved = _matrix(step)
     length = float(np.linalg.norm(moved[:3, 3]))
-    usual = max(config.odometry_drift * length, LEAST_STEP_SIGMA_M), config.odometry_sigma_deg
+    usual = max(config.odometry_drift * length, MOTION_SIGMA_M), config.odometry_sigma_deg
     return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
 
 
@@ -119,7 +125,7 @@ def _list_named_poses(
     poses: Mapping[str, Matrix] | Sequence[Matrix | None], images: Images
 ) -> list[tuple[str, npt.NDArray[np.float64]]]:
     if isinstance(poses, Mapping):
-        return [(frame_name(Path(name)), _matrix(T)) for name, T in poses.items()]
+        return [(str(Path(name).parent / frame_name(Path(name))), _matrix(T)) for name, T in poses.items()]
     names = names_of(images)
     if len(poses) != len(names):
         raise ValueError(f"poses must be one for each of the {len(names)} photographs, got {len(poses)}")
@@ -262,6 +268,9 @@ Changes = Mapping[str, Any] | str | PathLike[str]
 def reconstruct(
     images: Images,
     *,
+    cameras: str | Sequence[str] | None = None,
+    camera_ids: Sequence[str | None] | None = None,
+    captured_at: Sequence[Stamp | None] | None = None,
     intrinsics: LensChoice | None = None,
     poses: Poses | None = None,
     poses_sigma: tuple[float, float] | None = None,
@@ -286,10 +295,15 @@ def reconstruct(
       `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
       uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
       than 30 photographs, keyframes are chosen.
+    - `cameras`: which cameras of one robot are used together, as `--cameras`: `"all"`, or a list of names: folders of
+      a folder, topics of an MCAP file, keys of an episode `"pusht#3"`; of listed folders or films, a name for each.
+      Frames are called `left/0001.jpg` then, and each camera has its own lens.
+    - `camera_ids`, `captured_at`: of listed images which camera took each (None: not known), and when, a `Stamp`. What
+      different cameras took together, to `frame_set_tolerance_s` of `config`, is used, or left out, as one.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion; or a list of these, one of each photograph (None: not known); or a mapping of
-      them by photograph, by camera with which names begin, or by pattern: `{"left": a, "right": b}`. None: what EXIF
-      tells, else it is estimated.
+      them by photograph, by camera id, by camera with which names begin, or by pattern: `{"left": a, "right": b}`.
+      None: what EXIF tells, else it is estimated.
     - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
       (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
       is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees: with
@@ -315,12 +329,13 @@ def reconstruct(
     telling = tell or ignore_progress
     check_count("views", views)
     check_count("threads", threads)
-    source = load_frames(images, views, every_frame, telling)
+    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
+    trusted = poses is not None and poses_sigma is not None and not poses_only_check
+    flags["registration"] = {"trust_poses": True} if trusted else None
+    several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
+    source = load_frames(images, views, every_frame, telling, several)
     source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
     source = apply_lens(source, intrinsics, images)
-    trusted = poses is not None and poses_sigma is not None and not poses_only_check
-    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
-    flags["registration"] = {"trust_poses": True} if trusted else None
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
@@ -346,6 +361,11 @@ def build_config(
     if scale is not None:
         config = apply_changes(config, {"metric": metric_changes(scale, of_pictures)})
     return apply_changes(config, {name: value for name, value in flags.items() if value is not None})
+
+
+def tolerance_of(preset: str, changes: Changes | None) -> float:
+    """The seconds between images of a frame set, by the preset and what differs from it."""
+    return build_config(preset, changes, {}, None, of_pictures=False).frame_set_tolerance_s
 
 
 def check_count(name: str, value: int | None) -> None:

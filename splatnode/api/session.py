@@ -81,7 +81,8 @@ class Session:
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress
-        self._selector = Selector(Selection(every_frame=every_frame, max_fps=_EACH, patience_s=0.0), Limits())
+        self._selection = Selection(every_frame=every_frame, max_fps=_EACH, patience_s=0.0)
+        self._selectors: dict[str, Selector] = {}  # by camera id
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()
@@ -110,16 +111,16 @@ class Session:
     ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
-        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the name of the camera that
-        took it: photographs of different cameras share no lens. `pose` is where odometry or a tracker says that its
-        camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that is, metres and
-        degrees; default: what `config` says. Two poses or more give the scene metres and their axes. `motion` is how
-        wheels or an IMU say that the camera has moved since the photograph that was given before, whether that was
-        taken or not: T_previous_current (4, 4), metres; `motion_sigma`, metres and degrees, is of this motion alone.
-        One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
-        degrees; it gives `Result.map` its up. `right` is what the right half of a stereo camera saw at that moment,
-        rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
-        the scene metres, too.
+        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the id of the camera
+        that took it, of several: photographs of different cameras share no lens. `pose` is where odometry or a
+        tracker says that its camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma`
+        how unsure that is, metres and degrees; default: what `config` says. Two poses or more give the scene
+        metres and their axes. `motion` is how wheels or an IMU say that the camera has moved since the
+        photograph that was given before, whether that was taken or not: T_previous_current (4, 4), metres;
+        `motion_sigma`, metres and degrees, is of this motion alone. One or more give metres. `gravity` (3,) is
+        the direction of down in the camera's frame, `gravity_sigma` in degrees; it gives `Result.map` its up.
+        `right` is what the right half of a stereo camera saw at that moment, rectified, of the image's size,
+        and `baseline_m` how far it stands from the left one, metres: such pairs give the scene metres, too.
 
         Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
         milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
@@ -139,7 +140,8 @@ class Session:
             self._motion = moved
             self._given.add(frame.name)
             self._sizes += {(frame.width, frame.height)}.difference(self._sizes)
-            decision = self._selector.decide(frame)
+            selector = self._selectors.setdefault(frame.camera_id, Selector(self._selection, Limits()))
+            decision = selector.decide(frame)
             if decision.take:
                 self._frames[frame.name] = frame
                 self._evidence = self._evidence.merge(gather_evidence((frame,), self._config.metric))
@@ -196,7 +198,7 @@ class Session:
         self, image: Picture, number: int, name: str, captured_at: Stamp | None, lens: Lens | None, camera: str | None
     ) -> Frame:
         made = make_frame(image, number, name, time.monotonic_ns(), captured_at)
-        made = made if camera is None else replace(made, camera=sanitize_text(camera, LONGEST_NAME))
+        made = made if camera is None else replace(made, camera_id=sanitize_text(camera, LONGEST_NAME))
         if lens is not None:
             known = intrinsics_of(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])

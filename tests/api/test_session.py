@@ -253,4 +253,4 @@ def test_a_photograph_may_have_its_own_lens_and_camera(arrays):
         with pytest.raises(ValueError, match="got those of 100 x 100 for 320 x 240"):
             session.add(arrays[2], intrinsics=splatnode.Intrinsics(100, 100, 90, 90, 50, 50, "given"))
         frames = [session._frames[name] for name in ("a.png", "b.png")]
-    assert [(each.intrinsics.fx, each.camera) for each in frames] == [(300, ""), (200, "gripper")]
+    assert [(each.intrinsics.fx, each.camera_id) for each in frames] == [(300, ""), (200, "gripper")]

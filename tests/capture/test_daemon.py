@@ -21,7 +21,7 @@ import pytest
 from splatnode.capture import keyframe_selection
 from splatnode.capture.cameras import folder
 from splatnode.capture.config import Camera, CaptureConfig, PreviewHeader, decode_preview
-from splatnode.capture.daemon import _Session, capture, last_run
+from splatnode.capture.daemon import CaptureSession, capture, last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.messages import FrameHeader
@@ -325,5 +325,5 @@ def test_what_the_camera_could_not_give_takes_no_room_of_keyframes(live, waiting
         _deliver=offered.append,
     )
     damaged = DroppedFrame("3.jpg", "the driver says that it is damaged")
-    _Session.drop(session, damaged)
+    CaptureSession.drop(session, damaged)
     assert session.dropped == 1 and offered == ([damaged] if told else [])

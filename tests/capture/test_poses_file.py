@@ -202,3 +202,16 @@ def test_many_matrices_are_judged_as_one_is(seed):
     for matrix, is_rigid in zip(matrices, are_rigid(matrices), strict=True):
         assert not (is_rigid and rigid_problem(matrix.ravel().tolist()))
     assert are_rigid(np.stack(TRUE)).all()
+
+
+def test_poses_of_several_cameras_are_found_with_the_cameras_folder(tmp_path):
+    """Photographs of two cameras have one name: their folders tell them apart, and none gets the other one's pose."""
+    left, right = np.eye(4), np.eye(4)
+    right[0, 3] = 0.5
+    frames = {"rig/left/1.png": left, "rig/right/1.png": right, "rig/left/2.png": right}
+    content = {"frames": [{"file_path": name, "transform_matrix": T.tolist()} for name, T in frames.items()]}
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps(content))
+    found = read_poses(file).find_poses([frame(name) for name in ("left/1.png", "right/1.png", "right/2.png")])
+    assert sorted(found) == ["left/1.png", "right/1.png"]
+    assert (found["left/1.png"][0, 3], found["right/1.png"][0, 3]) == (0.0, 0.5)

@@ -11,6 +11,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
 from splatnode.capture.keyframe_selection import (
+    LUCAS_KANADE,
     REMEMBERED_BLURS,
     REMEMBERED_VIEWS,
     Config,
@@ -139,6 +140,17 @@ def test_corners_are_tracked_to_where_they_went():
     error = np.linalg.norm((after - corners)[tracked] - (-12, 0), axis=-1)
     assert np.quantile(error, 0.9) < 0.1  # some at the border see what has come in
     assert not tracked[corners[:, 0, 0] < 10].any()  # these have left the image
+
+
+def test_a_corner_that_has_just_left_the_image_is_lost_though_its_surroundings_are_seen():
+    """Lucas and Kanade follow it beside the border, where half of its window still is in the image."""
+    start, now = (cv2.cvtColor(view(left).image, cv2.COLOR_RGB2GRAY) for left in (20, 23))
+    corners = np.array([[[x, y]] for x in (0.5, 1.0, 1.5, 2.0) for y in range(20, 220, 8)], np.float32)
+    guess = corners - np.array([3, 0], np.float32)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **LUCAS_KANADE)
+    assert found.mean() > 0.3 and (there[..., 0] < 0).mean() > 0.8
+    positions, tracked = track(start, now, corners, guess)
+    assert not (tracked & (there[:, 0, 0] < 0)).any() and (positions[tracked] >= 0).all()
 
 
 def test_parallax_is_what_no_homography_explains():

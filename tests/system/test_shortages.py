@@ -41,7 +41,7 @@ HARMLESS = {
         "capture/process/system.py:make_sure_of_room",
         "capture/reader.py:_run",
         "recon/batch/write_back.py:write_back",
-        "recon/daemon/node.py:_answer",
+        "recon/daemon/node.py:_remove_keyframe",
         "recon/daemon/node.py:run_and_record_error",
         "recon/daemon/output.py:save",
         "recon/daemon/output.py:save_fallbacks",

@@ -195,7 +195,7 @@ def capturing(place):
     config = CaptureConfig(camera, network=network, selection=keyframe_selection.Config(every_frame=True))
     with contextlib.ExitStack() as resources:
         server = resources.enter_context(KeyframeServer(network, Spool(SpoolConfig(directory=place))))
-        yield daemon._Session(config, server, resources)
+        yield daemon.CaptureSession(config, server, resources)
 
 
 def test_capture_keeps_a_frame_that_cannot_be_written_for_want_of_files(tmp_path):
