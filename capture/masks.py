@@ -127,13 +127,18 @@ def open_single_mask(path: Path) -> Find:
     return find
 
 
+_MOST_TIMES = 4  # as many pixels as its photograph: a mask of another size is decoded, and refused by its size
+_LEAST_BOUND = 1 << 20  # pixels that may be decoded of any photograph's mask
+
+
 def read_mask(path: Path, frame: Frame) -> Mask:
     """The mask (H, W) in an image file, turned as its photograph is. Raises UnusableMask.
 
     A mask that has the size of the photograph as it is stored, not turned yet, is turned as the photograph's EXIF says.
     """
+    most = max(_MOST_TIMES * frame.width * frame.height, _LEAST_BOUND)
     try:
-        image = outlast(lambda: decode_any_image(read_image_file(path)).image, sanitize_name(path.name))
+        image = outlast(lambda: decode_any_image(read_image_file(path, most), most).image, sanitize_name(path.name))
     except (UnusableImage, OSError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise UnusableMask(f"the mask {sanitize_name(path.name)} cannot be read: {why}") from error

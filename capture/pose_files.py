@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from array import array
 from collections import Counter
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame
-from splatnode.capture.odometry import are_rigid, rigid_problem
+from splatnode.capture.odometry import LARGEST_M, are_rigid, rigid_problem
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
@@ -79,6 +80,8 @@ _MAX_BYTES = 200_000_000
 MOST_POSES = 1_000_000  # of a file: those of five hours at 60 a second
 _LONGEST_GAP_S = 1.0  # between two poses, over which a time between them is interpolated
 _NEAREST_S = 0.02  # of a time to the one pose that counts where there is none on its other side
+_LARGEST_DEG = 180.0  # of a sigma
+_UNTOLD = math.nan, math.nan
 _FARTHEST_M = 1e9  # of a coordinate
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras: x right, y up, z back
 _Row = tuple[float, float, float, float]
@@ -92,6 +95,8 @@ class PosesFileError(ValueError):
 class _Frame(msgspec.Struct, frozen=True):
     file_path: _Name
     transform_matrix: tuple[_Row, _Row, _Row, _Row]
+    sigma_m: float | None = None  # standard deviation of the position in each direction, metres
+    sigma_deg: float | None = None  # of the orientation about each axis, degrees
 
 
 class _Transforms(msgspec.Struct, frozen=True):
@@ -107,22 +112,44 @@ class Trajectory:
     Ts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (M, 4, 4)
     # Of several cameras: by the folder and the name of the photograph, left/0001.jpg
     by_camera: Mapping[str, Array] = field(default_factory=dict)
+    # Standard deviations (2,) of a position in each direction, metres, and of an orientation about each axis, degrees,
+    # of those poses that tell them: by the name of the photograph, or of each time (M, 2), NaN where nothing is told
+    sigmas_by_name: Mapping[str, Array] = field(default_factory=dict)
+    sigmas: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def find_poses(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
         """The poses of the frames that have one, by their names."""
         found = {each.name: self.pose_of(each) for each in frames if isinstance(each, Frame)}
         return {name: T for name, T in found.items() if T is not None}
 
+    def find_sigmas(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, tuple[float, float]]:
+        """The standard deviations, metres and degrees, of the poses that tell them, by the frames' names."""
+        found = {each.name: self.sigmas_of(each) for each in frames if isinstance(each, Frame)}
+        return {name: sigmas for name, sigmas in found.items() if sigmas is not None}
+
     def pose_of(self, frame: Frame) -> Array | None:
         """Returns the pose of one frame, T_world_camera (4, 4); None where it has none."""
         if self.by_name or self.by_camera:
             named = self.by_camera if "/" in frame.name else self.by_name
             return named[known] if (known := self.names(frame.name)) else None
+        return None if (time := self._time_of(frame)) is None else self._interpolate_pose(time)
+
+    def sigmas_of(self, frame: Frame) -> tuple[float, float] | None:
+        """Returns the sigmas of one frame's pose, metres and degrees: between two poses the larger; None: not told."""
+        if self.by_name or self.by_camera:
+            told = self.sigmas_by_name.get(self.names(frame.name))
+        else:
+            time = self._time_of(frame) if len(self.sigmas) else None
+            told = None if time is None else self.sigmas[self._neighbours(time)].max(0)
+        return None if told is None or not np.isfinite(told).all() else (float(told[0]), float(told[1]))
+
+    def _time_of(self, frame: Frame) -> float | None:
+        """The time at which the frame has a pose, seconds; or its number, where times are numbers."""
         if frame.captured_at is not None:
-            found = self._interpolate_pose(frame.captured_at.ns / 1e9)
-            if found is not None or frame.captured_at.clock is Clock.RECORDING:
-                return found  # whole seconds of a recording are seconds, and no numbers of frames
-        return self._interpolate_pose(float(frame.frame_id)) if self._are_numbers else None
+            seconds = frame.captured_at.ns / 1e9
+            if self._neighbours(seconds) or frame.captured_at.clock is Clock.RECORDING:
+                return seconds  # whole seconds of a recording are seconds, and no numbers of frames
+        return float(frame.frame_id) if self._are_numbers else None
 
     @cached_property
     def _are_numbers(self) -> bool:
@@ -137,19 +164,28 @@ class Trajectory:
         named = self.by_camera if "/" in photograph else self.by_name
         return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in named), "")
 
-    def _interpolate_pose(self, seconds: float) -> Array | None:
-        """The pose at this time, between its two neighbours; None where they are too far away."""
+    def _neighbours(self, seconds: float) -> list[int]:
+        """The poses between which this time is, or the one that counts for it; none where they are too far away."""
         after = int(np.searchsorted(self.seconds, seconds))
         near = [index for index in (after - 1, after) if 0 <= index < len(self.seconds)]
+        if not near:
+            return []
         nearest = min(near, key=lambda index: abs(self.seconds[index] - seconds))
         if abs(self.seconds[nearest] - seconds) < 1e-6:
-            return self.Ts[nearest]
+            return [nearest]
         if len(near) < 2 or self.seconds[after] - self.seconds[after - 1] > _LONGEST_GAP_S:
-            return self.Ts[nearest] if abs(self.seconds[nearest] - seconds) <= _NEAREST_S else None
-        between, T = self.seconds[after - 1 : after + 1], np.eye(4)
+            return [nearest] if abs(self.seconds[nearest] - seconds) <= _NEAREST_S else []
+        return near
+
+    def _interpolate_pose(self, seconds: float) -> Array | None:
+        """The pose at this time, between its two neighbours; None where they are too far away."""
+        near = self._neighbours(seconds)
+        if len(near) < 2:
+            return self.Ts[near[0]] if near else None
+        between, T = self.seconds[near], np.eye(4)
         share = (seconds - between[0]) / (between[1] - between[0])
-        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(self.Ts[after - 1 : after + 1, :3, :3]))(share).as_matrix()
-        T[:3, 3] = (1.0 - share) * self.Ts[after - 1, :3, 3] + share * self.Ts[after, :3, 3]
+        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(self.Ts[near, :3, :3]))(share).as_matrix()
+        T[:3, 3] = (1.0 - share) * self.Ts[near[0], :3, 3] + share * self.Ts[near[1], :3, 3]
         return T
 
 
@@ -204,7 +240,9 @@ def _read(path: Path, data: bytes) -> Trajectory:
         content = record_in(data, _Transforms)
         _check_count(len(content.frames))
         matrices = np.array([each.transform_matrix for each in content.frames], np.float64).reshape(-1, 4, 4)
-        return _make_named_trajectory([each.file_path for each in content.frames], matrices @ _OPENGL)
+        told = any(each.sigma_m is not None or each.sigma_deg is not None for each in content.frames)
+        sigmas = np.array([(each.sigma_m, each.sigma_deg) for each in content.frames], np.float64) if told else None
+        return _make_named_trajectory([each.file_path for each in content.frames], matrices @ _OPENGL, sigmas)
     if path.suffix == ".bin":
         return _parse_colmap(binary_images(data))
     text = data.decode()
@@ -222,8 +260,10 @@ def create_trajectory(poses: Iterable[tuple[str, Array]]) -> Trajectory:
     return _make_named_trajectory(names, np.stack(matrices) if matrices else np.zeros((0, 4, 4)))
 
 
-def _make_named_trajectory(paths: Sequence[str], Ts: Array) -> Trajectory:
-    """As `named`; Ts (M, 4, 4)."""
+def _make_named_trajectory(
+    paths: Sequence[str], Ts: Array, sigmas: Sequence[Sequence[float]] | Array | None = None
+) -> Trajectory:
+    """As `create_trajectory`; Ts (M, 4, 4), sigmas (M, 2), NaN where a pose tells none."""
     names = [PurePosixPath(path).name for path in paths]
     if not names:
         raise ValueError("it holds no poses")
@@ -240,7 +280,13 @@ def _make_named_trajectory(paths: Sequence[str], Ts: Array) -> Trajectory:
         if name not in shared:
             by_name[name] = T
     _check(names, Ts)
-    return Trajectory(by_name, by_camera=by_camera)
+    told = np.zeros((0, 2)) if sigmas is None else _check_sigmas(names, sigmas)
+    by_pose: dict[str, Array] = {}
+    for path, name, own in zip(paths, names, told, strict=False):
+        folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
+        known = [each for each, held in ((name, by_name), (f"{folder}/{name}", by_camera)) if each in held]
+        by_pose.update({each: own for each in known if np.isfinite(own[0])})
+    return Trajectory(by_name, by_camera=by_camera, sigmas_by_name=by_pose)
 
 
 def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
@@ -254,27 +300,42 @@ def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
 
 
 def _parse_tum(text: str) -> Trajectory:
-    names, numbers = [], array("d")
+    names, numbers, told = [], array("d"), array("d")
     for line in each_line(text):
         if line.strip() and not line.lstrip().startswith("#"):
-            name, *motion = line.split(maxsplit=8)
-            if len(motion) != 7:
-                raise ValueError("each line must have eight values")
-            x, y, z, qx, qy, qz, qw = map(float, motion)
+            name, *motion = line.split(maxsplit=10)
+            if len(motion) not in (7, 9):
+                raise ValueError("each line must have eight values, or ten with the sigmas in metres and degrees")
+            x, y, z, qx, qy, qz, qw, *sigmas = map(float, motion)
             _add(names, name)
             numbers.extend((x, y, z, qw, qx, qy, qz))
+            told.extend(sigmas or _UNTOLD)
     if not names:
         raise ValueError("each line must have eight values, and there must be one")
-    Ts = _motions(numbers)
+    Ts, by_line = _motions(numbers), np.array(told, np.float64).reshape(-1, 2)
     try:
         seconds = np.array([float(name) for name in names])
     except ValueError:  # names of photographs in place of times
-        return _make_named_trajectory(names, Ts)
+        return _make_named_trajectory(names, Ts, by_line)
     _check(names, Ts)
     if not np.isfinite(seconds).all():
         raise ValueError("times must be finite")
     order = np.argsort(seconds, kind="stable")
-    return Trajectory(seconds=seconds[order], Ts=Ts[order])
+    return Trajectory(seconds=seconds[order], Ts=Ts[order], sigmas=_check_sigmas(names, by_line)[order])
+
+
+def _check_sigmas(names: Sequence[str], sigmas: Sequence[Sequence[float]] | Array) -> Array:
+    """(M, 2) metres and degrees; NaN where a pose tells none. Raises ValueError where some are no sigmas."""
+    told = np.asarray(sigmas, np.float64).reshape(-1, 2)
+    untold = np.isnan(told).all(1)
+    usable = (told > 0).all(1) & (told[:, 0] <= LARGEST_M) & (told[:, 1] <= _LARGEST_DEG)
+    for index in np.flatnonzero(~(untold | usable)):
+        got = " and ".join("nothing" if math.isnan(value) else f"{value:g}" for value in told[index])
+        raise ValueError(
+            f"the sigmas of the pose of {sanitize_text(names[int(index)], 100)} must be metres and degrees above 0, "
+            f"up to {LARGEST_M:g} and {_LARGEST_DEG:g}; got {got}"
+        )
+    return told
 
 
 def _add(names: list[str], name: str) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.keyframe_selection import THINNED
 from splatnode.capture.lens_file import Lenses, read_lenses
-from splatnode.capture.pose_files import poses_of, read_poses
+from splatnode.capture.pose_files import Trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.recon import cost
@@ -38,7 +38,7 @@ from splatnode.recon.evaluate.report import Bench, explain_missing_seconds, merg
 from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, format_run, run_bench
 from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric.arguments import collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
@@ -85,10 +85,15 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
     if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
         say(taken, error=True)
     check_baseline(config, given)
-    known = _load_scale_evidence(args, given)
-    if known.poses is not None and trusts_poses(args):
-        given = add_poses(given, known.poses, config.metric.poses_sigma_m, config.metric.poses_sigma_deg)
+    trajectory = None if args.poses is None else read_poses(args.poses)
+    known = _load_scale_evidence(args, given, trajectory)
+    own = {} if trajectory is None else trajectory.find_sigmas(given.frames)
+    if known.poses is not None and trusts_poses(args, told=bool(own)):
+        given = add_poses(given, known.poses, args.poses_sigma, own)
         known = replace(known, poses=None)  # they are the photographs' own now
+        config = apply_changes(config, {"registration": {"trust_poses": True, **collect_drift_changes(args)}})
+    elif args.poses_drift is not None:
+        raise ValueError("--poses-drift is of poses that hold the cameras: give --poses FILE and --poses-sigma, too")
     needed_bytes = bound_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with hold_result_folder(args.out, needed_bytes), _viewer(args) as show:
         config = set_preview_interval(config, LOOK_EVERY) if args.view else config
@@ -223,9 +228,9 @@ def _run_bench(args: argparse.Namespace) -> Bench:
         )
 
 
-def _load_scale_evidence(args: argparse.Namespace, given: Source) -> Evidence:
+def _load_scale_evidence(args: argparse.Namespace, given: Source, trajectory: Trajectory | None) -> Evidence:
     """Loads the scale evidence that the options name. Raises ValueError where it fits none of the images."""
-    poses = None if args.poses is None else poses_of(read_poses(args.poses), given.frames, str(args.poses))
+    poses = None if trajectory is None else poses_of(trajectory, given.frames, str(args.poses))
     pairs = () if args.stereo is None else make_pairs(given.frames, stream_right_images(args.stereo, given.frames))
     return Evidence(poses=poses, pairs=pairs)
 
@@ -243,8 +248,6 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
     if args.prior is not None and args.prior != config.prior.kind:
         config = apply_changes(config, {"prior": {"kind": args.prior}})
     config = apply_changes(config, {"metric": collect_metric_changes(args)})
-    if trusts_poses(args):
-        config = apply_changes(config, {"registration": {"trust_poses": True}})
     flags = {
         "size": args.size,
         "device": args.device,

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypeVar
 
 import msgspec
@@ -248,14 +249,28 @@ def apply_lenses(given: Source, lenses: Lenses) -> Source:
     return replace(given, frames=tuple(map(lenses.apply, given.frames)))
 
 
-def add_poses(given: Source, poses: Mapping[str, Array], sigma_m: float, sigma_deg: float) -> Source:
-    """The frames, each with its pose of `poses` (4, 4), metres, by their names, and its sigmas. Raises ValueError."""
+def add_poses(
+    given: Source,
+    poses: Mapping[str, Array],
+    sigmas: tuple[float, float] | None,
+    own: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> Source:
+    """The frames, each with its pose of `poses` (4, 4), metres, by their names, and its sigmas, metres and degrees.
+
+    `sigmas` are of those poses that have none of their `own`. Raises ValueError where neither tells a pose's.
+    """
 
     def add_pose(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
         if not isinstance(frame, Frame) or frame.name not in poses:
             return frame
+        told = own.get(frame.name, sigmas)
+        if told is None:
+            raise ValueError(
+                f"some poses tell how unsure they are, and that of {sanitize_name(frame.name)} does not: tell it for "
+                "each, or give --poses-sigma (poses_sigma) for those that do not"
+            )
         try:
-            return replace(frame, given_pose=make_given_pose(poses[frame.name], sigma_m, sigma_deg))
+            return replace(frame, given_pose=make_given_pose(poses[frame.name], *told))
         except ValueError as error:
             raise ValueError(f"{sanitize_name(frame.name)}: {error}") from error
 

@@ -36,8 +36,8 @@ Side = Annotated[int, msgspec.Meta(ge=16, le=4096)]
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keyframes: Count = 1000  # how many are made; the walk is as long as they need
-    width: Side = 480  # of an image, pixels
-    height: Side = 360  # of an image, pixels
+    width: Internal[Side] = 480  # of an image, pixels
+    height: Internal[Side] = 360  # of an image, pixels
     seed: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 0  # of the building and of the walk
     noise: Internal[float] = 1.0  # standard deviation of the sensor noise, grey levels
     samples: Internal[Annotated[int, msgspec.Meta(ge=1, le=4)]] = 2  # rays a pixel in each direction

@@ -87,8 +87,10 @@ class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The camera's poses by odometry, a tracker or a drone's log, in metres; each photograph carries its own."""
 
     file: Path  # a TUM trajectory, nerfstudio's transforms.json, or the folder of a COLMAP model
-    sigma_m: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_M)] = POSE_SIGMA_M  # of each position, metres
-    sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = POSE_SIGMA_DEG  # of each orientation about each axis
+    # Standard deviation of each position for which the file tells none, metres
+    sigma_m: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_M)] = POSE_SIGMA_M
+    # And of each orientation about each axis, degrees
+    sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = POSE_SIGMA_DEG
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -252,7 +254,8 @@ def _attach_pose(item: Frame | DroppedFrame, poses: Trajectory | None, given: Po
     if T_world_camera is None:
         return item
     try:
-        return replace(item, given_pose=make_given_pose(T_world_camera, given.sigma_m, given.sigma_deg))
+        sigmas = poses.sigmas_of(item) or (given.sigma_m, given.sigma_deg)
+        return replace(item, given_pose=make_given_pose(T_world_camera, *sigmas))
     except ValueError as error:
         return DroppedFrame(item.name, f"its pose cannot be used: {error}")
 

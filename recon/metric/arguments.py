@@ -8,6 +8,8 @@ from typing import Any
 
 from splatnode.capture.process.text import measurement_argument, parse_measurement, sanitize_text
 
+DRIFT_DEG = 0.5  # of odometry's direction after a metre, where nobody tells it
+
 
 def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:
     """Adds the option --marker, which applies to many recordings alike."""
@@ -44,8 +46,17 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
         type=_parse_two_sigmas,
         metavar="METRES,DEGREES",
         help="how unsure each pose is: the standard deviation of its position and of its orientation, absolute in the "
-        "poses' world. With a lens that is told (--intrinsics) the poses then hold the cameras, also where photographs "
-        "share no matches; poses that the photographs contradict are named and let go",
+        "poses' world; a file may tell it for single poses (two more columns of TUM, or sigma_m and sigma_deg in "
+        "transforms.json). With a lens that is told (--intrinsics) the poses then hold the cameras, also where "
+        "photographs share no matches; poses that the photographs contradict are named and let go",
+    )
+    parser.add_argument(
+        "--poses-drift",
+        type=_parse_drift,
+        metavar="PERCENT[,DEGREES]",
+        help="with sigmas: the poses are odometry's and drift from the first photograph on, a step by PERCENT of its "
+        "length (standard deviation in each direction, and of all lengths alike), its direction by DEGREES a metre, "
+        "growing with the root of the way (default: 0.5), as 2%%,0.5",
     )
     parser.add_argument(
         "--check-poses",
@@ -83,9 +94,35 @@ def _parse_two_sigmas(text: str) -> tuple[float, float]:
     return metres, degrees
 
 
-def trusts_poses(args: argparse.Namespace) -> bool:
-    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far."""
-    return args.poses_sigma is not None and not args.check_poses
+def _parse_drift(text: str) -> tuple[float, float]:
+    percent, _, degrees = text.partition(",")
+    try:
+        share, turn = float(percent.strip().removesuffix("%")) / 100.0, float(degrees) if degrees else DRIFT_DEG
+    except ValueError:
+        share = turn = -1.0
+    if not (0.0 < share <= 0.5 and 0.0 <= turn <= 90.0):
+        raise argparse.ArgumentTypeError(
+            f"must be a share above 0 %, up to 50 %, and degrees if you know them, as 2%,0.5; got "
+            f"{sanitize_text(text, 100)!r}"
+        )
+    return share, turn
+
+
+def collect_drift_changes(args: argparse.Namespace) -> dict[str, float]:
+    """Collects the changes of the configuration's `registration` that --poses-drift sets. Raises ValueError."""
+    if args.poses_drift is None:
+        return {}
+    if args.poses is None:
+        raise ValueError("--poses-drift is of --poses FILE, which is not given: which poses drift?")
+    return dict(zip(("poses_drift", "poses_drift_deg"), args.poses_drift, strict=True))
+
+
+def trusts_poses(args: argparse.Namespace, told: bool = False) -> bool:
+    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far.
+
+    `told`: their file says it.
+    """
+    return (told or args.poses_sigma is not None) and not args.check_poses
 
 
 def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:

@@ -114,6 +114,11 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_network_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.15
 
     @property
+    def poses_sigmas(self) -> tuple[float, float]:
+        """Metres and degrees."""
+        return self.poses_sigma_m, self.poses_sigma_deg
+
+    @property
     def baselines(self) -> tuple[Baseline, ...]:
         return (*(() if self.baseline is None else (self.baseline,)), *self.further_baselines)
 

@@ -81,7 +81,7 @@ MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are 
 class DropoutConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Dropout of Gaussians whose depth is uncertain, so that none relies on another in front of it or behind it."""
 
-    share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
+    share: Internal[float] = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
     sure: Internal[float] = 0.6  # least confidence of stereo at which the uncertainty is 0
     until: Internal[float] = 0.7  # share of the refinement after which no Gaussian is left out
 

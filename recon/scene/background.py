@@ -43,7 +43,7 @@ class BackgroundConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The far shell: Gaussians on a sphere around the scene, so that what no view has seen has the colours around
     it."""
 
-    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
+    spacing_deg: Internal[float] = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
     margin: Internal[float] = 2.0  # how far beyond the images' borders they are so near, in units of the images' size
     elsewhere_deg: Internal[float] = 10.0  # between those in all other directions; 0: there are none
     distance: Internal[float] = 1.3  # radius, in units of the farthest known depth

@@ -36,7 +36,7 @@ from splatnode.capture.odometry import (
     Motion,
     make_given_pose,
 )
-from splatnode.capture.pose_files import create_trajectory, poses_of, read_poses
+from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
@@ -50,12 +50,14 @@ from splatnode.recon.replay_source import add_poses, apply_masks
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
+Sigmas: TypeAlias = "tuple[float, float]"  # metres and degrees
+PosesSigma: TypeAlias = "Sigmas | Mapping[str, Sigmas] | Sequence[Sigmas | None]"
 Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
 
 
-def sigmas_of(poses_sigma: tuple[float, float] | None) -> dict[str, float] | None:
-    """Returns the settings of `metric` that the standard deviations change. Raises TypeError."""
-    if poses_sigma is None:
+def sigmas_of(poses_sigma: PosesSigma | None) -> dict[str, float] | None:
+    """Returns the settings of `metric` that the standard deviations of all poses change. Raises TypeError."""
+    if poses_sigma is None or not _is_of_all(poses_sigma):
         return None
     return dict(zip(("poses_sigma_m", "poses_sigma_deg"), _parse_sigmas(poses_sigma, "poses_sigma"), strict=True))
 
@@ -114,11 +116,48 @@ def poses_given(
     poses: Poses | None, images: Images, frames: Sequence[Frame | DroppedFrame]
 ) -> dict[str, npt.NDArray[np.float64]] | None:
     """The poses of the frames that have one, by their names. Raises TypeError, ValueError, FileNotFoundError."""
+    trajectory = load_trajectory(poses, images)
+    where = fspath(poses) if isinstance(poses, (str, PathLike)) else "poses"
+    return None if trajectory is None else poses_of(trajectory, frames, where)
+
+
+def load_trajectory(poses: Poses | None, images: Images) -> Trajectory | None:
+    """The poses as they are given, by name or time. Raises TypeError, ValueError, FileNotFoundError."""
     if poses is None:
         return None
     if isinstance(poses, (str, PathLike)):
-        return poses_of(read_poses(Path(poses)), frames, fspath(poses))
-    return poses_of(create_trajectory(_list_named_poses(poses, images)), frames, "poses")
+        return read_poses(Path(poses))
+    return create_trajectory(_list_named_poses(poses, images))
+
+
+def own_sigmas_of(
+    poses: Poses | None, sigma: PosesSigma | None, images: Images, frames: Sequence[Frame | DroppedFrame]
+) -> dict[str, Sigmas]:
+    """The standard deviations of single poses, by the frames' names: as given, else as their file tells them.
+
+    Raises TypeError, ValueError.
+    """
+    if sigma is not None and not _is_of_all(sigma):
+        return _list_named_sigmas(sigma, images)
+    trajectory = load_trajectory(poses, images) if isinstance(poses, (str, PathLike)) else None
+    return {} if trajectory is None else trajectory.find_sigmas(frames)
+
+
+def _is_of_all(sigma: PosesSigma) -> bool:
+    """Whether these are two numbers, of all poses, or else no mapping or list of such."""
+    return not isinstance(sigma, Mapping) and not (
+        isinstance(sigma, Sequence) and any(isinstance(each, (Sequence, type(None))) for each in sigma)
+    )
+
+
+def _list_named_sigmas(sigma: Any, images: Images) -> dict[str, Sigmas]:
+    if isinstance(sigma, Mapping):
+        return {frame_name(Path(name)): _parse_sigmas(each, "poses_sigma") for name, each in sigma.items()}
+    names = names_of(images)
+    if len(sigma) != len(names):
+        raise ValueError(f"poses_sigma must be one for each of the {len(names)} photographs, got {len(sigma)}")
+    told = zip(names, sigma, strict=True)
+    return {name: _parse_sigmas(each, "poses_sigma") for name, each in told if each is not None}
 
 
 def _list_named_poses(
@@ -273,7 +312,7 @@ def reconstruct(
     captured_at: Sequence[Stamp | None] | None = None,
     intrinsics: LensChoice | None = None,
     poses: Poses | None = None,
-    poses_sigma: tuple[float, float] | None = None,
+    poses_sigma: PosesSigma | None = None,
     poses_only_check: bool = False,
     masks: Masks | None = None,
     scale: Scale | None = None,
@@ -306,9 +345,10 @@ def reconstruct(
       None: what EXIF tells, else it is estimated.
     - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
       (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
-      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees: with
-      `intrinsics` the poses then hold the cameras, also where photographs share nothing. `poses_only_check`: they do
-      not even then, but are compared with the cameras that the photographs alone tell.
+      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees, of
+      all poses, or a mapping or list of such as `poses` is: with `intrinsics` the poses then hold the cameras, also
+      where photographs share nothing. So do poses whose file tells their sigmas. `poses_only_check`: they do not even
+      then, but are compared with the cameras that the photographs alone tell.
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
@@ -327,20 +367,19 @@ def reconstruct(
     Raises TypeError and ValueError where an argument is not what it must be, and FileNotFoundError.
     """
     telling = tell or ignore_progress
-    check_count("views", views)
-    check_count("threads", threads)
-    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
-    trusted = poses is not None and poses_sigma is not None and not poses_only_check
-    flags["registration"] = {"trust_poses": True} if trusted else None
+    check_counts(views=views, threads=threads)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     source = load_frames(images, views, every_frame, telling, several)
     source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
     source = apply_lens(source, intrinsics, images)
+    own = own_sigmas_of(poses, poses_sigma, images, source.frames)
+    trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
+    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
     if trusted and known is not None:
-        source = add_poses(source, known, chosen.metric.poses_sigma_m, chosen.metric.poses_sigma_deg)
+        source = add_poses(source, known, None if sigmas_of(poses_sigma) is None else chosen.metric.poses_sigmas, own)
         known = None  # they are the photographs' own now
     given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
@@ -366,6 +405,17 @@ def build_config(
 def tolerance_of(preset: str, changes: Changes | None) -> float:
     """The seconds between images of a frame set, by the preset and what differs from it."""
     return build_config(preset, changes, {}, None, of_pictures=False).frame_set_tolerance_s
+
+
+def hold_poses(trusted: bool) -> Mapping[str, bool] | None:
+    """Returns what makes given poses hold the cameras; None: nothing."""
+    return {"trust_poses": True} if trusted else None
+
+
+def check_counts(**values: int | None) -> None:
+    """Raises ValueError for an argument, by its name, that is neither a number of things nor None."""
+    for name, value in values.items():
+        check_count(name, value)
 
 
 def check_count(name: str, value: int | None) -> None:

@@ -643,8 +643,8 @@ MUTANTS = (
         "recon/result/export/formats/colmap.py",
         (
             "COLMAP gets camera-to-world",
-            "T_camera_world = np.linalg.inv(camera.T_world_camera)",
-            "T_camera_world = camera.T_world_camera",
+            "_format_motion(np.asarray(np.linalg.inv(T_world_camera), np.float64))",
+            "_format_motion(np.asarray(T_world_camera, np.float64))",
         ),
     ),
     *_list_mutants(

@@ -53,6 +53,9 @@ HARMLESS = {
     "what is left out is no frame, no keyframe and no result: a name, a reason, a picture, a figure": {
         "capture/daemon.py:last_run",
         "capture/messaging/keyframe_queue.py:_quarantine_frame",
+        "capture/process/library_lines.py:_create_file",
+        "capture/process/library_lines.py:_find_memory",
+        "capture/process/library_lines.py:tell_last_words",
         "capture/messaging/spool.py:mark_seen",
         "capture/messaging/spool.py:take",
         "recon/batch/report.py:make_data_url",

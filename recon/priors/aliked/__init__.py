@@ -16,7 +16,7 @@ WEIGHTS = ("aliked/aliked-n16.pth",)
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # file of N16 or T16; None: N16's, where `splatnode weights` puts them
-    longer_side: int = 800  # of the network's images, pixels; none is enlarged
+    longer_side: Internal[int] = 800  # of the network's images, pixels; none is enlarged
     num_keypoints: Internal[int] = 2000  # of an image, at most
 
 

@@ -112,7 +112,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
     longer_side: int = 512  # of the network's images, pixels: what it was trained with
-    max_neighbours: int = 6  # places in the circle of frames: of up to 13 frames every pair is asked about
+    max_neighbours: Internal[int] = 6  # places in the circle of frames: of up to 13 frames every pair is asked about
     seed: Internal[int] = 0  # every prior has one; global alignment has a fixed one
 
 

@@ -9,7 +9,7 @@ import pytest
 from splatnode.command_line import build_parser
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.config import ReconstructionConfig, apply_changes
-from splatnode.recon.metric.arguments import add_poses, collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import add_poses, collect_drift_changes, collect_metric_changes, trusts_poses
 
 
 def configured(*options: str):
@@ -60,3 +60,16 @@ def test_who_says_how_unsure_poses_are_trusts_them_unless_they_are_only_to_be_ch
         (["--poses", "p", "--poses-sigma", "0.001,0.1", "--check-poses"], False),
     ):
         assert trusts_poses(parser.parse_args(given)) is trusted
+
+
+def test_drift_is_a_share_of_the_way_and_degrees():
+    parser = argparse.ArgumentParser()
+    add_poses(parser)
+    for text, told in (("2%", (0.02, 0.5)), ("1,0.2", (0.01, 0.2))):
+        changes = collect_drift_changes(parser.parse_args(["--poses", "p", "--poses-drift", text]))
+        assert (changes["poses_drift"], changes["poses_drift_deg"]) == pytest.approx(told)
+    for wrong in ("0%", "60%", "2%,x", "nan", "2%,nan"):
+        with pytest.raises(SystemExit):
+            parser.parse_args(["--poses-drift", wrong])
+    with pytest.raises(ValueError, match="which poses drift"):
+        collect_drift_changes(parser.parse_args(["--poses-drift", "2%"]))

@@ -145,7 +145,9 @@ def test_pixels_without_a_point_are_white_or_left_out_as_is_chosen(without_netwo
     costs = {}
     for compare in (True, False):
         chosen = {"point_render": {"weight": 1.0, "compare_unseen": compare}}
-        config = apply_changes(preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}}).optimize.regularizers
+        config = apply_changes(
+            preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}}
+        ).optimize.regularizers
         regularised = Regularizer([half, nothing], [image, image], structs.replace(config, off_path=0.0), seed=0)
 
         def draw(view, _, dark: bool) -> Render:
