@@ -113,7 +113,7 @@ class Trajectory:
     # Of several cameras: by the folder and the name of the photograph, left/0001.jpg
     by_camera: Mapping[str, Array] = field(default_factory=dict)
     # Standard deviations (2,) of a position in each direction, metres, and of an orientation about each axis, degrees,
-    # of those poses that tell them: by the name of the photograph, or of each time (M, 2), NaN where nothing is told
+    # of those poses that tell them: by the name of the photograph, or of each time (M, 2), 0 where nothing is told
     sigmas_by_name: Mapping[str, Array] = field(default_factory=dict)
     sigmas: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
@@ -140,7 +140,8 @@ class Trajectory:
             told = self.sigmas_by_name.get(self.names(frame.name))
         else:
             time = self._time_of(frame) if len(self.sigmas) else None
-            told = None if time is None else self.sigmas[self._neighbours(time)].max(0)
+            near = np.zeros((0, 2)) if time is None else self.sigmas[self._neighbours(time)]
+            told = near.max(0) if len(near) and (near > 0).all() else None
         return None if told is None or not np.isfinite(told).all() else (float(told[0]), float(told[1]))
 
     def _time_of(self, frame: Frame) -> float | None:
@@ -321,7 +322,7 @@ def _parse_tum(text: str) -> Trajectory:
     if not np.isfinite(seconds).all():
         raise ValueError("times must be finite")
     order = np.argsort(seconds, kind="stable")
-    return Trajectory(seconds=seconds[order], Ts=Ts[order], sigmas=_check_sigmas(names, by_line)[order])
+    return Trajectory(seconds=seconds[order], Ts=Ts[order], sigmas=np.nan_to_num(_check_sigmas(names, by_line)[order]))
 
 
 def _check_sigmas(names: Sequence[str], sigmas: Sequence[Sequence[float]] | Array) -> Array:

@@ -156,7 +156,7 @@ def test_pictures_without_a_display(result, tmp_path, capsys):
     arguments = ["view", str(result), "--headless", "--size", "160x120", "--num-frames", "2", "--out", str(out)]
     assert command_line.main(arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == [
-        "camera_000.png", "camera_001.png", "overview.png", "turntable_000.png", "turntable_001.png",
+        "camera_000.png", "camera_001.png", "exports.json", "overview.png", "turntable_000.png", "turntable_001.png",
     ]  # fmt: skip
     pair, alone = (cv2.imread(str(out / f"camera_00{number}.png")) for number in (0, 1))
     assert pair is not None and alone is not None
