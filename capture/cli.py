@@ -23,7 +23,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import merge_config, parse_changes, parse_config, read_yaml
+from splatnode.capture.process.config import parse_changes, parse_config, parse_layers, read_yaml
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.logs import use_structured_lines
@@ -79,7 +79,7 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
     own = {} if args.intrinsics is None else {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
     if camera_id is not None:
         own["camera_id"] = camera_id
-    return parse_config(merge_config(merge_config(raw, own), parse_changes(args.set)), CaptureConfig)
+    return parse_layers([raw, own, parse_changes(args.set)], CaptureConfig)
 
 
 def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
@@ -134,8 +134,9 @@ def keys(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Waits for a heartbeat of each process and prints it; 75 where one is silent. `--seen`: what it tells is known.
+    """Waits for a heartbeat of each process and prints it; 75 where one is silent.
 
+    `--acknowledge`: what it tells is known.
     A capture that has come to the end of its recording is not silent.
     """
     network = (
@@ -154,7 +155,7 @@ def status(args: argparse.Namespace) -> int:
                 silent = f"{room}: {ended[room]}"
             for line in [silent] if fields is None else describe_heartbeat(room, fields):
                 say(line)
-    if args.seen:
+    if args.acknowledge:
         for room, answer in mark_problems_seen(network, [room for room, fields in found.items() if fields]).items():
             say(f"{room}: {answer}")
     return EXIT_GOOD if all(fields or room in ended for room, fields in found.items()) else EXIT_SILENT

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import keyframe_selection, reader
+from splatnode.capture import former_names, keyframe_selection, reader
 from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image
 from splatnode.capture.masks import mask_frames, open_single_mask
 from splatnode.capture.messaging import spool
@@ -31,7 +31,7 @@ _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gi
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Previews: small JPEG images of what the camera sees now. Some may be lost on the way."""
 
-    per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
+    fps: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
     # At least so many, pixels; less than twice as many, since images are reduced by whole factors
     longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75  # of the JPEG: 100 is best and largest
@@ -92,6 +92,8 @@ class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All that can be configured in the capture room, with defaults and units."""
+
+    former_keys = former_names.KEYS
 
     camera: Camera  # where frames come from: the kinds have options of their own, below
     quality: Limits = Limits()  # which frames are usable, and no copies

@@ -377,7 +377,7 @@ class CaptureSession:
         return True
 
     def _send_preview(self, frame: Frame, decision: Decision, state: ReaderState) -> None:
-        rate = self.config.preview.per_second
+        rate = self.config.preview.fps
         if rate == 0 or frame.stamp_ns < self._next_preview_ns:
             return
         self._next_preview_ns = frame.stamp_ns + round(1e9 * (1 - PREVIEW_JITTER) / rate)

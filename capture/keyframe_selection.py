@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, reduce_image
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 
@@ -60,9 +61,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Or when no homography explains so much of their motion, in longer sides of the image (median)
     parallax: Share = 0.01
     # Frames that are examined; the others become no keyframes. Higher: more work, finer choice
-    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0
+    max_fps: Annotated[float, msgspec.Meta(gt=0)] = 8.0
     # Until the next frame is examined, after one that would have been taken but is unusable
-    patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3
+    patience_s: Internal[Annotated[float, msgspec.Meta(ge=0)]] = 0.3
     # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
     backlog: Annotated[int, msgspec.Meta(ge=1)] = 8
 
@@ -123,7 +124,7 @@ class Selector:
             raise
 
     def _examine(self, frame: Frame, waiting: int) -> Decision:
-        self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
+        self._next_ns = frame.stamp_ns + round(1e9 / self.config.max_fps)
         small = reduce_image(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         reason, adds = self._explain_decision(grey, strictness=1 + waiting / self.config.backlog)
@@ -258,7 +259,7 @@ class FrameSetSelector:
 
     def __init__(self, config: Config, limits: Limits) -> None:
         self.config, self.limits = config, limits
-        self._each_config = msgspec.structs.replace(config, per_second=1e9, patience_s=0.0)  # sets have the pace
+        self._each_config = msgspec.structs.replace(config, max_fps=1e9, patience_s=0.0)  # sets have the pace
         self._selectors: dict[str, Selector] = {}  # by camera id
         self._next_ns = 0  # nothing is examined before
 
@@ -277,7 +278,7 @@ class FrameSetSelector:
                 for frame, decision in zip(frames, decisions, strict=True)
             ]
         unusable = not takes and any(decision.candidate for decision in decisions)
-        pause_s = self.config.patience_s if unusable else 1.0 / self.config.per_second
+        pause_s = self.config.patience_s if unusable else 1.0 / self.config.max_fps
         self._next_ns = frames[0].stamp_ns + round(1e9 * pause_s)
         return decisions
 

@@ -68,7 +68,7 @@ def _marker_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
-    parser.add_argument("--seen", action="store_true", help="the problems that are told need not be told again")
+    parser.add_argument("--acknowledge", action="store_true", help="the problems that are told need not be told again")
     add_json(parser)
 
 
@@ -87,9 +87,11 @@ VERBS = (
         import_lazily("splatnode.capture.cli", "config"),
     ),
     CALIBRATE,
-    Verb("find", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")),
     Verb(
-        "keys",
+        "list-cameras", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")
+    ),
+    Verb(
+        "keygen",
         "make this machine's keys; say who may connect",
         _keys_arguments,
         import_lazily("splatnode.capture.cli", "keys"),

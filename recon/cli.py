@@ -68,8 +68,8 @@ def replay(args: argparse.Namespace) -> int:
         _check_apart(args.out, source)
     if not args.map and is_map_set(args.out):
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
-    if args.map and args.only_seen:
-        raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
+    if args.map and args.multi_view_only:
+        raise ValueError("--multi-view-only is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, request, config)
     with show_progress(quiet=args.json) as tell:
@@ -99,7 +99,7 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
         config = set_preview_interval(config, LOOK_EVERY) if args.view else config
         preset_name = args.preset or "balanced"
         made = reconstruct_source(
-            given, config, preset_name, without_guesses=args.only_seen, given=known, show=show, tell=tell
+            given, config, preset_name, without_guesses=args.multi_view_only, given=known, show=show, tell=tell
         )
         del given  # and with it photographs that lie in a folder
         tell(ProgressStep("writing the results"))
@@ -213,8 +213,8 @@ def _run_bench(args: argparse.Namespace) -> Bench:
     scoring = Scoring(
         make_rasterizer(on),
         partial(load_networks, args.weights_dir and args.weights_dir.absolute()),
-        replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
-        args.by_region,
+        replace(INTERPOLATED_START if args.interpolate_start else Settings(), best_gain=args.color_correct),
+        args.score_regions,
     )
     with opened(args.cores, args.ray) as engine:
         return run_bench(
@@ -256,8 +256,10 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
         "frame_set_tolerance_s": args.frame_set_tolerance,
-        "quick": args.quick or None,
-        "decision": None if args.require is None else {"require_percent": args.require},
+        "no_fallbacks": args.no_fallbacks or None,
+        "decision": None
+        if args.max_position_error is None
+        else {"max_position_error_percent": args.max_position_error},
     }
     return apply_changes(config, {key: value for key, value in flags.items() if value is not None})
 
@@ -280,5 +282,8 @@ def _print_summary(snapshot: Snapshot, out: Path) -> None:
             say(f"lengths: {snapshot.scale.sentence}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
-        say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
+        say(
+            f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches "
+            "(--no-fallbacks leaves them out)"
+        )
     say(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

@@ -81,7 +81,7 @@ def create_initial_scene(
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     told = compute_exposure_priors(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
     exposures, headroom = scene_exposure.apply_headroom(
-        images, scene_exposure.estimate_exposures(pointmaps, images, config.light, told)
+        images, scene_exposure.estimate_exposures(pointmaps, images, config.exposure_compensation, told)
     )
     images = scene_exposure.compensate_images(images, exposures)
     seen_through = _find_transient_masks(pointmaps, images, masks, config) if all_at_hand else {}
@@ -89,7 +89,7 @@ def create_initial_scene(
         free, own = ~hidden, masks[name]
         masks[name] = free if own is None else free & own
         images[name] = fill_masked(images[name], free)
-    scene = initialize_scene(pointmaps, images, config.initialisation, masks, exposures, lenses)
+    scene = initialize_scene(pointmaps, images, config.scene_initialization, masks, exposures, lenses)
     shares = {name: float(hidden.mean()) for name, hidden in seen_through.items()}
     views = tuple(replace(view, moved=shares.get(view.name, 0.0)) for view in scene.views)
     return replace(scene, views=views, headroom=headroom)
@@ -102,7 +102,7 @@ def _find_transient_masks(
     config: ReconstructionConfig,
 ) -> dict[str, Mask]:
     """For each photograph that shows what others see through: the mask (h, w), True there, that no other mask hides."""
-    if not config.denied.enabled:
+    if not config.transient_mask.enabled:
         return {}
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     used = []

@@ -42,7 +42,7 @@ MOST = 60  # keyframes of a video, or of a folder of more photographs
 EVERY = 300  # frames of a video, where all that are sharp and no copies are asked for
 IMAGES = "images"  # in the result folder: the keyframes of a video
 
-_OF_PHOTOGRAPHS = Config(per_second=1e9, patience_s=0.0)  # which were not taken at any rate
+_OF_PHOTOGRAPHS = Config(max_fps=1e9, patience_s=0.0)  # which were not taken at any rate
 
 
 @dataclass(frozen=True)

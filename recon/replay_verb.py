@@ -57,7 +57,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     _add_masks(parser)
     parser.add_argument(
         "--intrinsics",
-        "--calibration",
         type=Path,
         metavar="FILE",
         help="the lens of all photographs, or one of each image or camera: YAML as a camera's configuration has it, a "
@@ -92,12 +91,12 @@ def add_reconstruction_options(parser: argparse.ArgumentParser) -> tuple[argpars
             "photographs and writing files come on top, and cameras and first points take what they take",
         ),
         add(
-            "--quick",
+            "--no-fallbacks",
             action="store_true",
             help="refuse at once: try nothing that takes longer before the answer is no",
         ),
         add(
-            "--require",
+            "--max-position-error",
             type=percent,
             metavar="PERCENT",
             help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% "

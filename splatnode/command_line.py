@@ -25,12 +25,16 @@ from typing import NoReturn
 import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
+from splatnode.capture import former_names as capture_names
+from splatnode.capture.process.arguments import replace_former_words
 from splatnode.capture.process.files import default_runtime_directory
 from splatnode.capture.process.library_lines import keep_last_words, tell_last_words
 from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
-from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output
+from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output, say
 from splatnode.capture.process.text import sanitize_lines, sanitize_text
+from splatnode.recon import former_names as recon_names
+from splatnode.viewer import former_names as viewer_names
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -43,6 +47,9 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
+# Hidden aliases: no help lists them
+FORMER_VERBS = recon_names.VERBS | capture_names.VERBS
+FORMER_FLAGS = recon_names.FLAGS | viewer_names.FLAGS | capture_names.FLAGS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,7 +60,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     parser = build_parser()
-    args = parser.parse_args(argv)
+    words, told = replace_former_words(sys.argv[1:] if argv is None else argv, FORMER_VERBS, FORMER_FLAGS)
+    for sentence in told:
+        say(f"splatnode: {sentence}", error=True)
+    args = parser.parse_args(words)
     if args.verb is None:
         parser.print_help(sys.stderr)
         return 2

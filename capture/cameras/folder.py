@@ -100,7 +100,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intrinsics: Intrinsics | None = None
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     # By the stamps that the photographs get; those of a recording have their own
-    frames_per_second: FramesPerSecond = 10.0
+    fps: FramesPerSecond = 10.0
     pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are taken
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many times all are shown, each time under other names
     # Of a stereo camera, whose left photographs lie in `folder`: what the right one saw, by which lengths are in metres
@@ -192,7 +192,7 @@ def _frames(
             height, width = image.shape[:2]
             if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
-            stamp_ns = round(frame_id / config.frames_per_second * 1e9)
+            stamp_ns = round(frame_id / config.fps * 1e9)
             # A file whose values are stretched is no file of this image: a recording would store it as it was.
             known = image, intrinsics, data if used is None else None, decoded.captured_at or name_time(name)
             item = make_frame(

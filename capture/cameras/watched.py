@@ -38,6 +38,7 @@ from splatnode.capture.image_file import (
 )
 from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import is_shortage, outlast
@@ -49,11 +50,11 @@ _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: Path  # the folder that is watched
-    existing: bool = True  # whether what lies there at the start is taken, too
-    poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2  # between looks at the folder
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
+    include_existing: bool = True  # whether what lies there at the start is taken, too
+    poll_s: Internal[Annotated[float, msgspec.Meta(gt=0)]] = 0.2  # between looks at the folder
+    stable_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
     # A file that is not whole, or cannot be read, after so long is left out
-    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0
+    file_timeout_s: Internal[Annotated[float, msgspec.Meta(gt=0)]] = 60.0
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     # The lens, of all images of its aspect ratio, instead of what their EXIF tells
     intrinsics: Intrinsics | None = None
@@ -122,7 +123,7 @@ class _Watched:
         """Raises CameraUnavailable."""
         if self._opened:
             self._here = set()  # while it was away, any name may have been given to another photograph
-        elif not self._config.existing:
+        elif not self._config.include_existing:
             self._done = {path.name: _version(path) for path in _list_images(self._config.folder)}
             self._here = set(self._done)
         self._opened = True
@@ -179,7 +180,7 @@ def _read_when_complete(
         if before is None or (before.size, before.changed_ns) != (found.st_size, found.st_mtime_ns):
             seen[path.name] = _FileState(found.st_size, found.st_mtime_ns, now, before.first if before else now)
             return None
-        if now - before.since < config.settle_s:
+        if now - before.since < config.stable_s:
             return None
         data = read_image_file(path, config.max_pixels)
         check_whole(data)
@@ -242,7 +243,7 @@ def _apply_sidecar(made: Frame, sidecar: Sidecar) -> Frame | DroppedFrame:
 
 def _drop_when_overdue(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
     """None while it may still become whole, or readable."""
-    return None if waited_s < config.give_up_s else DroppedFrame(name, f"{why}, after {waited_s:.0f} s")
+    return None if waited_s < config.file_timeout_s else DroppedFrame(name, f"{why}, after {waited_s:.0f} s")
 
 
 def _decode_frame(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:

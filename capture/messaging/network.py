@@ -101,7 +101,7 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of ipc sockets and locks. None: $RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/splatnode, else a folder under /tmp.
     directory: Path | None = None
     tcp: str | None = None  # the address to bind (robot) or to connect to (other machine), in place of ipc; needs keys
-    keys: Path | None = None  # the folder that `splatnode keys` made; None: no keys, and so no tcp
+    keys: Path | None = None  # the folder that `splatnode keygen` made; None: no keys, and so no tcp
     first_port: Annotated[int, msgspec.Meta(ge=1, le=65500)] = 47310  # of the tcp ports, which follow one another
     max_message_mb: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256  # a larger message is not taken, in 2^20 bytes
 
@@ -282,7 +282,7 @@ class _Link:
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                raise NotAllowed(f"{self._address} does not let this machine in. Run there: splatnode keys --allow")
+                raise NotAllowed(f"{self._address} does not let this machine in. Run there: splatnode keygen --allow")
             self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
         if self._failures >= _MAX_FAILED_HANDSHAKES:
             raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
@@ -334,7 +334,7 @@ def _curve_keys(network: Network) -> Keys | None:
     if network.tcp is None:
         return None
     if network.keys is None:
-        raise NetworkError("network.tcp needs network.keys, or anybody could connect. Run: splatnode keys FOLDER")
+        raise NetworkError("network.tcp needs network.keys, or anybody could connect. Run: splatnode keygen FOLDER")
     return read_keys(network.keys)
 
 

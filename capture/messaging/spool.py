@@ -20,6 +20,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from splatnode.capture.messaging.wire import MAGIC, VERSION, Name, Part, Text, check
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.files import (
     StrayFile,
     exclusive,
@@ -220,7 +221,7 @@ class SpoolConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     # Their size, in 2^20 bytes, at which likewise no further one is taken
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
-    quarantine: QuarantineConfig = QuarantineConfig()  # keyframes that recon refused
+    quarantine: Internal[QuarantineConfig] = QuarantineConfig()  # keyframes that recon refused
 
 
 _FILE = re.compile(r"[0-9]{12,18}-[0-9a-f]{32}-[0-9]{1,18}\.frame")  # number, session, sequence

@@ -121,7 +121,7 @@ class Daemon:
             make_sure_of_room(_FILES + files_for_strangers(network, _SOCKETS), _THREADS)
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
             self._depths = self._resources.enter_context(StateServer(RECON_DEPTH, network))
-            maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.map.live else None
+            maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.occupancy.live else None
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
             self._store = Store(config.checkpoint or state_directory() / "recon")
@@ -177,7 +177,7 @@ class Daemon:
                 self._publish()
                 self._publish_map(self._worker.current_map)
                 if time.monotonic() >= next_status_s:
-                    next_status_s = time.monotonic() + self._config.status_every_s
+                    next_status_s = time.monotonic() + self._config.status_interval_s
                     self._heart.do(self._beat)
                     if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager restarts it
                         manager.alive(self._told)

@@ -44,15 +44,17 @@ class Worker:
         stopping: threading.Event,
     ) -> None:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
-        asked = config.reconstruction.ladder
-        ladder = asked if asked.most_s is not None else msgspec.structs.replace(asked, most_s=LADDER_S)
-        self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None, ladder=ladder)
+        asked = config.reconstruction.fallbacks
+        ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
+        self._recipe = msgspec.structs.replace(
+            config.reconstruction, max_gaussians=limit, budget_s=None, fallbacks=ladder
+        )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._report_problem)
         self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause)
-        self._free_space = OccupancyMapper(config.map)
+        self._free_space = OccupancyMapper(config.occupancy)
         self._atlas = LoopDetector(store.directory, self._recipe, self._output.places)
-        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_s)
+        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_timeout_s)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
         self._shortage = ""  # the last one that was told
@@ -111,7 +113,7 @@ class Worker:
             self._run_step(lambda: self.place.resume(found))
         give_back_memory()
         while not self._stopping.is_set():
-            worked = self._process_events(min(IDLE_S, self._config.settle_s))
+            worked = self._process_events(min(IDLE_S, self._config.idle_finalize_s))
             if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
                 self._run_step(self._process_idle, present=False)
         self._run_step(self.place.export_provisionally)
@@ -145,7 +147,7 @@ class Worker:
             self._run_step(lambda: self._add_keyframes(arrived))
         elif left_out:
             self._run_step(lambda: self.place.remove_frames(left_out))
-        elif self.place.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.settle_s:
+        elif self.place.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.idle_finalize_s:
             return False
         else:
             self._run_step(lambda: self._add_keyframes([]) if self.place.owed else self.place.finalize())

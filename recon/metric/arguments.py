@@ -59,7 +59,7 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
         "growing with the root of the way (default: 0.5), as 2%%,0.5",
     )
     parser.add_argument(
-        "--poses-only-check",
+        "--check-poses",
         action="store_true",
         help="only compare the poses with the cameras that the photographs alone tell, and take metres and axes from "
         "them, as without --poses-sigma",
@@ -122,7 +122,7 @@ def trusts_poses(args: argparse.Namespace, told: bool = False) -> bool:
 
     `told`: their file says it.
     """
-    return (told or args.poses_sigma is not None) and not args.poses_only_check
+    return (told or args.poses_sigma is not None) and not args.check_poses
 
 
 def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
@@ -135,11 +135,11 @@ def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     if (args.stereo is None) != (args.stereo_baseline is None):
         raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
     if args.stereo_baseline is not None:
-        changes |= _parse_length("stereo", args.stereo_baseline)
+        changes |= _parse_length("stereo_baseline", args.stereo_baseline)
     if args.poses_sigma is not None and args.poses is None:
         raise ValueError("--poses-sigma is of --poses FILE, which is not given: how unsure are which poses?")
-    if args.poses_only_check and args.poses is None:
-        raise ValueError("--poses-only-check is of --poses FILE, which is not given: which poses are to be checked?")
+    if args.check_poses and args.poses is None:
+        raise ValueError("--check-poses is of --poses FILE, which is not given: which poses are to be checked?")
     if args.poses_sigma is not None:
         changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes
@@ -147,7 +147,7 @@ def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
 
 def collect_marker_changes(args: argparse.Namespace) -> dict[str, float]:
     """Collects the changes that --marker alone sets. Raises ValueError."""
-    return {} if args.marker is None else _parse_length("marker", args.marker)
+    return {} if args.marker is None else _parse_length("marker_size", args.marker)
 
 
 def _parse_length(what: str, text: str) -> dict[str, float]:

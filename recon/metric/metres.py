@@ -78,9 +78,9 @@ def _collect_measurements(
     said: list[Measurement | str] = [
         estimate_scale_from_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines
     ]
-    if config.marker_m is not None:
+    if config.marker_size_m is not None:
         said += estimate_scale_from_markers(
-            make_metric_views(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m
+            make_metric_views(snapshot), evidence.sightings, config.marker_size_m, config.marker_size_sigma_m
         )
     aligned = None
     if snapshot.given is not None:
@@ -98,13 +98,13 @@ def _collect_measurements(
             found = offset
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
-    said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.motions_shared)
+    said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.odometry_scale_sigma)
     for (baseline_m, sigma_m), pairs in _group_stereo_pairs(config, evidence).items():
         said.append(
             estimate_scale_from_stereo(make_metric_views(snapshot), snapshot.landmarks, pairs, baseline_m, sigma_m)
         )
-    if config.network:
-        said.append(_estimate_scale_from_network(snapshot, config.network_sigma))
+    if config.depth_network:
+        said.append(_estimate_scale_from_network(snapshot, config.depth_network_sigma))
     return said, aligned
 
 
@@ -140,7 +140,7 @@ def _explain_too_far(snapshot: Snapshot, aligned: PoseAlignment) -> str:
 
 def _group_stereo_pairs(config: MetricConfig, evidence: Evidence) -> dict[tuple[float, float], list[StereoPair]]:
     """The stereo pairs by how far apart their cameras are, and its standard deviation, metres."""
-    usual = None if config.stereo_m is None else (config.stereo_m, config.stereo_sigma_m)
+    usual = None if config.stereo_baseline_m is None else (config.stereo_baseline_m, config.stereo_baseline_sigma_m)
     rigs: dict[tuple[float, float], list[StereoPair]] = {} if usual is None else {usual: []}
     for pair in evidence.pairs:
         own = usual if pair.baseline is None else (pair.baseline.metres, pair.baseline.sigma_m)

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
 from splatnode.recon.matching.two_view import TwoView
@@ -32,8 +33,8 @@ from splatnode.recon.registration.subpixel import PatchImage, patch_image
 class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of registration: the lenses, and the mapper."""
 
-    lenses: self_calibration.LensGroupingConfig = self_calibration.LensGroupingConfig()
-    mapper: incremental_mapper.MapperConfig = incremental_mapper.MapperConfig()
+    lenses: Internal[self_calibration.LensGroupingConfig] = self_calibration.LensGroupingConfig()
+    mapper: Internal[incremental_mapper.MapperConfig] = incremental_mapper.MapperConfig()
     # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
     # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
     trust_poses: bool = False

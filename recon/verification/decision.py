@@ -169,7 +169,7 @@ def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
 
 def check_required_precision(case: EvidenceCase) -> Verdict | None:
     """The centres are known less well than the user requires."""
-    needed = case.config.require_percent
+    needed = case.config.max_position_error_percent
     if needed is None or case.widest_bounds.centre_percent <= needed:
         return None
     return refuse(rejections.ROUGHER, case.names, found=case.widest_bounds.centre_percent, needed=needed)
@@ -389,7 +389,7 @@ def make_overfit_verdict(names: Sequence[str], iterations: int, kept: int, befor
         Code.OVERFIT,
         f"The refinement overfitted the photographs: between them the scene misses what stereo shows by {after:.2g} "
         f"after {iterations} iterations, and by {before:.2g} after {kept}, which is the scene that is given.",
-        "Take smaller steps (optimize.rates) or fewer (optimize.iterations), or a preset as it is.",
+        "Take smaller steps (optimize.lr) or fewer (optimize.iterations), or a preset as it is.",
         tuple(names),
         publishable=True,
     )

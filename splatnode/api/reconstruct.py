@@ -163,7 +163,7 @@ def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
         if isinstance(each, Marker):
             changes |= _make_marker_settings(each)
         elif isinstance(each, Stereo):
-            changes |= {"stereo_m": each.baseline_m, "stereo_sigma_m": each.sigma_m}
+            changes |= {"stereo_baseline_m": each.baseline_m, "stereo_baseline_sigma_m": each.sigma_m}
         else:
             baselines.append(_baseline(each, of_pictures))
     if baselines:
@@ -212,8 +212,8 @@ def _list_scale_sources(scale: object) -> Sequence[object]:
 
 def _make_marker_settings(marker: Marker) -> dict[str, Any]:
     return {
-        "marker_m": marker.side_m,
-        "marker_sigma_m": marker.sigma_m,
+        "marker_size_m": marker.side_m,
+        "marker_size_sigma_m": marker.sigma_m,
         "marker_dictionary": marker.dictionary,
     }
 

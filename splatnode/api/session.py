@@ -89,7 +89,7 @@ class Session:
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress
-        self._selection = Selection(every_frame=every_frame, per_second=_EACH, patience_s=0.0)
+        self._selection = Selection(every_frame=every_frame, max_fps=_EACH, patience_s=0.0)
         self._selectors: dict[str, Selector] = {}  # by camera id
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._trust_poses(poses_sigma)
@@ -146,7 +146,7 @@ class Session:
             metric = self._config.metric
             given = make_pose(None if pose is None else parse_matrix(pose), pose_sigma, metric.poses_sigmas)
             self._trust_poses(pose_sigma)
-            usual = metric.motions_drift, metric.motions_sigma_deg
+            usual = metric.odometry_drift, metric.odometry_sigma_deg
             moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
             came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
             frame = replace(frame, **came, right=_make_right_image(right, baseline_m))

@@ -201,7 +201,7 @@ def test_what_one_camera_adds_takes_the_whole_frame_set():
     frames = []
     for step in range(8):  # one camera moves fast, the other by little: too little to be taken alone, and no copy
         frames += [shot("fast", step, 60 * step), shot("slow", step, 8 * step)]
-    config = Config(per_second=1e9, patience_s=0.0)
+    config = Config(max_fps=1e9, patience_s=0.0)
     alone = choose([frame for frame in frames if frame.camera_id == "slow"], config, Limits(), 60)
     both = choose(frames, config, Limits(), 60)
     fast = [name.split("/")[1] for name in both.names if name.startswith("fast")]
@@ -220,6 +220,6 @@ def test_an_unusable_image_leaves_its_frame_set_alone():
     frames = []
     for step, image in enumerate(images):
         frames += [make_frame("left", step, image), make_frame("right", step, np.zeros_like(image))]
-    choice = choose(frames, Config(per_second=1e9, patience_s=0.0), Limits(blur_px=99.0), 60)
+    choice = choose(frames, Config(max_fps=1e9, patience_s=0.0), Limits(max_blur_px=99.0), 60)
     assert [name for name in choice.names if name.startswith("right")] == []
     assert len(choice.names) == 3

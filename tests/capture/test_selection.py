@@ -24,7 +24,7 @@ from splatnode.capture.keyframe_selection import (
 from splatnode.capture.quality import Limits
 from tests.support import synthetic
 
-EVERY = Config(per_second=1000.0, patience_s=0.0)
+EVERY = Config(max_fps=1000.0, patience_s=0.0)
 WALL = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (600, 1200, 3)).astype(np.uint8), (0, 0), 2)
 WALL = cv2.normalize(WALL, None, 0, 255, cv2.NORM_MINMAX)
 
@@ -94,7 +94,7 @@ def test_blurred_candidates_are_waited_out():
 
 
 def test_not_every_frame_is_examined():
-    decisions = taken([replace(view(0, index), stamp_ns=index * 10**7) for index in range(101)], Config(per_second=10))
+    decisions = taken([replace(view(0, index), stamp_ns=index * 10**7) for index in range(101)], Config(max_fps=10))
     assert sum(decision.reason != "between two examinations" for decision in decisions) == 11
 
 
@@ -188,7 +188,7 @@ def test_the_built_in_capture_is_taken_whole():
 
 @pytest.mark.parametrize("scene", ["fox", "llff_flower", "tum_fr3_office"])
 def test_real_photographs_of_a_walk_are_taken(shared, scene):
-    frames = folder.stream(folder.Config(shared / "scenes" / scene / "images", frames_per_second=2))
+    frames = folder.stream(folder.Config(shared / "scenes" / scene / "images", fps=2))
     decisions = taken([frame for frame in frames if isinstance(frame, Frame)][:12])
     assert sum(decision.take for decision in decisions) >= 5
     assert not [decision.reason for decision in decisions if decision.candidate and not decision.take]

@@ -355,7 +355,7 @@ MUTANTS = (
         ("paper: semantic from .5 instead of .1", "semantic.Config(0.5, 0.1, 0.8)", "semantic.Config(0.5, 0.5, 0.8)"),
         ("paper: white where no point is, not compared", "compare_unseen=True", "compare_unseen=False"),
         ("InstantSplat: colours a tenth as fast", "sh=2.5e-2,", "sh=2.5e-3,"),
-        ("InstantSplat: D-SSIM .8 instead of .2", "dssim=0.2,", "dssim=0.8,"),
+        ("InstantSplat: D-SSIM .8 instead of .2", "ssim_lambda=0.2,", "ssim_lambda=0.8,"),
         ("InstantSplat: steps of poses do not fall", "final_pose=0.01,", "final_pose=1.0,"),
     ),
     *_list_mutants(
@@ -392,7 +392,7 @@ MUTANTS = (
     *_list_mutants(
         "recipes",
         "recon/optimize/control/proximity.py",
-        ("FSGS: one neighbour instead of three", "neighbours: int = 3", "neighbours: int = 1"),
+        ("FSGS: one neighbour instead of three", "neighbours: Internal[int] = 3", "neighbours: int = 1"),
     ),
     *_list_mutants(
         "recipes",

@@ -56,7 +56,7 @@ def noisy(seed: int = 0) -> dict[int, Array]:
 
 @lru_cache(maxsize=1)
 def matched() -> ViewGraph:
-    alone = apply_changes(TRUSTING, {"registration": {"trust_poses": False}, "quick": True})
+    alone = apply_changes(TRUSTING, {"registration": {"trust_poses": False}, "no_fallbacks": True})
     return estimate_frame_cameras(told({}), load_prior(alone), alone, Clock())[0].graph
 
 

@@ -60,7 +60,7 @@ def test_one_light_for_photographs_of_different_exposure_is_worth_what_it_was(sh
     config = apply_changes(preset("fast"), BUDGET)
     start, found = find_start(under, config), {}
     for enabled in (True, False):
-        switched = apply_changes(config, {"light": {"enabled": enabled}})
+        switched = apply_changes(config, {"exposure_compensation": {"enabled": enabled}})
         *_, final = continue_reconstruction(start, switched)
         found[enabled] = score(final, scene, split, best_gain=True).psnr
     assert found[True] > found[False] + MIN_GAIN_DB

@@ -40,7 +40,7 @@ SETS = tuple(f"{scene}:{views}" for views in (3, 6) for scene in SCENES)
 SIGMA_M, SIGMA_DEG = 0.001, 0.1  # of the poses, at 1 m from the scene
 FALSE_M, FALSE_DEG = 0.03, 3.0
 KINDS = ("clean", "turn", "shift")
-CONFIG = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "quick": True})
+CONFIG = apply_changes(preset("balanced"), {"registration": {"trust_poses": True}, "no_fallbacks": True})
 
 
 @dataclass(frozen=True)

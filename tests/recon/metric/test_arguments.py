@@ -19,7 +19,7 @@ def configured(*options: str):
 
 def test_options_become_the_configuration():
     plain = configured()
-    assert plain.marker_m is None and plain.stereo_m is None and plain.baselines == ()
+    assert plain.marker_size_m is None and plain.stereo_baseline_m is None and plain.baselines == ()
     metric = configured(
         "--marker",
         "99.4mm@0.2mm",
@@ -32,8 +32,8 @@ def test_options_become_the_configuration():
         "--poses-sigma",
         "1,5",
     )
-    assert (metric.marker_m, metric.marker_sigma_m) == pytest.approx((0.0994, 0.0002))
-    assert (metric.stereo_m, metric.stereo_sigma_m) == pytest.approx((0.075, 0.0003))
+    assert (metric.marker_size_m, metric.marker_size_sigma_m) == pytest.approx((0.0994, 0.0002))
+    assert (metric.stereo_baseline_m, metric.stereo_baseline_sigma_m) == pytest.approx((0.075, 0.0003))
     assert (metric.poses_sigma_m, metric.poses_sigma_deg) == (1.0, 5.0)
 
 
@@ -57,7 +57,7 @@ def test_who_says_how_unsure_poses_are_trusts_them_unless_they_are_only_to_be_ch
     for given, trusted in (
         (["--poses", "p"], False),
         (["--poses", "p", "--poses-sigma", "0.001,0.1"], True),
-        (["--poses", "p", "--poses-sigma", "0.001,0.1", "--poses-only-check"], False),
+        (["--poses", "p", "--poses-sigma", "0.001,0.1", "--check-poses"], False),
     ):
         assert trusts_poses(parser.parse_args(given)) is trusted
 

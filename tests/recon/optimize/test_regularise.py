@@ -18,7 +18,7 @@ from splatnode.recon.optimize.regularizers import Regularizer, RegularizerConfig
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.reference import Render
 
-PAPER = CONFIGS["paper"].optimize.regularise
+PAPER = CONFIGS["paper"].optimize.regularizers
 WIDTH, HEIGHT = 96, 64
 K = np.array([[90.0, 0.0, 48.0], [0.0, 90.0, 32.0], [0.0, 0.0, 1.0]])
 
@@ -73,7 +73,7 @@ def weighted(**weights: float) -> RegularizerConfig:
     chosen = {name: {"weight": weight} for name, weight in weights.items()}
     if "depth" in chosen:
         chosen["depth"]["share"] = 1.0
-    return apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}}).optimize.regularise
+    return apply_changes(preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}}).optimize.regularizers
 
 
 def regularisation(config: RegularizerConfig) -> Regularizer:
@@ -145,7 +145,9 @@ def test_pixels_without_a_point_are_white_or_left_out_as_is_chosen(without_netwo
     costs = {}
     for compare in (True, False):
         chosen = {"point_render": {"weight": 1.0, "compare_unseen": compare}}
-        config = apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}}).optimize.regularise
+        config = apply_changes(
+            preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}}
+        ).optimize.regularizers
         regularised = Regularizer([half, nothing], [image, image], structs.replace(config, off_path=0.0), seed=0)
 
         def draw(view, _, dark: bool) -> Render:
@@ -255,5 +257,5 @@ def test_a_loss_that_is_not_there_is_named_with_those_that_are():
 
 def test_a_loss_may_be_used_twice_under_names_of_its_own():
     chosen = {"fine": {"kind": "depth", "weight": 1.0, "patch": 16}, "coarse": {"kind": "depth", "weight": 0.5}}
-    changed = apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}})
-    assert list(regularisation(changed.optimize.regularise).served_by) == ["fine", "coarse"]
+    changed = apply_changes(preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}})
+    assert list(regularisation(changed.optimize.regularizers).served_by) == ["fine", "coarse"]

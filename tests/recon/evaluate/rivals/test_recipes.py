@@ -32,9 +32,9 @@ def test_3dgs_takes_the_step_sizes_of_its_publication():
     published = {"means": 1.6e-4, "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 5e-2, "sh": 2.5e-3}
     assert {name: rates[name] for name in published} == published
     assert rates["final_means"] == 0.01 and rates["final"] == 1.0  # means alone fall, to a hundredth
-    assert colmap_3dgs.OPTIMIZE.dssim == 0.2 and not colmap_3dgs.OPTIMIZE.refine_poses
+    assert colmap_3dgs.OPTIMIZE.ssim_lambda == 0.2 and not colmap_3dgs.OPTIMIZE.refine_poses
     assert colmap_3dgs.OPTIMIZE.iterations == 1500 and colmap_3dgs.PUBLISHED.iterations == 7000
-    assert colmap_3dgs.PUBLISHED.rates.final_means == pytest.approx(0.01 ** (7 / 30))  # the longer run falls further
+    assert colmap_3dgs.PUBLISHED.lr.final_means == pytest.approx(0.01 ** (7 / 30))  # the longer run falls further
 
 
 def test_3dgs_grows_and_prunes_as_its_publication_does():
@@ -58,14 +58,14 @@ def test_3dgs_starts_with_a_gaussian_of_a_tenth_of_the_opacity_for_each_point():
 
 
 def test_fsgs_correlates_whole_images_and_grows_between_three_neighbours():
-    ((name, loss),) = colmap_fsgs.OPTIMIZE.regularise.losses.items()
+    ((name, loss),) = colmap_fsgs.OPTIMIZE.regularizers.losses.items()
     assert (name, loss.kind) == ("depth", "depth") and loss.config.share == 1.0 and loss.config.patch >= 512 * 512
     assert (loss.config.weight, loss.config.start, loss.config.end) == (0.05, 0.2, 0.95)
     control = colmap_fsgs.OPTIMIZE.control
     assert control.kind == "proximity" and control.config.neighbours == 3
     grown = control.config.adaptive
     assert (grown.min_gradient, grown.start, grown.end, grown.reset_every) == (5e-4, 0.05, 0.95, adaptive.NEVER)
-    assert colmap_fsgs.OPTIMIZE.rates == colmap_3dgs.RATES and colmap_fsgs.PUBLISHED.iterations == 10_000
+    assert colmap_fsgs.OPTIMIZE.lr == colmap_3dgs.RATES and colmap_fsgs.PUBLISHED.iterations == 10_000
     assert colmap_fsgs.PUBLISHED.control.config.adaptive.every == 100
 
 
