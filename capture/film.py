@@ -11,7 +11,7 @@ import errno
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import quote, unquote
@@ -20,6 +20,7 @@ from splatnode.capture.cameras import video
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process import plugins
 from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.rig import Rig
 
 _MARK = "#"  # between a file and the part of it that is meant
 # Seconds of a video from its first frame, the first of which is in it, as W3C's Media Fragments have it: t=10,20.5.
@@ -43,6 +44,20 @@ class RecordingReader(Protocol):
 
     def explain_many(self, path: Path) -> str | None:
         """Why this recording is no film as a whole, and what to name; None where it is one."""
+        ...
+
+    def list_cameras(self, path: Path, part: str) -> Sequence[tuple[Sequence[str], str]] | None:
+        """The cameras of this part, each by its name in segments and its own part; None where it is one camera's.
+
+        Raises ValueError where several cameras are those of another part.
+        """
+        ...
+
+    def read_rig(self, path: Path, parts: Mapping[str, str]) -> Rig | None:
+        """Where cameras stand to each other, by the part of each; None where such a recording does not tell that.
+
+        Raises ValueError where this one does not tell it.
+        """
         ...
 
 
@@ -110,9 +125,9 @@ def camera(path: Path) -> tuple[str, dict[str, Any]]:
 def _parse_seconds(file: Path, part: str) -> dict[str, float]:
     """From when to when a part of a video is. Raises ValueError."""
     found = _SECONDS.fullmatch(part)
-    told = {} if found is None else {"from_s": found[1], "to_s": found[2]}
+    told = {} if found is None else {"start_s": found[1], "end_s": found[2]}
     span = {name: float(text) for name, text in told.items() if text}
-    if not span or span.get("from_s", 0.0) >= span.get("to_s", math.inf):
+    if not span or span.get("start_s", 0.0) >= span.get("end_s", math.inf):
         raise ValueError(
             f"{sanitize_text(str(file))!r}: behind the # must be seconds of the video, the first before the last, "
             "such as "

@@ -10,17 +10,17 @@ from pathlib import Path
 
 from splatnode.capture.keyframe_selection import THINNED
 from splatnode.capture.lens_file import Lenses, read_lenses
-from splatnode.capture.pose_files import poses_of, read_poses
+from splatnode.capture.pose_files import Trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.recon import cost
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric.arguments import collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, set_preview_interval
-from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_paths
+from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_sources
 from splatnode.recon.result.export.result import LIVE_PICTURE
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.report import bound_result_bytes
@@ -35,13 +35,14 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
-    path, listed = parse_paths(args.source)
-    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args))
-    _check_apart(args.out, path)
+    path, listed, cameras = parse_sources(args.source, args.cameras, config.frame_set_tolerance_s)
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args), cameras)
+    for source in [path] if cameras is None else [path, *(camera.path for camera in cameras.cameras)]:
+        _check_apart(args.out, source)
     if not args.map and is_map_set(args.out):
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
-    if args.map and args.only_seen:
-        raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
+    if args.map and args.multi_view_only:
+        raise ValueError("--multi-view-only is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, request, config)
     with show_progress(quiet=args.json) as tell:
@@ -57,16 +58,21 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
     if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
         say(taken, error=True)
     check_baseline(config, given)
-    known = _load_scale_evidence(args, given)
-    if known.poses is not None and trusts_poses(args):
-        given = add_poses(given, known.poses, config.metric.poses_sigma_m, config.metric.poses_sigma_deg)
+    trajectory = None if args.poses is None else read_poses(args.poses)
+    known = _load_scale_evidence(args, given, trajectory)
+    own = {} if trajectory is None else trajectory.find_sigmas(given.frames)
+    if known.poses is not None and trusts_poses(args, told=bool(own)):
+        given = add_poses(given, known.poses, args.poses_sigma, own)
         known = replace(known, poses=None)  # they are the photographs' own now
+        config = apply_changes(config, {"registration": {"trust_poses": True, **collect_drift_changes(args)}})
+    elif args.poses_drift is not None:
+        raise ValueError("--poses-drift is of poses that hold the cameras: give --poses FILE and --poses-sigma, too")
     needed_bytes = bound_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with hold_result_folder(args.out, needed_bytes), _viewer(args) as show:
         config = set_preview_interval(config, LOOK_EVERY) if args.view else config
         preset_name = args.preset or "balanced"
         made = reconstruct_source(
-            given, config, preset_name, without_guesses=args.only_seen, given=known, show=show, tell=tell
+            given, config, preset_name, without_guesses=args.multi_view_only, given=known, show=show, tell=tell
         )
         del given  # and with it photographs that lie in a folder
         tell(ProgressStep("writing the results"))
@@ -91,9 +97,9 @@ def _check_apart(out: Path, photographs: Path) -> None:
         raise ValueError(f"--out must not be the folder of the photographs; give one in it, such as {out / 'out'}")
 
 
-def _load_scale_evidence(args: argparse.Namespace, given: Source) -> Evidence:
+def _load_scale_evidence(args: argparse.Namespace, given: Source, trajectory: Trajectory | None) -> Evidence:
     """Loads the scale evidence that the options name. Raises ValueError where it fits none of the images."""
-    poses = None if args.poses is None else poses_of(read_poses(args.poses), given.frames, str(args.poses))
+    poses = None if trajectory is None else poses_of(trajectory, given.frames, str(args.poses))
     pairs = () if args.stereo is None else make_pairs(given.frames, stream_right_images(args.stereo, given.frames))
     return Evidence(poses=poses, pairs=pairs)
 
@@ -111,8 +117,6 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
     if args.prior is not None and args.prior != config.prior.kind:
         config = apply_changes(config, {"prior": {"kind": args.prior}})
     config = apply_changes(config, {"metric": collect_metric_changes(args)})
-    if trusts_poses(args):
-        config = apply_changes(config, {"registration": {"trust_poses": True}})
     flags = {
         "size": args.size,
         "device": args.device,
@@ -120,7 +124,10 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
         "budget_s": args.budget_s,
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
-        "quick": args.quick or None,
-        "decision": None if args.require is None else {"require_percent": args.require},
+        "frame_set_tolerance_s": args.frame_set_tolerance,
+        "no_fallbacks": args.no_fallbacks or None,
+        "decision": None
+        if args.max_position_error is None
+        else {"max_position_error_percent": args.max_position_error},
     }
     return apply_changes(config, {key: value for key, value in flags.items() if value is not None})

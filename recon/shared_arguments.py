@@ -18,7 +18,7 @@ def add_device(parser: argparse.ArgumentParser) -> argparse.Action:
 
 def add_multi_view_only(parser: argparse.ArgumentParser) -> argparse.Action:
     return parser.add_argument(
-        "--only-seen",
+        "--multi-view-only",
         action="store_true",
         help="leave out what no two photographs confirm, and the far background: holes in place of guesses",
     )
@@ -29,8 +29,6 @@ def add_lens(parser: argparse.ArgumentParser) -> None:
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument(
         "--intrinsics",
-        "--calibration",
-        dest="calibration",
         type=Path,
         metavar="FILE",
         help="their lens: YAML with width, height, fx, ..., COLMAP's cameras.txt, or Kalibr's camchain",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import msgspec
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
 from splatnode.capture.lens_file import same_aspect
+from splatnode.capture.logged import static_rig
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
 from splatnode.capture.logged.messages import (
     CALIBRATIONS,
@@ -31,11 +32,13 @@ from splatnode.capture.logged.messages import (
 from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_name, sanitize_text
+from splatnode.capture.rig import Rig
 
 log = logging.getLogger(__name__)
 
 SUFFIX = ".mcap"
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the message comes behind it
+_COPIES = ("/compressed", "/theora", "/ffmpeg")  # behind a topic's name: ROS sends its images once more, packed
 _NOT_PHOTOGRAPHS = "/compressedDepth"  # the end of a topic's name: depth that ROS packs into a PNG
 
 
@@ -71,6 +74,20 @@ def explain_many(path: Path) -> None:
     """A file is a film as a whole where one topic has images; `stream` says so where that is not so."""
 
 
+def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]] | None:
+    """The topics with images, each once; None where one of them is meant. Raises as `image_topics`."""
+    if part or not path.is_file():
+        return None
+    names = [topic.name for topic in image_topics(path)]
+    names = [name for name in names if not any(name == f"{each}{copy}" for each in names for copy in _COPIES)]
+    return [([segment for segment in name.split("/") if segment], name) for name in names]
+
+
+def read_rig(path: Path, parts: Mapping[str, str]) -> Rig:
+    """Where the cameras of these topics stand to each other. Raises as `static_rig.read_rig`."""
+    return static_rig.read_rig(path, parts)
+
+
 def image_topics(file: Path) -> list[Topic]:
     """Those whose messages are photographs, by name. Raises UnusableLog, OSError, ModuleNotFoundError without mcap."""
     pictures = [topic for topic in topics(file) if topic.kind in PICTURES and not topic.name.endswith(_NOT_PHOTOGRAPHS)]
@@ -98,7 +115,10 @@ def _select_topic(config: Config) -> Topic:
         held = f"it holds {sanitize_text(', '.join(others))}" if others else "it holds no messages of any schema"
         raise ValueError(f"{shown} must have a topic of images ({READ}); {held}")
     if not config.topic and len(there) > 1:
-        raise ValueError(f"{shown} has {len(there)} topics of images: {names}; name one, as in FILE.mcap#TOPIC")
+        raise ValueError(
+            f"{shown} has {len(there)} topics of images: {names}; name one, as in FILE.mcap#TOPIC, or "
+            "use several together with --cameras all"
+        )
     for topic in there:
         if config.topic in ("", topic.name):
             return topic

@@ -3,7 +3,7 @@
 Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
 names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. Further
 kinds are installed beside the core (`plugins.py`). A field whose type is a Mapping of Plugins holds several by name,
-which is also their kind where they say no other.
+which is also their kind where they say no other. `config_keys` knows internal keys and former names.
 """
 
 from __future__ import annotations
@@ -16,10 +16,20 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
 
+from splatnode.capture.process.config_keys import (
+    KeyPlace,
+    find_nearest_key,
+    has_fields,
+    is_internal,
+    join_keys,
+    list_documented_keys,
+    list_field_types,
+    replace_former_name,
+)
 from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.plugins import EntryPoint, entry_points
@@ -55,15 +65,34 @@ class Plugin:
 
     @classmethod
     def load_module(cls, kind: str) -> ModuleType:
-        """Returns the module of `kind`: a file of the package, or what an entry point names. Raises ImportError."""
-        if kind in cls._own_names() or kind not in (named := cls._entry_points()):
+        """Returns the module of `kind`: a file of the package, or what an entry point names.
+
+        Raises ImportError, or ConfigError where one of another package does not load.
+        """
+        entry = None if kind in cls._own_names() else cls._entry_points().get(kind)
+        if entry is None:
             return import_module(f"{cls.package}.{kind}")
-        return named[kind].load()
+        brought = f"{kind}: the plug-in {entry.target} of {entry.package}"
+        try:
+            module = entry.load()
+        except ImportError as error:
+            if entry.is_ours:
+                raise
+            cause = error.__cause__ or error
+            raise ConfigError(
+                f"{brought} does not load ({type(cause).__name__}: {sanitize_text(cause)}); install that package anew, "
+                "or choose another kind"
+            ) from error
+        if missing := [needed for needed in cls.needs if not hasattr(module, needed)]:
+            both = "both" if len(cls.needs) == 2 else " and ".join(cls.needs)
+            raise ConfigError(f"{brought} has no {' and no '.join(missing)}; it must be a module that has {both}")
+        return module
 
     @classmethod
     def kinds(cls) -> list[str]:
-        """All there are. It imports every module of the package, to see what each has, and no entry point's."""
-        return [name for name in cls._names() if cls.is_kind(name)]
+        """All there are, those of other packages last. It imports every module of the package, and no entry point's."""
+        brought = {name for name, entry in cls._entry_points().items() if not entry.is_ours} - cls._own_names()
+        return [name for name in sorted(cls._names() - brought) if cls.is_kind(name)] + sorted(brought)
 
     @classmethod
     def is_kind(cls, name: object) -> bool:
@@ -75,8 +104,8 @@ class Plugin:
         return all(hasattr(module, needed) for needed in cls.needs)
 
     @classmethod
-    def _names(cls) -> list[str]:
-        return sorted({*cls._own_names(), *cls._entry_points()})
+    def _names(cls) -> set[str]:
+        return {*cls._own_names(), *cls._entry_points()}
 
     @classmethod
     def _own_names(cls) -> set[str]:
@@ -89,7 +118,15 @@ class Plugin:
 
 def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
     """The YAML file at `path` with `changes`, such as ["camera.folder=photos"], as a `schema`. Raises ConfigError."""
-    return parse_config(merge_config(read_yaml(path), parse_changes(changes)), schema)
+    return parse_layers([read_yaml(path), parse_changes(changes)], schema)
+
+
+def parse_layers(layers: Sequence[Mapping[str, Any]], schema: type[T]) -> T:
+    """The layers, as people wrote them, each laid over those before it, as a `schema`. Raises ConfigError."""
+    tree: dict[str, Any] = {}
+    for layer in layers:
+        tree = merge_config(tree, replace_former_names(layer, schema, tree))
+    return build_config(tree, schema)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -107,7 +144,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
-    """["camera.loops=2", "camera.frames-per-second=5"] -> {"camera": {"loops": 2, "frames_per_second": 5}}."""
+    """["camera.loops=2", "camera.max-pixels=5"] -> {"camera": {"loops": 2, "max_pixels": 5}}."""
     tree: dict[str, Any] = {}
     for change in changes:
         key, equals, value = change.partition("=")
@@ -131,16 +168,65 @@ def merge_config(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[st
 
 
 def parse_config(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
-    """`raw` as a `schema` (Struct or dataclass); `where` is the key under which it stands. Raises ConfigError."""
+    """`raw`, as somebody wrote it, as a `schema`; `where` is the key under which it stands. Raises ConfigError."""
+    return build_config(replace_former_names(raw, schema, {}, where), schema, where)
+
+
+def build_config(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
+    """`raw`, of present names only, as a `schema` (Struct or dataclass). Raises ConfigError."""
     with guard_untrusted(ConfigError, where):
         try:
             return record_of(_check_keys(raw, schema, where), schema, dec_hook=_decode)
         except msgspec.ValidationError as error:
             message, _, path = str(error).partition(" - at `$")
-            key = _join(where, path.rstrip("`").lstrip("."))
+            key = join_keys(where, path.rstrip("`").lstrip("."))
             raise ConfigError(
                 f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}"
             ) from error
+
+
+def replace_former_names(
+    raw: Mapping[str, Any], schema: type, base: Mapping[str, Any], where: str = ""
+) -> dict[str, Any]:
+    """`raw`, as somebody wrote it, by present names; `base`, which it changes, has the kinds that it does not say.
+
+    Former and internal keys are told, each once a process. Raises ConfigError where a key has both of its names.
+    """
+    with guard_untrusted(ConfigError, where):
+        return _replace_names(raw, schema, base, KeyPlace(where))
+
+
+def _replace_names(raw: Any, schema: Any, base: Any, place: KeyPlace) -> Any:
+    if not isinstance(raw, Mapping):
+        return raw
+    base = base if isinstance(base, Mapping) else {}
+    if typing.get_origin(schema) is Mapping:
+        plugin = typing.get_args(schema)[1]
+        return {
+            name: _replace_names(each, plugin, base.get(name) or {"kind": name}, dataclasses.replace(place, where=key))
+            for name, each in raw.items()
+            for key in [join_keys(place.where, str(name))]
+        }
+    if isinstance(schema, type) and issubclass(schema, Plugin):
+        kind = raw.get("kind", base.get("kind", schema.usual))
+        if not schema.is_kind(kind):
+            return raw  # which is refused where the whole is read
+        try:
+            module = schema.load_module(str(kind))
+        except ConfigError:
+            return raw  # likewise
+        place, schema = dataclasses.replace(place, kind=str(kind)), module.Config
+    if not has_fields(schema):
+        return raw
+    place, types, result = place.enter(schema), list_field_types(schema), {}
+    for key, value in raw.items():
+        present = replace_former_name(str(key), place, schema)
+        if present != key and present in raw:
+            raise ConfigError(f"{join_keys(place.where, present)}: given twice, once as {key}; give it once")
+        below = types.get(present)
+        inner = _struct_in(below) if present in types else None
+        result[present] = _replace_names(value, inner, base.get(present), place.descend(present, is_internal(below)))
+    return result
 
 
 def _check_keys(raw: Any, schema: Any, where: str) -> Any:
@@ -149,30 +235,34 @@ def _check_keys(raw: Any, schema: Any, where: str) -> Any:
         return raw
     if typing.get_origin(schema) is Mapping:
         plugin = typing.get_args(schema)[1]
-        return {name: _check_keys(_add_kind(name, each), plugin, _join(where, str(name))) for name, each in raw.items()}
+        return {
+            name: _check_keys(_add_kind(name, each), plugin, join_keys(where, str(name))) for name, each in raw.items()
+        }
     if isinstance(schema, type) and issubclass(schema, Plugin):
         return _plugin(raw, schema, where)
-    if not _has_fields(schema):
+    if not has_fields(schema):
         return raw
     types = typing.get_type_hints(schema)
     unknown = sorted((str(key) for key in raw if key not in types), key=lambda key: key not in OF_VERBS)
     if unknown:
-        elsewhere = _locate_key(unknown[0], types, where)
+        elsewhere, allowed = _locate_key(unknown[0], types, where), list_documented_keys(schema)
+        nearest = None if elsewhere else find_nearest_key(unknown[0], allowed)
         raise ConfigError(
-            f"{_join(where, sanitize_text(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(types)}"
+            f"{join_keys(where, sanitize_text(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(allowed)}"
+            + (f"; the nearest is {join_keys(where, nearest)}" if nearest else "")
         )
     missing = [name for name in _list_required_fields(schema) if name not in raw]
     if missing:
-        raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
-    return {key: _check_keys(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
+        raise ConfigError(f"{join_keys(where, missing[0])}: missing; it has no default")
+    return {key: _check_keys(value, _struct_in(types[key]), join_keys(where, key)) for key, value in raw.items()}
 
 
 def _locate_key(key: str, types: Mapping[str, Any], where: str) -> str:
     """Says where a key that is none of these belongs, if one of them has it, or another verb."""
     for name, annotation in types.items():
         struct = _struct_in(annotation)
-        if _has_fields(struct) and key in typing.get_type_hints(struct):
-            return f", which belongs under {_join(where, name)}"
+        if has_fields(struct) and key in typing.get_type_hints(struct):
+            return f", which belongs under {join_keys(where, name)}"
     return f", which is of the configuration of {OF_VERBS[key]}" if key in OF_VERBS and not where else ""
 
 
@@ -183,16 +273,14 @@ def _add_kind(kind: object, raw: Any) -> Any:
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
     if not schema.is_kind(kind):
-        raise ConfigError(
-            f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {sanitize_text(repr(kind), 100)}"
-        )
-    module = schema.load_module(kind)
+        known = ", ".join(schema.kinds())
+        raise ConfigError(f"{join_keys(where, 'kind')}: expected one of {known}, got {sanitize_text(repr(kind), 100)}")
+    try:
+        module = schema.load_module(str(kind))
+    except ConfigError as error:
+        raise ConfigError(f"{join_keys(where, 'kind')}: {error}") from error
     rest = {key: value for key, value in raw.items() if key != "kind"}
-    return schema(kind, parse_config(rest, module.Config, where))
-
-
-def _has_fields(schema: Any) -> bool:
-    return isinstance(schema, type) and (issubclass(schema, msgspec.Struct) or dataclasses.is_dataclass(schema))
+    return schema(kind, build_config(rest, module.Config, where))
 
 
 def _list_required_fields(schema: Any) -> list[str]:
@@ -204,9 +292,11 @@ def _list_required_fields(schema: Any) -> list[str]:
 
 def _struct_in(annotation: Any) -> Any:
     """The Struct or dataclass in `annotation`, also where it may be None; else, and of a Mapping, the annotation."""
+    if typing.get_origin(annotation) is Annotated:
+        annotation = typing.get_args(annotation)[0]
     if typing.get_origin(annotation) is Mapping:
         return annotation
-    return next((choice for choice in typing.get_args(annotation) if _has_fields(choice)), annotation)
+    return next((choice for choice in typing.get_args(annotation) if has_fields(choice)), annotation)
 
 
 def _decode(kind: type, value: Any) -> Any:
@@ -216,7 +306,3 @@ def _decode(kind: type, value: Any) -> Any:
     if kind is Path and isinstance(value, str):
         return Path(value).expanduser()
     raise ValueError(f"Expected {kind.__name__.lower()}, got {type(value).__name__}")
-
-
-def _join(where: str, key: str) -> str:
-    return f"{where}.{key}" if where and key and not key.startswith("[") else where + key

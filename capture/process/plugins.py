@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -52,9 +52,15 @@ class EntryPoint:
     module: str
     attribute: str  # dotted; empty: the module itself
     file: Path  # that declares it
+    rival: Path | None = None  # the file of another package that gives this name something else
 
     def load(self) -> Any:
         """Returns what it names. Raises ModuleNotFoundError without an optional package, BrokenPlugin otherwise."""
+        if self.rival is not None:
+            raise BrokenPlugin(
+                f"the plug-in {self.name!r} of {self.group} must be brought by one package; {self.package} and "
+                f"{_name_package(self.rival)} both do. Uninstall one of them"
+            )
         try:
             loaded = import_module(self.module)
             return functools.reduce(getattr, self.attribute.split("."), loaded) if self.attribute else loaded
@@ -71,11 +77,21 @@ class EntryPoint:
     def target(self) -> str:
         return f"{self.module}:{self.attribute}" if self.attribute else self.module
 
+    @property
+    def is_ours(self) -> bool:
+        return self.file == _OWN
+
+    @property
+    def package(self) -> str:
+        """The name of the distribution that declares it, as PyPI writes it."""
+        return "splatnode" if self.is_ours else _name_package(self.file)
+
 
 def entry_points(group: str) -> Mapping[str, EntryPoint]:
     """The entry points of a group by their names: those of `extras`, then those of installed distributions.
 
-    Where two have one name, the first counts. None is imported.
+    A name of `extras` stays what it is. Where two distributions give one name to two things, `load` refuses it. None is
+    imported.
     """
     return _read_all(tuple(sys.path)).get(group, MappingProxyType({}))
 
@@ -97,12 +113,18 @@ def _read_all(path: tuple[str, ...]) -> Mapping[str, Mapping[str, EntryPoint]]:
     found: dict[str, dict[str, EntryPoint]] = {}
     for file in (_OWN, *_find_files(path)):
         for entry in _read_file(file):
-            found.setdefault(entry.group, {}).setdefault(entry.name, entry)
+            first = found.setdefault(entry.group, {}).setdefault(entry.name, entry)
+            if not first.is_ours and first.target != entry.target:
+                found[entry.group][entry.name] = replace(first, rival=file)
     return MappingProxyType({group: MappingProxyType(entries) for group, entries in found.items()})
 
 
 def _find_files(path: tuple[str, ...]) -> Iterator[Path]:
-    """The files of installed distributions but this one, in the order of the path and of the alphabet."""
+    """The files of installed distributions but this one, in the order of the path and of the alphabet.
+
+    Of a distribution that is installed twice the first counts, as for an import.
+    """
+    seen = {"splatnode"}
     for folder in dict.fromkeys(path):
         try:
             names = sorted(os.listdir(folder or "."))
@@ -110,8 +132,16 @@ def _find_files(path: tuple[str, ...]) -> Iterator[Path]:
             raise_shortage(error)
             continue
         for name in names:
-            if name.endswith((".dist-info", ".egg-info")) and not name.startswith("splatnode-"):
-                yield Path(folder, name, _FILE)
+            file = Path(folder, name, _FILE)
+            if name.endswith((".dist-info", ".egg-info")) and _name_package(file) not in seen:
+                seen.add(_name_package(file))
+                yield file
+
+
+def _name_package(file: Path) -> str:
+    """The name of the distribution whose file this is: of my_eyes-1.0.dist-info/entry_points.txt it is my-eyes."""
+    folder = file.parent.name.removesuffix(".dist-info").removesuffix(".egg-info")
+    return re.sub(r"[-_.]+", "-", folder.split("-")[0]).lower()
 
 
 def _read_file(file: Path) -> Iterator[EntryPoint]:

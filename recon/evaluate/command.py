@@ -133,8 +133,8 @@ def _run_bench(args: argparse.Namespace) -> Bench:
     scoring = Scoring(
         make_rasterizer(on),
         partial(load_networks, args.weights_dir and args.weights_dir.absolute()),
-        replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
-        args.by_region,
+        replace(INTERPOLATED_START if args.interpolate_start else Settings(), best_gain=args.color_correct),
+        args.score_regions,
     )
     with opened(args.cores, args.ray) as engine:
         return run_bench(

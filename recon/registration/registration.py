@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
 from splatnode.recon.matching.two_view import TwoView
@@ -31,11 +33,16 @@ from splatnode.recon.registration.subpixel import PatchImage, patch_image
 class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of registration: the lenses, and the mapper."""
 
-    lenses: self_calibration.LensGroupingConfig = self_calibration.LensGroupingConfig()
-    mapper: incremental_mapper.MapperConfig = incremental_mapper.MapperConfig()
+    lenses: Internal[self_calibration.LensGroupingConfig] = self_calibration.LensGroupingConfig()
+    mapper: Internal[incremental_mapper.MapperConfig] = incremental_mapper.MapperConfig()
     # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
     # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
     trust_poses: bool = False
+    # How fast trusted poses drift from the first photograph on, as odometry does: the standard deviation of a step's
+    # error in each direction, and of all lengths alike, as a share; 0: each pose is absolute. --poses-drift sets it
+    poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
+    # And of the turn about each axis that has grown after a metre, degrees; it grows with the root of the way
+    poses_drift_deg: Annotated[float, msgspec.Meta(ge=0, le=90)] = 0.0
 
 
 Array = npt.NDArray[np.float64]

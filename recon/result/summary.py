@@ -27,5 +27,8 @@ def print_summary(snapshot: Snapshot, out: Path) -> None:
             say(f"lengths: {snapshot.scale.sentence}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
-        say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
+        say(
+            f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches "
+            "(--no-fallbacks leaves them out)"
+        )
     say(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

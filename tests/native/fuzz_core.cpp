@@ -141,8 +141,16 @@ void bundle(Draw& draw) {
     std::vector<double> information(36 * size_t(lenses) * lenses);
     for (int k = 0; k < 6 * lenses; ++k) information[size_t(k) * 6 * lenses + k] = draw.whole(0, 2) * 10.0;
     auto given_rotations = rotations, given_centres = draw.numbers(3 * size_t(cameras));
-    std::vector<double> given(2 * size_t(cameras));
-    for (double& each : given) each = draw.whole(0, 2) * 10.0;
+    // Positive semi-definite, as an inverse covariance is: weights of the single poses, and what poses share.
+    const size_t numbers = 6 * size_t(cameras);
+    std::vector<double> given(numbers * numbers), shared(numbers);
+    for (int camera = 0; camera < cameras; ++camera) {
+        const double weight = draw.whole(0, 2) * 10.0, common = draw.whole(0, 1) * 3.0;
+        for (size_t i = 6 * size_t(camera); i < 6 * size_t(camera + 1); ++i)
+            given[i * numbers + i] = weight, shared[i] = weight > 0 ? common : 0;
+    }
+    for (size_t i = 0; i < numbers; ++i)
+        for (size_t j = 0; j < numbers; ++j) given[i * numbers + j] += shared[i] * shared[j];
     const core::Bundle task = {rotations.data(),  translations.data(), focals.data(),    radials.data(),
                                shifts.data(),     aspects.data(),      places.data(),    lens_of.data(),
                                camera_of.data(),  first_of.data(),     pixels.data(),    means.data(),

@@ -15,6 +15,7 @@ import pytest
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import load_config
+from splatnode.capture.process.config_text import ConfigError
 from tests.conftest import ROOT
 
 ALIEN = '''
@@ -97,10 +98,30 @@ def test_a_camera_of_another_package_is_a_kind_like_any_other(installed, tmp_pat
 
 
 def test_a_plug_in_that_cannot_be_imported_says_who_declares_it(installed):
+    cameras = plugins.entry_points(plugins.CAMERAS)
     with pytest.raises(plugins.BrokenPlugin, match=r"'gone' of splatnode.cameras must be alien_plugins.gone, as "):
+        cameras["gone"].load()
+    with pytest.raises(ConfigError, match=r"gone: the plug-in alien_plugins\.gone of alien does not load"):
         Camera.load_module("gone")
     with pytest.raises(ModuleNotFoundError, match="there_is_no_such_package"):
-        Camera.load_module("wants")
+        cameras["wants"].load()
+
+
+def test_a_name_that_two_packages_give_to_two_things_is_refused_and_one_that_is_installed_twice_is_not(installed):
+    again = installed / "later"
+    for name, target in (("alien-0.9", "an_older.camera"), ("Martian_Eyes-1.0", "martian.camera")):
+        (again / f"{name}.dist-info").mkdir(parents=True)
+        lines = f"[splatnode.cameras]\nalien = {target}\ngone = alien_plugins.gone\nmcap = {target}\n"
+        (again / f"{name}.dist-info" / "entry_points.txt").write_text(lines)
+        sys.path.append(str(again) if name.startswith("alien") else "")
+        cameras = plugins.entry_points(plugins.CAMERAS)
+        if name.startswith("alien"):
+            assert cameras["alien"].load().__name__ == "alien_plugins.camera"
+    with pytest.raises(plugins.BrokenPlugin, match="brought by one package; alien and martian-eyes both do. Uninstall"):
+        cameras["alien"].load()
+    with pytest.raises(ConfigError, match="alien and martian-eyes both do"):
+        Camera.load_module("alien")
+    assert cameras["gone"].rival is None and cameras["mcap"].load().__name__.startswith("splatnode.")
 
 
 def test_a_verb_of_another_package_is_offered_and_one_that_is_broken_is_left_out(installed):
