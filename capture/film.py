@@ -54,7 +54,7 @@ class RecordingReader(Protocol):
         ...
 
     def read_rig(self, path: Path, parts: Mapping[str, str]) -> Rig | None:
-        """Where cameras stand to each other, by the part of each; None where such a recording does not tell that.
+        """Returns where cameras stand to each other, by the part of each; None where such a recording does not tell it.
 
         Raises ValueError where this one does not tell it.
         """

@@ -79,7 +79,7 @@ def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]]:
 
 
 def read_rig(path: Path, parts: Mapping[str, str]) -> None:
-    """A data set does not tell where its cameras stand."""
+    """Returns nothing: a data set does not tell where its cameras stand."""
 
 
 def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:

@@ -84,7 +84,7 @@ def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]] | None:
 
 
 def read_rig(path: Path, parts: Mapping[str, str]) -> Rig:
-    """Where the cameras of these topics stand to each other. Raises as `static_rig.read_rig`."""
+    """Returns where the cameras of these topics stand to each other. Raises as `static_rig.read_rig`."""
     return static_rig.read_rig(path, parts)
 
 
