@@ -68,6 +68,7 @@ def test_a_raw_file_is_that_of_its_commit(name):
     commit = ages.read_commits(DOCS["measurement.md"])[name]
     if not ages.has_commit(commit):
         pytest.skip("needs the project's whole history in git")
+    assert ages.is_in_history(commit), "that commit was amended away; run: python -m tests.reference"
     assert ages.is_content_of(raw.RESULTS / name, commit), "commit the raw file, then run: python -m tests.reference"
 
 

@@ -31,8 +31,13 @@ def is_content_of(path: Path, commit: str) -> bool:
 
 
 def has_commit(commit: str) -> bool:
-    """Returns whether the history of this checkout reaches back to a commit."""
+    """Returns whether this checkout knows a commit; one without the whole history may not."""
     return not _run_git("cat-file", "-e", f"{commit}^{{commit}}").returncode
+
+
+def is_in_history(commit: str) -> bool:
+    """Returns whether a commit leads to the present one: one that was amended away does not."""
+    return not _run_git("merge-base", "--is-ancestor", commit, "HEAD").returncode
 
 
 def ages() -> str:
@@ -41,7 +46,7 @@ def ages() -> str:
     days: dict[str, list[str]] = {}
     for path in list_raw_files():
         commit = kept.get(path.name)
-        if commit is None or (has_commit(commit) and not is_content_of(path, commit)):
+        if commit is None or (has_commit(commit) and not (is_in_history(commit) and is_content_of(path, commit))):
             commit = _run_git("log", "-1", "--format=%h", "--", str(path)).stdout.strip() or "0000000"
         day = _run_git("log", "-1", "--format=%cs", commit).stdout.strip() or _find_day(path.name)
         days.setdefault(day, []).append(f"`{path.name}` {commit}")

@@ -143,7 +143,14 @@ def known_poses() -> str:
         beyond = sum(max(row["centre_over_bound"], row["rotation_over_bound"]) > 1 for row in group)
         most = max(max(row["centre_over_bound"], row["rotation_over_bound"]) for row in group)
         rows.append((words, len(group), "–" if kind == "clean" else named, strangers, beyond, f"{most:.1f}"))
-    header = ("false pose", "runs", "it is named", "others named", "any camera beyond a bound", "largest error over bound")
+    header = (
+        "false pose",
+        "runs",
+        "it is named",
+        "others named",
+        "any camera beyond a bound",
+        "largest error over bound",
+    )
     return table(header, rows)
 
 

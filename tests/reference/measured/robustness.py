@@ -103,28 +103,32 @@ def stability() -> str:
     )
 
 
+SHARES = (("free_solid", 3), ("found", 0), ("found_near", 0), ("unknown", 0))
+COUNTS = 3, 6, 12
+
+
 def free_space() -> str:
-    """Maps of free space against the truth."""
+    """Maps of free space against the truth, of 3, 6 and 12 photographs."""
     found, rows = raw("occupancy")["rows"], []
     for start, words in MAPPED.items():
-        for views in (3, 6, 12):
-            group = [row for row in found if row["place"].startswith(start) and row["views"] == views]
-            require(len(group) == {"built-in capture": 3, "building": 2}.get(start, 1), f"rows of {start}")
-            shares = (_span(group, key, digits) for key, digits in SHARES)
-            rows.append((words, views, *shares))
+        groups = [
+            [row for row in found if row["place"].startswith(start) and row["views"] == views] for views in COUNTS
+        ]
+        require({len(group) for group in groups} == {{"built-in capture": 3, "building": 2}.get(start, 1)}, start)
+        cells = (" / ".join(_span(group, key, digits) for group in groups) for key, digits in SHARES)
+        rows.append((words, *cells))
     (walk,) = raw("walk_occupancy")["rows"]
     require(walk["verdict"] == "OK" and walk["free_solid"] < 0.001, "the walk is within the bar")
-    place = f"{walk['place'].removeprefix('building, ')}, merged"
-    rows.insert(6, (place, walk["placed"], *(_span([walk], key, digits) for key, digits in SHARES)))
-    return table(("place", "photographs", "free, but solid", "found", "found, or beside", "unknown"), rows)
-
-
-SHARES = (("free_solid", 3), ("found", 0), ("found_near", 0), ("unknown", 0))
+    place = f"{walk['place'].removeprefix('building, ')}, merged, {walk['placed']} photographs"
+    rows.insert(2, (place, *(_span([walk], key, digits) for key, digits in SHARES)))
+    return table(
+        ("photographs: 3 / 6 / 12", "free, but solid, %", "found, %", "found, or beside, %", "unknown, %"), rows
+    )
 
 
 def _span(rows: list[dict[str, Any]], key: str, digits: int) -> str:
     ends = (f"{100 * end(row[key] for row in rows):.{digits}f}" for end in (min, max))
-    return f"{' to '.join(dict.fromkeys(ends))} %"
+    return "–".join(dict.fromkeys(ends))
 
 
 def free_space_notes() -> str:
