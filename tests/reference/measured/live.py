@@ -1,4 +1,4 @@
-"""docs/live_figures.md: streams, walks, faults, batches and the viewer."""
+"""docs/live.md: streams, walks, faults, batches and the viewer."""
 
 from __future__ import annotations
 

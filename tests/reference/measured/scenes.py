@@ -6,6 +6,10 @@ import re
 from statistics import mean
 from typing import Any
 
+import numpy as np
+from scipy.stats import spearmanr
+
+from splatnode.recon.result import npz_files
 from tests.reference.measured.raw import (
     average_over_sets,
     bullets,
@@ -275,11 +279,6 @@ def growth() -> str:
 
 def consistent_depth() -> str:
     """Quality away from the cameras by the share of multi-view consistent depth."""
-    import numpy as np
-    from scipy.stats import spearmanr
-
-    from splatnode.recon.result import npz_files
-
     every = list(raw("consistent_depth")["rows"].values())
     found = [row for row in every if row["consistent_depth"] is not None]
     limit = npz_files.ConsistentDepthConfig().min_share
