@@ -63,6 +63,7 @@ def movers() -> str:
     kinds, rows = ("without", "masks", "found"), []
     cases = dict.fromkeys((scene, share) for scene, share, _ in found)
     require(len(found) == len(kinds) * len(cases) == 27, "three kinds of nine cases")
+    require(found["fox", 0.15, "found"]["verdict"] == "OK_PARTIAL", "fox at 15 % is OK_PARTIAL")
     for scene, share in cases:
         group = [found[scene, share, kind] for kind in kinds]
         whole = [row["verdict"] if row["psnr"] is None else f"{row['psnr']:.1f}" for row in group]

@@ -149,6 +149,7 @@ def long_rivals() -> str:
         size = thousands(row["num_gaussians"])
         gain = change(row["psnr"] - before)
         rows.append((row["scene"], f"`{row['method']}`", scores(row, "lpips_alex"), gain, size, minutes))
+    require(sum(row[3].startswith("−") for row in rows) == len(rows) - 1, "most lose by longer runs")
     return table(("set", "method", "PSNR / SSIM / LPIPS", "PSNR by it", "Gaussians", "minutes"), rows)
 
 
@@ -257,6 +258,10 @@ def gpu_runs() -> str:
             seconds = f"{row['seconds']['optimise']:.1f} + {row['seconds']['total'] - row['seconds']['optimise']:.1f} s"
             runs[f"{method}, {words}", row["scene"]] = f"{row['psnr']:.1f} dB, {seconds}"
     scenes = ("fountain_p11", "llff_fern")
+    totals = {
+        d: [r["seconds"]["total"] for r in found[d]["rows"] if r["method"] == "balanced"] for d in ("cuda", "cpu")
+    }
+    require(max(abs(a - b) for a, b in zip(*totals.values(), strict=True)) < 0.2, "a GPU gains nothing for balanced")
     names = dict.fromkeys(name for name, _ in runs)
     return table(("refinement + the rest", *scenes), [(n, *(runs[n, scene] for scene in scenes)) for n in names])
 
