@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import re
 
 import pytest
 
 from tests.conftest import ROOT
-from tests.reference.measured import ages, blocks, race, raw
+from tests.reference.measured import ages, blocks, race, raw, scenes
 
 DOCS = {path.name: path.read_text(encoding="utf-8") for path in blocks.find_pages()}
 MEASURED = ("measurement.md", "scene_quality.md", "camera_accuracy.md", "robustness.md", "live.md")
@@ -34,6 +35,13 @@ def test_a_page_that_was_changed_by_hand_is_found():
     text = DOCS["scene_quality.md"]
     changed = text.replace("| `balanced` | 24.4 / ", "| `balanced` | 25.4 / ")
     assert changed != text and blocks.fill(changed) == text
+
+
+def test_a_raw_file_that_was_changed_is_found(monkeypatch):
+    changed = copy.deepcopy(raw.raw("growth"))
+    changed["rows"][0]["peak_rss_mb"] += 100
+    monkeypatch.setattr(scenes, "raw", lambda name: changed if name == "growth" else raw.raw(name))
+    assert blocks.fill(DOCS["scene_quality.md"]) != DOCS["scene_quality.md"]
 
 
 @pytest.mark.parametrize("name", MEASURED)
@@ -77,3 +85,13 @@ def test_each_raw_file_is_named_on_a_page():
     without_ages = pages.replace(DOCS["measurement.md"].partition("<!-- table: ages -->")[2], "")
     missing = [path.name for path in ages.list_raw_files() if path.name not in without_ages]
     assert not missing, "say on a page what these measure"
+
+
+def test_each_trial_of_broken_lenses_is_judged_and_the_limits_say_how():
+    keys = ("scene", "count", "kind", "setting")
+    judged, trials = (raw.raw(name)["trials"] for name in ("lens_assumptions_judged", "lens_assumptions"))
+    assert [[each[key] for key in keys] for each in judged] == [[each[key] for key in keys] for each in trials]
+    broken = [each for each in judged if each["kind"] != "clean"]
+    limits = re.sub(r"\s+", " ", (ROOT / "docs" / "limits.md").read_text(encoding="utf-8"))
+    assert f"of {len(broken)} sets made so that" in limits
+    assert f"{sum(each['wrong'] for each in broken)} were published beyond their claim" in limits
