@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 from collections.abc import Iterator
 
@@ -10,7 +11,9 @@ import pytest
 import yaml
 
 from splatnode import command_line
+from splatnode.capture import former_names as capture_names
 from splatnode.recon import former_names
+from tests.conftest import ROOT
 from tests.system.test_pages import PAGES, text
 
 LOOKED_AT = sorted(set(PAGES) - {"CHANGELOG.md", "docs/configuration.md"})  # what was renamed; what is made of the code
@@ -107,3 +110,37 @@ def test_configurations_on_a_page_have_keys_that_there_are(page):
     paths = [path for block in [*blocks, *spans] for path in list_keys(yaml.safe_load(block))]
     unknown = [".".join(path) for path in paths if not is_configured(path)]
     assert not unknown, f"{page} configures what there is not"
+
+
+def list_former_words() -> set[str]:
+    """Flags and dotted keys of the release before, as a sentence may name them."""
+    flags = {flag for flags in command_line.FORMER_FLAGS.values() for flag in flags}
+    tables = capture_names.KEYS | former_names.KEYS | former_names.NODE_KEYS
+    sections = {former: present for former, present in tables.items() if "." not in former}
+    keys = {re.sub(r"\[.*?\]", "", former) for former in tables if "." in former}
+    moved = {
+        f"{former}.{key.partition('.')[2]}"
+        for former, present in sections.items()
+        for key in KEYS
+        if key.startswith(f"{present}.")
+    }
+    return (flags | keys | moved) - KEYS
+
+
+def test_no_sentence_of_the_program_has_a_former_name():
+    former = re.compile(
+        rf"(?<![\w.-])(?:{'|'.join(map(re.escape, sorted(list_former_words(), reverse=True)))})(?![\w.-])"
+    )
+    found = []
+    for room in ("splatnode/api", "capture", "recon", "viewer"):
+        for path in (ROOT / room).rglob("*.py"):
+            if path.name == "former_names.py":
+                continue
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if (
+                    isinstance(node, ast.Constant)
+                    and isinstance(node.value, str)
+                    and (word := former.search(node.value))
+                ):
+                    found.append(f"{path.relative_to(ROOT)}:{node.lineno} {word[0]}")
+    assert not found
