@@ -267,8 +267,8 @@ def reconstruct(
     A rejection is a result, too: ask `verdict.publishable`. Several threads may call this at once.
 
     - `images`: a folder, a video, an image topic `"drive.mcap#/front/image"`, an episode `"pusht#3/CAMERA"` of a
-      LeRobot data set, a list of paths in one folder, or a list of arrays (H, W, 3) uint8 RGB or PIL images. Grey becomes RGB;
-      alpha 0 is masked. Of a video, and of more than 30 images, keyframes are selected.
+      LeRobot data set, a list of paths in one folder, or a list of arrays (H, W, 3) uint8 RGB or PIL images. Grey becomes
+      RGB; alpha 0 is masked. Of a video, and of more than 30 images, keyframes are selected.
     - `cameras`: the cameras of one robot, as `--cameras`: `"all"`, or names of folders, topics or keys; of listed
       folders or videos a name for each. Each camera has its own lens; images are called `left/0001.jpg`.
     - `camera_ids`, `captured_at`: of listed images, which camera took each (None: unknown) and when, a `Stamp`. Images
@@ -277,9 +277,9 @@ def reconstruct(
       list for each image (None: unknown), or in a mapping by image, camera id, name prefix or pattern:
       `{"left": a, "right": b}`. None: EXIF's, else estimated.
     - `poses`: T_world_camera (4, 4) in metres by image name, in a list (None: unknown), or a file as for `--poses`.
-      They give metres and the world's axes; one that does not fit is named and left out. `poses_sigma`: standard deviations,
-      metres and degrees, of all poses or in a list or mapping. With sigmas (also from the file) and `intrinsics` they
-      are priors of the cameras, unless `poses_only_check`.
+      They give metres and the world's axes; one that does not fit is named and left out. `poses_sigma`: standard
+      deviations, metres and degrees, of all poses or in a list or mapping. With sigmas (also from the file) and
+      `intrinsics` they are priors of the cameras, unless `poses_only_check`.
     - `masks`: white (any value above 0) is used, black is ignored. A folder of masks with the images' names, one file
       for all, or a list of arrays (H, W), paths, or None. None: all is used.
     - `scale`: the metres between two cameras, `("a.jpg", "b.jpg", 0.5)` or by places in the list, `(0, 3, 0.5)`;
