@@ -267,8 +267,8 @@ def reconstruct(
     A rejection is a result, too: ask `verdict.publishable`. Several threads may call this at once.
 
     - `images`: a folder, a video, an image topic `"drive.mcap#/front/image"`, an episode `"pusht#3/CAMERA"` of a
-      LeRobot data set, a list of paths in one folder, or a list of arrays (H, W, 3) uint8 RGB or PIL images. Grey becomes
-      RGB; alpha 0 is masked. Of a video, and of more than 30 images, keyframes are selected.
+      LeRobot data set, a list of paths in one folder, or a list of arrays (H, W, 3) uint8 RGB or PIL images. Grey
+      becomes RGB; alpha 0 is masked. Of a video, and of more than 30 images, keyframes are selected.
     - `cameras`: the cameras of one robot, as `--cameras`: `"all"`, or names of folders, topics or keys; of listed
       folders or videos a name for each. Each camera has its own lens; images are called `left/0001.jpg`.
     - `camera_ids`, `captured_at`: of listed images, which camera took each (None: unknown) and when, a `Stamp`. Images
