@@ -106,7 +106,8 @@ def is_configured(path: tuple[str, ...]) -> bool:
 @pytest.mark.parametrize("page", LOOKED_AT)
 def test_configurations_on_a_page_have_keys_that_there_are(page):
     blocks = re.findall(r"^```yaml\n(.*?)^```$", text(page), re.DOTALL | re.MULTILINE)
-    spans = [span for span in re.findall(r"`([a-z_]+: \{[^`]+\})`", text(page)) if "..." not in span]
+    whole = re.sub(r"\s+", " ", text(page))  # a span may be broken into lines
+    spans = [span for span in re.findall(r"`([a-z_]+: \{[^`]+\})`", whole) if "..." not in span]
     paths = [path for block in [*blocks, *spans] for path in list_keys(yaml.safe_load(block))]
     unknown = [".".join(path) for path in paths if not is_configured(path)]
     assert not unknown, f"{page} configures what there is not"
