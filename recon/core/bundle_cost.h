@@ -31,6 +31,14 @@ struct Bundle {
     // Given poses, world to camera: rotations (C, 3, 3), centres (C, 3), and the information (C, 2) of a turn about each
     // axis and of a position in each direction; 0: nothing is given.
     const double *given_rotations, *given_centres, *given_information;
+    // A rig: cameras of a frame set have one pose together, and each its mount on the rig. Rotations (., 3, 3) and
+    // translations (., 3) of S sets, world to rig, and of M mounts, rig to camera, are parameters after the lenses.
+    double *set_rotations, *set_translations, *mount_rotations, *mount_translations;
+    const int32_t *set_of_camera, *mount_of_camera;  // (C,) -1: this camera is in no frame set
+    const double* rig_information;                   // (C, 2) of a turn and of a shift between camera and rig
+    // Given mounts as given poses are: (M, 3, 3), (M, 3), (M, 2); a negative information fixes the mount.
+    const double *given_mount_rotations, *given_mount_centres, *given_mount_information;
+    int32_t num_sets, num_mounts;
 };
 
 struct Projection {
@@ -92,12 +100,12 @@ inline bool is_free(const Bundle& bundle, int parameter) {
     return bundle.prior_information[size_t(parameter) * (kLens * bundle.num_lenses) + parameter] > 0;
 }
 
-// How far a camera is from its given pose, in its own axes: the turn (3) and the shift (3), and what they depend on.
+// How far a pose is from a given one, in its own axes: the turn (3) and the shift (3), and what they depend on.
 struct PoseDeviation {
-    double turn[3], shift[3], seen[3];  // seen: the given centre from the camera's origin of translation, R c
+    double turn[3], shift[3], seen[3];  // seen: the given centre from the pose's origin of translation, R c
 
-    PoseDeviation(const Bundle& bundle, int camera) {
-        const double *rotation = bundle.rotations + 9 * camera, *given = bundle.given_rotations + 9 * camera;
+    // `rotation` (3, 3) and `translation` (3) of the pose, `given` (3, 3) and `centre` (3) of the given one.
+    PoseDeviation(const double* rotation, const double* translation, const double* given, const double* centre) {
         double by[3][3];
         for (int i = 0; i < 3; ++i) {
             for (int j = 0; j < 3; ++j) {
@@ -105,8 +113,8 @@ struct PoseDeviation {
                 for (int k = 0; k < 3; ++k) by[i][j] += rotation[3 * i + k] * given[3 * j + k];
             }
             seen[i] = 0;
-            for (int k = 0; k < 3; ++k) seen[i] += rotation[3 * i + k] * bundle.given_centres[3 * camera + k];
-            shift[i] = seen[i] + bundle.translations[3 * camera + i];
+            for (int k = 0; k < 3; ++k) seen[i] += rotation[3 * i + k] * centre[k];
+            shift[i] = seen[i] + translation[i];
         }
         const double half[3] = {(by[2][1] - by[1][2]) / 2, (by[0][2] - by[2][0]) / 2, (by[1][0] - by[0][1]) / 2};
         const double sine = std::sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2]);
@@ -116,14 +124,58 @@ struct PoseDeviation {
     }
 };
 
+inline PoseDeviation deviate_camera(const Bundle& b, int i) {
+    return {b.rotations + 9 * i, b.translations + 3 * i, b.given_rotations + 9 * i, b.given_centres + 3 * i};
+}
+
+inline PoseDeviation deviate_mount(const Bundle& b, int i) {
+    return {b.mount_rotations + 9 * i, b.mount_translations + 3 * i, b.given_mount_rotations + 9 * i,
+            b.given_mount_centres + 3 * i};
+}
+
+// The pose that a camera has by the rig, world to camera: that of its frame set, then its mount.
+struct RigPose {
+    double rotation[9], translation[3], centre[3];
+
+    RigPose(const Bundle& bundle, int camera) {
+        const int set = bundle.set_of_camera[camera], mount = bundle.mount_of_camera[camera];
+        const double *m = bundle.mount_rotations + 9 * mount, *s = bundle.set_rotations + 9 * set;
+        for (int i = 0; i < 3; ++i) {
+            translation[i] = bundle.mount_translations[3 * mount + i];
+            for (int k = 0; k < 3; ++k) translation[i] += m[3 * i + k] * bundle.set_translations[3 * set + k];
+            for (int j = 0; j < 3; ++j) {
+                rotation[3 * i + j] = 0;
+                for (int k = 0; k < 3; ++k) rotation[3 * i + j] += m[3 * i + k] * s[3 * k + j];
+            }
+        }
+        for (int j = 0; j < 3; ++j) {
+            centre[j] = 0;
+            for (int i = 0; i < 3; ++i) centre[j] -= rotation[3 * i + j] * translation[i];
+        }
+    }
+};
+
+inline double deviation_cost(const PoseDeviation& d, const double* information) {
+    double cost = 0;
+    for (int i = 0; i < 3; ++i)
+        cost += information[0] * d.turn[i] * d.turn[i] + information[1] * d.shift[i] * d.shift[i];
+    return cost;
+}
+
 static double pose_cost(const Bundle& bundle) {
     double cost = 0;
     for (int camera = 0; camera < bundle.num_cameras; ++camera) {
         const double* information = bundle.given_information + 2 * camera;
-        if (!(information[0] > 0 || information[1] > 0)) continue;
-        const PoseDeviation d(bundle, camera);
-        for (int i = 0; i < 3; ++i)
-            cost += information[0] * d.turn[i] * d.turn[i] + information[1] * d.shift[i] * d.shift[i];
+        if (information[0] > 0 || information[1] > 0) cost += deviation_cost(deviate_camera(bundle, camera), information);
+        if (bundle.set_of_camera[camera] < 0) continue;
+        const RigPose by_rig(bundle, camera);
+        const double *rotation = bundle.rotations + 9 * camera, *translation = bundle.translations + 3 * camera;
+        const PoseDeviation d(rotation, translation, by_rig.rotation, by_rig.centre);
+        cost += deviation_cost(d, bundle.rig_information + 2 * camera);
+    }
+    for (int mount = 0; mount < bundle.num_mounts; ++mount) {
+        const double* information = bundle.given_mount_information + 2 * mount;
+        if (information[0] > 0 || information[1] > 0) cost += deviation_cost(deviate_mount(bundle, mount), information);
     }
     return cost;
 }

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
 from splatnode.recon.matching.two_view import TwoView
@@ -18,6 +20,7 @@ from splatnode.recon.registration import (
     known_poses,
     mapping_problem,
     own_lenses,
+    rigs,
     self_calibration,
 )
 from splatnode.recon.registration.known_poses import GivenWorld
@@ -36,6 +39,10 @@ class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
     # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
     trust_poses: bool = False
+    # Cameras that are fixed to each other, as `--rig FILE` gives them; nothing: what their frame sets tell
+    rig: Rig | None = None
+    # Longest time between images that were taken together, seconds
+    rig_tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_S
 
 
 Array = npt.NDArray[np.float64]
@@ -89,6 +96,7 @@ class Registration:
     median_angle_deg: float  # of the points' triangulation angles
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
     given: GivenWorld | None = None  # the world of given poses that held cameras; None: none did
+    rig: rigs.RigEstimate | None = None  # that its cameras are on; None: they are on none
 
 
 def register(
@@ -111,7 +119,34 @@ def register(
     if built is None:
         return None
     found, grouping = built
-    return make_registration(found.relabel(order), keyframes, [grouping.scales[i] for i in rank], config)
+    scales = [grouping.scales[i] for i in rank]
+    alone = make_registration(found.relabel(order), keyframes, scales, config)
+    pause()
+    on_rig = rigs.adjust_with_rig(found, ordered, config.rig, config.rig_tolerance_s)
+    if on_rig is None:
+        return alone
+    adjusted, rig = on_rig[0].relabel(order), on_rig[1].relabel(order)
+    whole = replace(adjusted, views=(*adjusted.views, *rig.placed))
+    together = make_registration(whole, keyframes, scales, config)
+    return _keep_sigmas(together, alone, rig.rescale(known_poses.distance(adjusted.estimate, adjusted.views)))
+
+
+def _keep_sigmas(together: Registration, alone: Registration, rig: rigs.RigEstimate) -> Registration:
+    """The registration on a rig, no camera of which is claimed to be better known than by images alone."""
+    before = {camera.index: camera for camera in alone.cameras}
+    cameras = [
+        camera
+        if camera.index not in before
+        else replace(
+            camera,
+            rotation_sigma_deg=max(camera.rotation_sigma_deg, before[camera.index].rotation_sigma_deg),
+            centre_sigma_rel=max(camera.centre_sigma_rel, before[camera.index].centre_sigma_rel),
+            centre_covariance=before[camera.index].centre_covariance,
+        )
+        for camera in together.cameras
+    ]
+    focal_sigma = max(together.focal_sigma, alone.focal_sigma)
+    return replace(together, cameras=tuple(cameras), focal_sigma=focal_sigma, rig=rig)
 
 
 def sort_by_content(keyframes: Sequence[Keyframe]) -> list[int]:
