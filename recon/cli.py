@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
@@ -20,6 +21,7 @@ from splatnode.capture.lens_file import Lenses, read_lenses
 from splatnode.capture.pose_files import poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
+from splatnode.capture.rig_file import read_rig
 from splatnode.recon import cost
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.evaluate import methods
@@ -244,6 +246,8 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
     config = apply_changes(config, {"metric": collect_metric_changes(args)})
     if trusts_poses(args):
         config = apply_changes(config, {"registration": {"trust_poses": True}})
+    if getattr(args, "rig", None) is not None:
+        config = apply_changes(config, {"registration": {"rig": msgspec.to_builtins(read_rig(args.rig))}})
     flags = {
         "size": args.size,
         "device": args.device,

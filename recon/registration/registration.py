@@ -98,6 +98,12 @@ class Registration:
     given: GivenWorld | None = None  # the world of given poses that held cameras; None: none did
     rig: rigs.RigEstimate | None = None  # that its cameras are on; None: they are on none
 
+    @property
+    def without_placed(self) -> Registration:
+        """Without the cameras that the rig alone places, of which images tell nothing."""
+        placed = () if self.rig is None else self.rig.placed
+        return replace(self, cameras=tuple(camera for camera in self.cameras if camera.index not in placed))
+
 
 def register(
     keyframes: Sequence[Keyframe],

@@ -106,7 +106,8 @@ class _Sets:
 def form_sets(keyframes: Sequence[Keyframe], tolerance_s: float) -> tuple[FrameSet, ...]:
     """The frame sets of keyframes that have a camera id and a time."""
     known = [(k.name, k.frame.camera_id, k.frame.captured_at) for k in keyframes]
-    return tuple(form_frame_sets([(n, c, at) for n, c, at in known if at is not None], tolerance_s))
+    formed = form_frame_sets([(n, c, at) for n, c, at in known if at is not None], tolerance_s)
+    return tuple(replace(each, names=dict(each.names)) for each in formed)  # which processes can send each other
 
 
 def adjust_with_rig(
@@ -193,7 +194,7 @@ def _constrain(
             of_mount[views[reference]], sigmas[views[reference]] = 0, stiff
     for camera, means in told.items():
         poses = mounts[camera]
-        scatter = np.sqrt(np.add(rig_poses.estimate_scatter(poses), np.square(stiff)))
+        scatter = np.sqrt(poses.scatter)
         for at, (part, (rotation, centre, _)) in enumerate(zip(split[camera], means, strict=True)):
             own = tuple(poses.sets[i] for i in part)
             released = {poses.sets[i] for i in range(len(poses.sets))} - set(own)
@@ -285,9 +286,7 @@ def _mount_covariances(adjusted: Map) -> Array:
     return np.stack(covariances)
 
 
-def _find_changes(
-    sets: _Sets, measured: dict[tuple[str, str], RelativePoses], reference: str
-) -> tuple[RigChange, ...]:
+def _find_changes(sets: _Sets, measured: dict[tuple[str, str], RelativePoses], reference: str) -> tuple[RigChange, ...]:
     """Says which cameras do not stand as in most sets, and from which set on."""
     found = []
     others = sorted({camera for first, camera in measured if first == reference})

@@ -8,6 +8,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -31,6 +32,7 @@ from splatnode.capture.odometry import GRAVITY_SIGMA_DEG, GivenPose, Gravity, Mo
 from splatnode.capture.pose_files import create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
+from splatnode.capture.rig_file import read_rig
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
@@ -266,6 +268,7 @@ def reconstruct(
     poses: Poses | None = None,
     poses_sigma: tuple[float, float] | None = None,
     poses_only_check: bool = False,
+    rig: str | PathLike[str] | None = None,
     masks: Masks | None = None,
     scale: Scale | None = None,
     budget_s: float | None = None,
@@ -295,6 +298,8 @@ def reconstruct(
       is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees: with
       `intrinsics` the poses then hold the cameras, also where photographs share nothing. `poses_only_check`: they do
       not even then, but are compared with the cameras that the photographs alone tell.
+    - `rig`: a file that tells where the cameras of one robot stand to each other, as `--rig` reads it. None: the images
+      that they took together tell.
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
@@ -320,7 +325,8 @@ def reconstruct(
     source = apply_lens(source, intrinsics, images)
     trusted = poses is not None and poses_sigma is not None and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
-    flags["registration"] = {"trust_poses": True} if trusted else None
+    on_rig = {} if rig is None else {"rig": msgspec.to_builtins(read_rig(Path(rig)))}
+    flags["registration"] = (on_rig | ({"trust_poses": True} if trusted else {})) or None
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -70,8 +70,13 @@ def make_rig_walk(
             lens = Intrinsics(*size, *(float(K[at]) for at in _LENS), source="given") if lens_told else None
             frames.append(
                 Frame(
-                    len(frames), name, stamp_ns, image, intrinsics=lens,
-                    captured_at=Stamp(stamp_ns, Clock.RECORDING), camera_id=camera_id,
+                    len(frames),
+                    name,
+                    stamp_ns,
+                    image,
+                    intrinsics=lens,
+                    captured_at=Stamp(stamp_ns, Clock.RECORDING),
+                    camera_id=camera_id,
                 )  # fmt: skip
             )
             poses[name] = T
