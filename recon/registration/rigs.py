@@ -145,7 +145,7 @@ def adjust_with_rig(
 
 
 def _measure(found: Map, sets: _Sets, joint: Array, distance: float) -> dict[tuple[str, str], RelativePoses]:
-    """The relative poses of each ordered pair of cameras, as unsure as they scatter and no surer than rigs are stiff."""
+    """The relative poses of each ordered pair of cameras, as unsure as they scatter, no surer than rigs are stiff."""
     ids = sorted({camera for views in sets.views for camera in views})
     measured = {}
     for first in ids:

@@ -77,7 +77,7 @@ def make_rig_walk(
                     intrinsics=lens,
                     captured_at=Stamp(stamp_ns, Clock.RECORDING),
                     camera_id=camera_id,
-                )  # fmt: skip
+                )
             )
             poses[name] = T
     return RigWalk(tuple(frames), poses)
