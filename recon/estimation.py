@@ -186,7 +186,7 @@ def _estimate_from_images(
         return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
     registration = register(graph.keyframes, graph.pairs, config.registration, pause)
     pause()
-    seen = None if registration is None else registration.without_placed
+    seen = None if registration is None else registration.image_part
     evidence = verify(graph, seen, config.verification, pause)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)

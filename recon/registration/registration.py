@@ -99,8 +99,8 @@ class Registration:
     rig: rigs.RigEstimate | None = None  # that its cameras are on; None: they are on none
 
     @property
-    def without_placed(self) -> Registration:
-        """Without the cameras that the rig alone places, of which images tell nothing."""
+    def image_part(self) -> Registration:
+        """Returns it without the cameras that the rig alone places, of which images tell nothing."""
         placed = () if self.rig is None else self.rig.placed
         return replace(self, cameras=tuple(camera for camera in self.cameras if camera.index not in placed))
 

@@ -44,7 +44,7 @@ class RigConstraint:
         return bool(np.isfinite(self.given_sigmas[:, 1]).any())
 
     def copy(self) -> RigConstraint:
-        """With parameters of its own, which the core changes in place."""
+        """Returns it with parameters of its own, which the core changes in place."""
         names = ("set_rotations", "set_translations", "mount_rotations", "mount_translations")
         return replace(self, **{name: np.array(getattr(self, name), dtype=np.float64, order="C") for name in names})
 

@@ -38,15 +38,15 @@ class RelativePoses:
     scatter: tuple[float, float] = (0.0, 0.0)  # variances of turn and shift of a set, which the covariances have, too
 
     def select(self, positions: Sequence[int]) -> RelativePoses:
-        """Those of some positions."""
+        """Returns those of some positions."""
         at = list(positions)
         sets = tuple(self.sets[i] for i in at)
         return RelativePoses(sets, self.rotations[at], self.centres[at], self.covariances[at], self.scatter)
 
     def widen(self, turn: float, shift: float) -> RelativePoses:
-        """With these variances added in each direction."""
+        """Returns them with these variances added in each direction."""
         further = np.diag([turn] * 3 + [shift] * 3)
-        scatter = self.scatter[0] + turn, self.scatter[1] + shift
+        scatter = float(self.scatter[0] + turn), float(self.scatter[1] + shift)
         return RelativePoses(self.sets, self.rotations, self.centres, self.covariances + further, scatter)
 
     def residuals(self, rotation: Array, centre: Array) -> Array:

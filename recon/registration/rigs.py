@@ -61,7 +61,7 @@ class RigChange:
 
 @dataclass(frozen=True, eq=False)
 class RigEstimate:
-    """What a registration tells of the rig that its cameras are on."""
+    """The estimate of the rig that the cameras of a registration are on."""
 
     mounts: tuple[Mount, ...]  # the rig's own camera first; of a camera that moved, that of the most sets first
     frame_sets: tuple[FrameSet, ...]
@@ -72,7 +72,7 @@ class RigEstimate:
     placed: tuple[int, ...]  # keyframes that the rig alone places
 
     def rescale(self, unit: float) -> RigEstimate:
-        """In a world whose unit is `unit` of this one's."""
+        """Returns it in a world whose unit is `unit` of this one's."""
         by = np.diag([1.0] * 3 + [1.0 / unit] * 3)
         mounts = []
         for mount in self.mounts:
@@ -84,7 +84,7 @@ class RigEstimate:
         return replace(self, mounts=tuple(mounts), changes=changes, metres_per_unit=metres)
 
     def relabel(self, number: Sequence[int]) -> RigEstimate:
-        """With keyframe i being keyframe `number[i]`."""
+        """Returns it with keyframe i being keyframe `number[i]`."""
         return replace(self, placed=tuple(sorted(int(number[i]) for i in self.placed)))
 
 

@@ -144,7 +144,7 @@ class OnRig:
     scale_sigma: float  # standard deviation of its logarithm
 
     def rescale(self, factor: float) -> OnRig:
-        """In a world whose unit is `factor` times smaller."""
+        """Returns it in a world whose unit is `factor` times smaller."""
         mounts = []
         for name, T, sigma, sigma_deg in self.mounts:
             moved = T.copy()
