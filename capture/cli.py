@@ -9,29 +9,30 @@ import json
 import logging
 import math
 import os
-import pkgutil
 import shutil
 import uuid
 from collections.abc import Iterator
 from dataclasses import asdict
-from importlib import import_module, resources
+from importlib import resources
 from pathlib import Path
 
-from splatnode.capture import cameras, daemon
-from splatnode.capture.config import CaptureConfig, camera_opener, is_live
+from splatnode.capture import daemon
+from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live
 from splatnode.capture.daemon import last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config, read_yaml
+from splatnode.capture.process.config import parse_changes, parse_config, parse_layers, read_yaml
+from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.process.files import make_folder, sync_folder
 from splatnode.capture.process.logs import use_structured_lines
 from splatnode.capture.process.terminal import report_items, say, show_progress, show_waiting
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
-from splatnode.capture.status import describe_heartbeat, heartbeats, mark_problems_seen
+from splatnode.capture.several import choose_camera, list_cameras, run_captures
+from splatnode.capture.status import describe_heartbeat, heartbeats, mark_problems_seen, parse_camera_id
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +40,15 @@ EXIT_GOOD, EXIT_SILENT = 0, 75
 
 
 def capture(args: argparse.Namespace) -> int:
-    """Runs the capture process."""
+    """Runs the capture process; of a configuration with several cameras one for each."""
+    camera_ids = list_cameras(read_yaml(args.config)) if args.camera_id is None else []
+    if camera_ids:
+        if args.intrinsics is not None:
+            raise ConfigError("--intrinsics: has one lens, and there are several cameras; give each its `intrinsics`")
+        for each in camera_ids:
+            _config(argparse.Namespace(**{**vars(args), "camera_id": each}))  # what is wrong is told at once
+        use_structured_lines()
+        return run_captures(args.config, camera_ids, [part for each in args.set for part in ("--set", each)])
     config = _config(args)
     use_structured_lines()
     daemon.capture(config)
@@ -62,12 +71,15 @@ def record(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> CaptureConfig:
-    if args.intrinsics is None:
-        return load_config(args.config, CaptureConfig, args.set)
-    lens = {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
-    return parse_config(
-        merge_config(merge_config(read_yaml(args.config), lens), parse_changes(args.set)), CaptureConfig
-    )
+    raw, camera_id = read_yaml(args.config), getattr(args, "camera_id", None)
+    if "cameras" in raw:
+        if camera_id is None:
+            raise ConfigError("cameras: this command is for one camera; give a configuration with `camera`")
+        raw = choose_camera(raw, camera_id)
+    own = {} if args.intrinsics is None else {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
+    if camera_id is not None:
+        own["camera_id"] = camera_id
+    return parse_layers([raw, own, parse_changes(args.set)], CaptureConfig)
 
 
 def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
@@ -86,11 +98,15 @@ def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | Dropp
 def find(args: argparse.Namespace) -> int:
     """Lists the cameras that are connected, as lines that can be copied into a configuration."""
     found = {}
-    for module in pkgutil.iter_modules(cameras.__path__):
-        source = import_module(f"splatnode.capture.cameras.{module.name}")
+    for kind in [*Camera.kinds(), *Camera.kinds_elsewhere()]:
+        try:
+            source = Camera.load_module(kind)
+        except ConfigError as error:  # of another package: the other cameras are found all the same
+            say(str(error), error=True)
+            continue
         if hasattr(source, "find"):
             with show_waiting("looking for cameras"):
-                found[module.name] = source.find()
+                found[kind] = source.find()
     if args.json:
         print(json.dumps(found, indent=1))
         return EXIT_GOOD
@@ -118,8 +134,9 @@ def keys(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Waits for a heartbeat of each process and prints it; 75 where one is silent. `--seen`: what it tells is known.
+    """Waits for a heartbeat of each process and prints it; 75 where one is silent.
 
+    `--acknowledge`: what it tells is known.
     A capture that has come to the end of its recording is not silent.
     """
     network = (
@@ -127,21 +144,27 @@ def status(args: argparse.Namespace) -> int:
     )
     with show_waiting("listening for capture and recon"):
         found = heartbeats(network)
-    ended = last_run(network) if found["capture"] is None else None
+    silent_captures = {room for room in found if room != "recon" and found[room] is None}
+    ended = {room: run for room in silent_captures if (run := last_run(network, parse_camera_id(room))) is not None}
     if args.json:
         print(json.dumps(found))
     else:
         for room, fields in found.items():
-            silent = f"{room}: nothing heard of it; is `splatnode {room}` running, with the same `network` as here?"
-            if room == "capture" and ended is not None:
-                silent = f"{room}: {ended}"
+            silent = f"{room}: nothing heard of it; is `splatnode {_command(room)}` running, with the same `network`?"
+            if room in ended:
+                silent = f"{room}: {ended[room]}"
             for line in [silent] if fields is None else describe_heartbeat(room, fields):
                 say(line)
-    if args.seen:
+    if args.acknowledge:
         for room, answer in mark_problems_seen(network, [room for room, fields in found.items() if fields]).items():
             say(f"{room}: {answer}")
-    heard = {room: bool(fields) for room, fields in found.items()} | ({"capture": True} if ended else {})
-    return EXIT_GOOD if all(heard.values()) else EXIT_SILENT
+    return EXIT_GOOD if all(fields or room in ended for room, fields in found.items()) else EXIT_SILENT
+
+
+def _command(room: str) -> str:
+    """`capture --camera-id left`."""
+    camera_id = parse_camera_id(room)
+    return f"capture --camera-id {camera_id}" if camera_id else room
 
 
 # The configurations that come with the package, with systemd's units and udev's rule: listed, or written to a folder.

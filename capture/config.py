@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -11,15 +12,15 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import keyframe_selection, reader
+from splatnode.capture import former_names, keyframe_selection, reader
 from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image
 from splatnode.capture.masks import mask_frames, open_single_mask
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
-from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.network import CaptureId, Network
 from splatnode.capture.messaging.wire import Header, Message, Name, Numbering, Sequential, Text, WireError
 from splatnode.capture.process.config import Plugin
-from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.quality import Limits
 
 # Previews: small JPEG images of what the camera sees now. Some may be lost on the way.
@@ -30,7 +31,7 @@ _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gi
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Previews: small JPEG images of what the camera sees now. Some may be lost on the way."""
 
-    per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
+    fps: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
     # At least so many, pixels; less than twice as many, since images are reduced by whole factors
     longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75  # of the JPEG: 100 is best and largest
@@ -71,13 +72,28 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
 
 
 class Camera(Plugin):
-    """The source of frames: a module of capture/cameras."""
+    """The source of frames: a module of capture/cameras, or one that another package brings."""
 
     package = "splatnode.capture.cameras"
+    needs = ("Config", "stream")
+    entry_points = "splatnode.cameras"
+
+
+class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Configures what a program of one's own sends in place of a camera: as CaptureConfig has it, without a camera."""
+
+    quality: Limits = Limits()
+    selection: keyframe_selection.Config = keyframe_selection.Config()
+    preview: Config = Config()
+    spool: spool.SpoolConfig = spool.SpoolConfig()
+    network: Network = Network()
+    camera_id: CaptureId = ""
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All that can be configured in the capture room, with defaults and units."""
+
+    former_keys = former_names.KEYS
 
     camera: Camera  # where frames come from: the kinds have options of their own, below
     quality: Limits = Limits()  # which frames are usable, and no copies
@@ -88,6 +104,9 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()  # how the processes reach each other
     # An image of the camera's size: black is never used, as where the camera sees the robot itself; white is used
     body_mask: Path | None = None
+    # Where several captures run beside one recon, each has an id of its own, of letters, digits, - and _: its frames
+    # carry it. Frames that they took at one time form a frame set
+    camera_id: CaptureId = ""
 
 
 def camera_opener(
@@ -105,3 +124,21 @@ def camera_opener(
 def is_live(camera: Camera) -> bool:
     """Whether the camera goes on when nobody reads. Of a live camera the newest frames are read, of a recording all."""
     return getattr(camera.module, "LIVE", False)
+
+
+def name_camera(
+    opened: Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]], camera_id: str
+) -> Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]]:
+    """The camera, whose frames carry the id, also in their names; as it is for an empty one."""
+    if not camera_id:
+        return opened
+
+    def stream() -> Iterator[Frame | DroppedFrame | KeepAlive]:
+        for item in opened():
+            if isinstance(item, KeepAlive):
+                yield item
+                continue
+            named = replace(item, name=f"{camera_id}_{item.name}"[:LONGEST_NAME])
+            yield replace(named, camera_id=named.camera_id or camera_id) if isinstance(named, Frame) else named
+
+    return stream

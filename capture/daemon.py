@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import cv2
 import msgspec
 
-from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live
+from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live, name_camera
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.keyframe_selection import Decision, Selector
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
@@ -72,28 +72,28 @@ class LastRun(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
 
-def begin_run(network: Network) -> None:
+def begin_run(network: Network, camera_id: str = "") -> None:
     """Forgets the last run: another one has begun. Raises NetworkError, OSError."""
-    _path(network).unlink(missing_ok=True)
+    _path(network, camera_id).unlink(missing_ok=True)
 
 
-def end_run(network: Network, frames: int, keyframes: int) -> None:
+def end_run(network: Network, frames: int, keyframes: int, camera_id: str = "") -> None:
     """Keeps that the recording has ended now. Raises NetworkError, OSError."""
-    path = _path(network)
+    path = _path(network, camera_id)
     path.unlink(missing_ok=True)
     with open(create_own(path), "wb") as file:
         file.write(msgspec.json.encode(LastRun(frames, keyframes, time.time())))
 
 
-def last_run(network: Network) -> LastRun | None:
+def last_run(network: Network, camera_id: str = "") -> LastRun | None:
     """How capture ended on this machine; None where that is not known, or it was stopped. Raises NetworkError."""
     with contextlib.suppress(OSError, StrayFile, msgspec.MsgspecError):
-        return record_in(read_own(_path(network), _MOST_BYTES), LastRun)
+        return record_in(read_own(_path(network, camera_id), _MOST_BYTES), LastRun)
     return None
 
 
-def _path(network: Network) -> Path:
-    return runtime_directory(network) / _FILE
+def _path(network: Network, camera_id: str) -> Path:
+    return runtime_directory(network) / (f"{_FILE}@{camera_id}" if camera_id else _FILE)
 
 
 log = logging.getLogger(__name__)
@@ -117,13 +117,15 @@ def capture(config: CaptureConfig) -> None:
     make_sure_of_room(_FILES + files_for_strangers(config.network, _SOCKETS), _THREADS)
     with ExitStack() as resources:
         manager = ServiceManager()
-        server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
-        session = _Session(config, server, resources)
+        server = resources.enter_context(
+            KeyframeServer(config.network, Spool(config.spool, config.camera_id), config.camera_id)
+        )
+        session = CaptureSession(config, server, resources)
         camera = config.camera
-        opened = camera_opener(camera, config.body_mask)
+        opened = name_camera(camera_opener(camera, config.body_mask), config.camera_id)
         reader = resources.enter_context(Reader(opened, is_live(camera), config.reader))
         resources.callback(manager.stopping)
-        begin_run(config.network)
+        begin_run(config.network, config.camera_id)
         if why := server.spool.shortage():
             event(log, logging.WARNING, "disk_space", problem=why)
         sound_s = math.inf if is_live(camera) else time.monotonic() + SOUND_S  # a live camera proves it by a frame
@@ -139,12 +141,24 @@ def capture(config: CaptureConfig) -> None:
                 manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
         event(log, logging.INFO, "finished", frames=session.frames, keyframes=session.keyframes)
         try:
-            end_run(config.network, session.frames, session.keyframes)
+            end_run(config.network, session.frames, session.keyframes, config.camera_id)
         except OSError as error:
             log.warning("splatnode status will not know that this capture finished: %s", error)
 
 
-class _Session:
+class FrameSource(Protocol):
+    """Describes where frames come from, for the heartbeat: a Reader, or a program."""
+
+    skipped: int
+
+    @property
+    def state(self) -> ReaderState: ...
+
+    @property
+    def why(self) -> str: ...
+
+
+class CaptureSession:
     """The counters of one run, and the sockets that it sends to."""
 
     def __init__(self, config: CaptureConfig, server: KeyframeServer, resources: ExitStack) -> None:
@@ -154,11 +168,17 @@ class _Session:
         self._spool_full = ""
         self._started = False
         self._server = server
-        self._selector = Selector(config.selection, config.quality)
+        self._selectors: dict[str, Selector] = {}  # by camera id: each camera has views of its own
         self._problems = Problems()
-        self._commands = resources.enter_context(CommandServer(CAPTURE_CONTROL, config.network, MarkProblemsSeen))
-        self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW, config.network))
-        self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS, config.network))
+        self._commands = resources.enter_context(
+            CommandServer(CAPTURE_CONTROL.select_capture(config.camera_id), config.network, MarkProblemsSeen)
+        )
+        self._previews = resources.enter_context(
+            Publisher(CAPTURE_PREVIEW.select_capture(config.camera_id), config.network)
+        )
+        self._heartbeats = resources.enter_context(
+            Publisher(CAPTURE_STATUS.select_capture(config.camera_id), config.network)
+        )
         self._preview_numbers = Numbering(server.numbering.session)
         self._heartbeat_numbers = Numbering(server.numbering.session)
         self._next_preview_ns = 0
@@ -217,15 +237,39 @@ class _Session:
 
     def take(self, frame: Frame, state: ReaderState) -> None:
         """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
-        decision = self._selector.decide(frame, waiting=self._server.num_queued)
+        decision = self._decide(frame)
+        if decision.take:
+            self._attempt(frame.name, lambda: self._offer(frame, decision))
+        self._preview.do(lambda: self._send_preview(frame, decision, state))
+
+    def push(self, frame: Frame) -> Decision:
+        """As `take`, for a program that waits for the outcome. Raises SpoolFull, OSError, WireError (too large)."""
+        decision = self._decide(frame)
+        if decision.take:
+            try:
+                self._server.offer(frame)
+            except Exception:
+                self._find_selector(frame).forget_last()
+                self.not_taken += 1
+                raise
+            self._count_keyframe(frame, decision)
+        self._preview.do(lambda: self._send_preview(frame, decision, ReaderState.STREAMING))
+        return decision
+
+    def _decide(self, frame: Frame) -> Decision:
+        decision = self._find_selector(frame).decide(frame, waiting=self._server.num_queued)
         self.frames += 1
         self._rate.count()
         self.unusable += decision.candidate and not decision.take
-        if decision.take:
-            self._attempt(frame.name, lambda: self._offer(frame, decision))
         if decision.candidate:
             self.last_decision = f"{frame.name}: {'taken' if decision.take else 'not taken'}: {decision.reason}"
-        self._preview.do(lambda: self._send_preview(frame, decision, state))
+        return decision
+
+    def _find_selector(self, frame: Frame) -> Selector:
+        """Returns the selector of the frame's camera, which begins with its first frame."""
+        if frame.camera_id not in self._selectors:
+            self._selectors[frame.camera_id] = Selector(self.config.selection, self.config.quality)
+        return self._selectors[frame.camera_id]
 
     def drop(self, dropped: DroppedFrame) -> None:
         """Tells recon of a photograph that cannot be used, where half of the spool at least is free for keyframes.
@@ -239,14 +283,14 @@ class _Session:
         if not live or is_logged(self.dropped):
             event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason, number=self.dropped)
 
-    def send_heartbeat(self, reader: Reader) -> None:
+    def send_heartbeat(self, reader: FrameSource) -> None:
         """Sends a heartbeat, when one is due; none where what it tells cannot be had."""
         if time.monotonic() < self._next_beat:
             return
         self._next_beat = time.monotonic() + HEARTBEAT_S
         self._heart.do(lambda: self._heartbeats.send(self._status(reader)))
 
-    def _status(self, reader: Reader) -> CaptureStatus:
+    def _status(self, reader: FrameSource) -> CaptureStatus:
         quarantine = self._server.spool.quarantine
         return CaptureStatus(
             **self._heartbeat_numbers.next(),
@@ -300,8 +344,11 @@ class _Session:
 
     def _offer(self, frame: Frame, decision: Decision) -> None:
         if not self._deliver(frame):
-            self._selector.forget_last()
+            self._find_selector(frame).forget_last()
             return
+        self._count_keyframe(frame, decision)
+
+    def _count_keyframe(self, frame: Frame, decision: Decision) -> None:
         self.keyframes += 1
         event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.num_queued)
 
@@ -330,7 +377,7 @@ class _Session:
         return True
 
     def _send_preview(self, frame: Frame, decision: Decision, state: ReaderState) -> None:
-        rate = self.config.preview.per_second
+        rate = self.config.preview.fps
         if rate == 0 or frame.stamp_ns < self._next_preview_ns:
             return
         self._next_preview_ns = frame.stamp_ns + round(1e9 * (1 - PREVIEW_JITTER) / rate)

@@ -80,9 +80,9 @@ def camera(path: Path) -> tuple[str, dict[str, Any]]:
 def _parse_seconds(file: Path, part: str) -> dict[str, float]:
     """From when to when a part of a video is. Raises ValueError."""
     found = _SECONDS.fullmatch(part)
-    told = {} if found is None else {"from_s": found[1], "to_s": found[2]}
+    told = {} if found is None else {"start_s": found[1], "end_s": found[2]}
     span = {name: float(text) for name, text in told.items() if text}
-    if not span or span.get("from_s", 0.0) >= span.get("to_s", math.inf):
+    if not span or span.get("start_s", 0.0) >= span.get("end_s", math.inf):
         raise ValueError(
             f"{sanitize_text(str(file))!r}: behind the # must be seconds of the video, the first before the last, "
             "such as "

@@ -348,9 +348,10 @@ def make_frame(
 
 def rename_frame(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
-    known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
-    came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure, frame.camera, frame.camera_id
-    return make_frame(frame_id, name, stamp_ns, *known, *came)
+    try:
+        return replace(frame, frame_id=frame_id, name=name, stamp_ns=stamp_ns)
+    except ValueError as error:
+        return DroppedFrame(name, f"it cannot be used: {error}")
 
 
 # Fields of records that are left out where there is nothing: a reader that does not know them reads the rest.

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.image_header import MAX_SIDE, UnusableImage
 from splatnode.capture.pi_heif import HEADER
-from splatnode.capture.process import python
+from splatnode.capture.process import apart, python
 from splatnode.capture.process.system import remedy
 
 SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
@@ -69,18 +69,9 @@ def decode(data: bytes, max_pixels: int) -> HeifImage:
     if (needed := installation_advice()) is not None:
         raise UnusableImage(f"HEIC and AVIF need a further package. {needed}")
     check_whole(data)
-    child = subprocess.Popen(
-        python.command("splatnode.capture.pi_heif", str(max_pixels)),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text
-        start_new_session=True,  # Ctrl-C is for us
-    )
-    with child:
-        try:
-            return _receive_image(child, data, max_pixels)
-        finally:
-            child.kill()
+    command = python.command("splatnode.capture.pi_heif", str(max_pixels))
+    with apart.start_process(command, subprocess.PIPE) as child:
+        return _receive_image(child, data, max_pixels)
 
 
 def _receive_image(child: subprocess.Popen[bytes], data: bytes, max_pixels: int) -> HeifImage:

@@ -24,6 +24,7 @@ from splatnode.capture.exif import exif_time
 from splatnode.capture.frame import ExposureSettings, Intrinsics, Stamp
 from splatnode.capture.image_header import ImageHeader, UnusableImage, read_header
 from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.library_lines import catch_library_lines
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import guard_untrusted
 
@@ -266,7 +267,8 @@ def _decode_alpha(header: ImageHeader) -> npt.NDArray[np.bool_] | None:
 
 def _decode_as(header: ImageHeader, flags: int) -> npt.NDArray:
     try:
-        image = cv2.imdecode(np.frombuffer(header.decodable, np.uint8), flags)
+        with catch_library_lines():
+            image = cv2.imdecode(np.frombuffer(header.decodable, np.uint8), flags)
     except cv2.error as error:
         raise UnusableImage(f"damaged: {error.err}") from error
     if image is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -19,7 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, reduce_image
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
+from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 
 TRACKED_SIDE = 320  # pixels: the longer side of the images in which corners are tracked is at least this
 MAX_CORNERS = 100
@@ -41,6 +43,7 @@ REMEMBERED_BLURS = 8  # candidates with which blur is compared: a soft place aft
 THUMBNAIL = 16, 12  # width and height in pixels
 MAX_THUMBNAIL_DIFFERENCE = 0.3  # mean; copies have 0.05. Others are no copies, which saves a closer comparison
 RETRY_S = 1.0  # after a keyframe that could not be kept
+TOGETHER = "frame set: another camera adds something at this time"
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Image = npt.NDArray  # (h, w) or (h, w, 3) uint8
@@ -58,9 +61,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Or when no homography explains so much of their motion, in longer sides of the image (median)
     parallax: Share = 0.01
     # Frames that are examined; the others become no keyframes. Higher: more work, finer choice
-    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0
+    max_fps: Annotated[float, msgspec.Meta(gt=0)] = 8.0
     # Until the next frame is examined, after one that would have been taken but is unusable
-    patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3
+    patience_s: Internal[Annotated[float, msgspec.Meta(ge=0)]] = 0.3
     # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
     backlog: Annotated[int, msgspec.Meta(ge=1)] = 8
 
@@ -121,7 +124,7 @@ class Selector:
             raise
 
     def _examine(self, frame: Frame, waiting: int) -> Decision:
-        self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
+        self._next_ns = frame.stamp_ns + round(1e9 / self.config.max_fps)
         small = reduce_image(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         reason, adds = self._explain_decision(grey, strictness=1 + waiting / self.config.backlog)
@@ -133,6 +136,15 @@ class Selector:
             self._next_ns = frame.stamp_ns + round(1e9 * self.config.patience_s)
             return Decision(False, fault, True)
         self._remember(view, grey)
+        return Decision(True, reason, True)
+
+    def add(self, frame: Frame, reason: str) -> Decision:
+        """Takes a frame whatever it adds, for this reason, unless it is unusable or a copy of a keyframe."""
+        small = reduce_image(frame.image, TRACKED_SIDE)
+        view = _Candidate(frame.name, small, _thumbnail(small), _digest(frame.encoded))
+        if (fault := self._find_fault(frame, view)) is not None:
+            return Decision(False, fault, True)
+        self._remember(view, cv2.cvtColor(small, cv2.COLOR_RGB2GRAY))
         return Decision(True, reason, True)
 
     def forget_last(self) -> None:
@@ -239,6 +251,66 @@ def _thumbnail(small: Image) -> Image:
     return (grey - grey.mean()) / (grey.std() + 1)
 
 
+class FrameSetSelector:
+    """Selects the images of several cameras that were taken together as one: what one camera adds takes all of them.
+
+    An image that is unusable, or a copy, is left out alone. Frame sets are given in the order of their stamps.
+    """
+
+    def __init__(self, config: Config, limits: Limits) -> None:
+        self.config, self.limits = config, limits
+        self._each_config = msgspec.structs.replace(config, max_fps=1e9, patience_s=0.0)  # sets have the pace
+        self._selectors: dict[str, Selector] = {}  # by camera id
+        self._next_ns = 0  # nothing is examined before
+
+    def decide(self, frames: Sequence[Frame], waiting: int = 0) -> list[Decision]:
+        """Whether each frame of a set becomes a keyframe; see `Selector.decide`."""
+        if frames[0].stamp_ns < self._next_ns and not self.config.every_frame:
+            return [Decision(False, "between two examinations", False) for _ in frames]
+        for frame in frames:
+            if frame.camera_id not in self._selectors:
+                self._selectors[frame.camera_id] = Selector(self._each_config, self.limits)
+        decisions = [self._selectors[frame.camera_id].decide(frame, waiting) for frame in frames]
+        takes = any(decision.take for decision in decisions)
+        if takes:
+            decisions = [
+                decision if decision.candidate else self._selectors[frame.camera_id].add(frame, TOGETHER)
+                for frame, decision in zip(frames, decisions, strict=True)
+            ]
+        unusable = not takes and any(decision.candidate for decision in decisions)
+        pause_s = self.config.patience_s if unusable else 1.0 / self.config.max_fps
+        self._next_ns = frames[0].stamp_ns + round(1e9 * pause_s)
+        return decisions
+
+
+def group_frame_sets(
+    frames: Iterable[Frame | DroppedFrame], tolerance_s: float = TOLERANCE_S
+) -> Iterator[tuple[Frame, ...] | DroppedFrame]:
+    """Groups frames that come in the order of their times into those that were taken together, as they come.
+
+    See `rig.form_frame_sets`. A frame without a camera id is alone.
+    """
+    together: list[Frame] = []
+    for each in frames:
+        if isinstance(each, DroppedFrame):
+            yield each
+            continue
+        if together and not _is_together(together, each, tolerance_s):
+            yield tuple(together)
+            together = []
+        together.append(each)
+    if together:
+        yield tuple(together)
+
+
+def _is_together(frames: Sequence[Frame], frame: Frame, tolerance_s: float) -> bool:
+    first, second = frames[0].captured_at, frame.captured_at
+    ids = [each.camera_id for each in frames]
+    if first is None or second is None or not frame.camera_id or frame.camera_id in ids or not all(ids):
+        return False
+    return are_taken_together(first, second, tolerance_s)
+
+
 # Keyframes of a recording: chosen as a live camera's are, and thinned evenly where they are more than can be used.
 
 THINNED = "thinned out"  # why a keyframe was given up again
@@ -270,38 +342,48 @@ class Choice:
 
 
 def choose(
-    recording: Iterable[Frame | DroppedFrame], config: Config, limits: Limits, most: int | None, what: str = "frame"
+    recording: Iterable[Frame | DroppedFrame],
+    config: Config,
+    limits: Limits,
+    most: int | None,
+    what: str = "frame",
+    tolerance_s: float = TOLERANCE_S,
 ) -> Choice:
     """At most `most` keyframes, evenly along the way; only they are held in memory. None: the names of all.
 
     When there are more, every second one is given up, and from then on every second one is taken: so the camera's way
-    stays covered whatever its length.
+    stays covered whatever its length. Images of several cameras are chosen, and given up, by whole frame sets.
     """
-    selector = Selector(config, limits)
-    kept: list[tuple[str, Frame | None, str]] = []
+    selector = FrameSetSelector(config, limits)
+    kept: list[list[tuple[str, Frame | None, str]]] = []  # of each frame set
     dropped: list[DroppedFrame] = []
     left_out: Counter[str] = Counter()
     examined = found = 0
-    step = 1  # one in so many of the frames that the selector takes is kept
-    for frame in recording:
-        if isinstance(frame, DroppedFrame):
-            dropped.append(frame)
+    step = 1  # one in so many of the frame sets that the selector takes is kept
+    for frames in group_frame_sets(recording, tolerance_s):
+        if isinstance(frames, DroppedFrame):
+            dropped.append(frames)
             continue
-        examined += 1
-        decision = selector.decide(frame)
-        reason = decision.reason.split(":")[0]
-        if not decision.take:
-            left_out[reason] += 1
+        examined += len(frames)
+        taken = []
+        for frame, decision in zip(frames, selector.decide(frames), strict=True):
+            reason = decision.reason.split(":")[0]
+            if decision.take:
+                taken.append((frame.name, None if most is None else frame, reason))
+            else:
+                left_out[reason] += 1
+        if not taken:
             continue
         if found % step == 0:
-            kept.append((frame.name, None if most is None else frame, reason))
+            kept.append(taken)
         else:
-            left_out[THINNED] += 1
+            left_out[THINNED] += len(taken)
         found += 1
-        if most is not None and len(kept) > most:
-            left_out[THINNED] += len(kept) // 2
+        while most is not None and len(kept) > 1 and sum(map(len, kept)) > most:
+            left_out[THINNED] += sum(map(len, kept[1::2]))
             kept, step = kept[::2], 2 * step
-    taken = Counter(reason for *_, reason in kept)
-    names = tuple(name for name, *_ in kept)
-    frames = tuple(frame for _, frame, _ in kept if frame is not None)
-    return Choice(names, frames, tuple(dropped), examined, taken, left_out, what)
+    chosen = [each for taken in kept for each in taken]
+    reasons = Counter(reason for *_, reason in chosen)
+    names = tuple(name for name, *_ in chosen)
+    keyframes = tuple(frame for _, frame, _ in chosen if frame is not None)
+    return Choice(names, keyframes, tuple(dropped), examined, reasons, left_out, what)

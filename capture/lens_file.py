@@ -31,23 +31,24 @@ _AFTER_CAMERA = "/_-. "  # what may follow the name of a camera in the name of a
 class Lenses:
     """Lenses by the images that they took.
 
-    A key is the name of an image, with or without its suffix; the name of a camera, as `Frame.camera` has it or with
-    which the names of its images begin (`left` for left/0001.png and left_0001.png); or a pattern, such as `left*.png`.
+    A key is the name of an image, with or without its suffix; a camera id; the name of a camera, as `Frame.camera` has
+    it or with which the names of its images begin (`left` for left/0001.png and left_0001.png); or a pattern, such as
+    `left*.png`.
     The first kind of key that an image matches counts, in this order.
     """
 
     by_key: Mapping[str, Intrinsics]
 
-    def find_key(self, name: str, camera: str = "") -> str | None:
+    def find_key(self, name: str, camera: str = "", camera_id: str = "") -> str | None:
         """Returns the key of the lens of an image; None where no lens is of it."""
-        return find_key(self.by_key, name, camera)
+        return find_key(self.by_key, name, camera, camera_id)
 
     def apply(self, each: Any) -> Any:
         """Returns the frame with its lens; as it is where no lens is of it, or one of another aspect ratio.
 
         Where lenses differ, the key becomes the frame's camera: images of different cameras share no lens.
         """
-        if not isinstance(each, Frame) or (key := self.find_key(each.name, each.camera)) is None:
+        if not isinstance(each, Frame) or (key := self.find_key(each.name, each.camera, each.camera_id)) is None:
             return each
         lens = self.by_key[key]
         seen = assign_lens(each, lens)
@@ -56,16 +57,16 @@ class Lenses:
         first = next(other for other, known in self.by_key.items() if known == lens)
         return replace(seen, camera=sanitize_text(first, LONGEST_NAME))
 
-    def check(self, images: Iterable[tuple[str, str, int, int]]) -> None:
+    def check(self, images: Iterable[tuple[str, str, str, int, int]]) -> None:
         """Raises ValueError where a lens is of no image, or of none of its aspect ratio.
 
-        `images` are names, cameras, widths and heights of all that there are.
+        `images` are names, cameras, camera ids, widths and heights of all that there are.
         """
         sizes: dict[str, set[tuple[int, int]]] = {key: set() for key in self.by_key}
         names = []
-        for name, camera, width, height in images:
+        for name, camera, camera_id, width, height in images:
             names.append(name)
-            if (key := self.find_key(name, camera)) is not None:
+            if (key := self.find_key(name, camera, camera_id)) is not None:
                 sizes[key].add((width, height))
         for key, found in sizes.items():
             if found:
@@ -79,9 +80,9 @@ class Lenses:
                 )
 
 
-def find_key(keys: Collection[str], name: str, camera: str = "") -> str | None:
+def find_key(keys: Collection[str], name: str, camera: str = "", camera_id: str = "") -> str | None:
     """Returns which of the keys an image with this name, of this camera, matches; None: none. See `Lenses`."""
-    for exact in (name, name.rpartition(".")[0], PurePosixPath(name).name, camera):
+    for exact in (name, name.rpartition(".")[0], PurePosixPath(name).name, camera_id, camera):
         if exact and exact in keys:
             return exact
     begins = (key for key in keys if key and name.startswith(key) and name[len(key) : len(key) + 1] in _AFTER_CAMERA)
@@ -89,9 +90,9 @@ def find_key(keys: Collection[str], name: str, camera: str = "") -> str | None:
     return next(begins, None) or next(patterns, None)
 
 
-def describe_image(frame: Frame) -> tuple[str, str, int, int]:
-    """Returns what `Lenses.check` asks of an image: name, camera, width and height."""
-    return frame.name, frame.camera, frame.width, frame.height
+def describe_image(frame: Frame) -> tuple[str, str, str, int, int]:
+    """Returns what `Lenses.check` asks of an image: name, camera, camera id, width and height."""
+    return frame.name, frame.camera, frame.camera_id, frame.width, frame.height
 
 
 def same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:

@@ -84,17 +84,21 @@ def mask_frames(
 def open_masks(path: Path) -> Find:
     """Finds masks in a folder, by the name of the photograph or its stem; a file is the mask of all photographs.
 
-    Raises FileNotFoundError and UnusableMask where there is none, or two of one name.
+    Of several cameras the masks may lie in a folder of each (left/0001.png), and one that is called as a camera
+    (left.png) is the mask of all of its photographs that have no own. Raises FileNotFoundError and UnusableMask where
+    there is none, or two of one name.
     """
     if path.is_file():
         return open_single_mask(path)
     if not path.is_dir():
         raise FileNotFoundError(f"{str(path)!r} is not there; give a folder of masks: {CONVENTION}")
     by_stem: dict[str, Path] = {}
-    for file in sorted(path.iterdir()):
-        if file.name.startswith(".") or file.suffix.lower() not in SUFFIXES:
+    inside = (child for child in sorted(path.iterdir()) if child.is_dir() and not child.name.startswith("."))
+    for file in (*sorted(path.iterdir()), *(file for child in inside for file in sorted(child.iterdir()))):
+        if file.name.startswith(".") or file.suffix.lower() not in SUFFIXES or not file.is_file():
             continue
-        stem = sanitize_name(file.stem)
+        of_camera = "" if file.parent == path else f"{sanitize_name(file.parent.name)}/"
+        stem = of_camera + sanitize_name(file.stem)
         if stem in by_stem:
             both = f"{by_stem[stem].name} and {sanitize_name(file.name)}"
             raise UnusableMask(f"{str(path)!r} has two masks of one photograph, {both}; remove one")
@@ -104,6 +108,7 @@ def open_masks(path: Path) -> Find:
 
     def find(frame: Frame) -> Mask | None:
         file = by_stem.get(frame.name) or by_stem.get(frame.name.rpartition(".")[0] or frame.name)
+        file = file or (by_stem.get(frame.camera_id) if frame.camera_id else None)
         return None if file is None else read_mask(file, frame)
 
     return find
@@ -122,13 +127,18 @@ def open_single_mask(path: Path) -> Find:
     return find
 
 
+_MOST_TIMES = 4  # as many pixels as its photograph: a mask of another size is decoded, and refused by its size
+_LEAST_BOUND = 1 << 20  # pixels that may be decoded of any photograph's mask
+
+
 def read_mask(path: Path, frame: Frame) -> Mask:
     """The mask (H, W) in an image file, turned as its photograph is. Raises UnusableMask.
 
     A mask that has the size of the photograph as it is stored, not turned yet, is turned as the photograph's EXIF says.
     """
+    most = max(_MOST_TIMES * frame.width * frame.height, _LEAST_BOUND)
     try:
-        image = outlast(lambda: decode_any_image(read_image_file(path)).image, sanitize_name(path.name))
+        image = outlast(lambda: decode_any_image(read_image_file(path, most), most).image, sanitize_name(path.name))
     except (UnusableImage, OSError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise UnusableMask(f"the mask {sanitize_name(path.name)} cannot be read: {why}") from error

@@ -84,6 +84,8 @@ def make_given_pose(
 
 Matrix = npt.NDArray[np.float64]
 
+# Standard deviations of a motion where nobody tells any: a share of its length, at least so many metres, and degrees.
+MOTION_DRIFT, MOTION_SIGMA_M, MOTION_SIGMA_DEG = 0.02, 0.001, 2.0
 _STILL = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 

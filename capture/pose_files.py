@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,7 +18,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame
-from splatnode.capture.odometry import are_rigid, rigid_problem
+from splatnode.capture.odometry import LARGEST_M, are_rigid, rigid_problem
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
@@ -78,6 +80,8 @@ _MAX_BYTES = 200_000_000
 MOST_POSES = 1_000_000  # of a file: those of five hours at 60 a second
 _LONGEST_GAP_S = 1.0  # between two poses, over which a time between them is interpolated
 _NEAREST_S = 0.02  # of a time to the one pose that counts where there is none on its other side
+_LARGEST_DEG = 180.0  # of a sigma
+_UNTOLD = math.nan, math.nan
 _FARTHEST_M = 1e9  # of a coordinate
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras: x right, y up, z back
 _Row = tuple[float, float, float, float]
@@ -91,6 +95,8 @@ class PosesFileError(ValueError):
 class _Frame(msgspec.Struct, frozen=True):
     file_path: _Name
     transform_matrix: tuple[_Row, _Row, _Row, _Row]
+    sigma_m: float | None = None  # standard deviation of the position in each direction, metres
+    sigma_deg: float | None = None  # of the orientation about each axis, degrees
 
 
 class _Transforms(msgspec.Struct, frozen=True):
@@ -104,21 +110,47 @@ class Trajectory:
     by_name: Mapping[str, Array] = field(default_factory=dict)
     seconds: Array = field(default_factory=lambda: np.zeros(0))  # (M,) rising
     Ts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (M, 4, 4)
+    # Of several cameras: by the folder and the name of the photograph, left/0001.jpg
+    by_camera: Mapping[str, Array] = field(default_factory=dict)
+    # Standard deviations (2,) of a position in each direction, metres, and of an orientation about each axis, degrees,
+    # of those poses that tell them: by the name of the photograph, or of each time (M, 2), 0 where nothing is told
+    sigmas_by_name: Mapping[str, Array] = field(default_factory=dict)
+    sigmas: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def find_poses(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
         """The poses of the frames that have one, by their names."""
         found = {each.name: self.pose_of(each) for each in frames if isinstance(each, Frame)}
         return {name: T for name, T in found.items() if T is not None}
 
+    def find_sigmas(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, tuple[float, float]]:
+        """The standard deviations, metres and degrees, of the poses that tell them, by the frames' names."""
+        found = {each.name: self.sigmas_of(each) for each in frames if isinstance(each, Frame)}
+        return {name: sigmas for name, sigmas in found.items() if sigmas is not None}
+
     def pose_of(self, frame: Frame) -> Array | None:
         """Returns the pose of one frame, T_world_camera (4, 4); None where it has none."""
-        if self.by_name:
-            return self.by_name[known] if (known := self.names(frame.name)) else None
+        if self.by_name or self.by_camera:
+            named = self.by_camera if "/" in frame.name else self.by_name
+            return named[known] if (known := self.names(frame.name)) else None
+        return None if (time := self._time_of(frame)) is None else self._interpolate_pose(time)
+
+    def sigmas_of(self, frame: Frame) -> tuple[float, float] | None:
+        """Returns the sigmas of one frame's pose, metres and degrees: between two poses the larger; None: not told."""
+        if self.by_name or self.by_camera:
+            told = self.sigmas_by_name.get(self.names(frame.name))
+        else:
+            time = self._time_of(frame) if len(self.sigmas) else None
+            near = np.zeros((0, 2)) if time is None else self.sigmas[self._neighbours(time)]
+            told = near.max(0) if len(near) and (near > 0).all() else None
+        return None if told is None or not np.isfinite(told).all() else (float(told[0]), float(told[1]))
+
+    def _time_of(self, frame: Frame) -> float | None:
+        """The time at which the frame has a pose, seconds; or its number, where times are numbers."""
         if frame.captured_at is not None:
-            found = self._interpolate_pose(frame.captured_at.ns / 1e9)
-            if found is not None or frame.captured_at.clock is Clock.RECORDING:
-                return found  # whole seconds of a recording are seconds, and no numbers of frames
-        return self._interpolate_pose(float(frame.frame_id)) if self._are_numbers else None
+            seconds = frame.captured_at.ns / 1e9
+            if self._neighbours(seconds) or frame.captured_at.clock is Clock.RECORDING:
+                return seconds  # whole seconds of a recording are seconds, and no numbers of frames
+        return float(frame.frame_id) if self._are_numbers else None
 
     @cached_property
     def _are_numbers(self) -> bool:
@@ -126,22 +158,35 @@ class Trajectory:
         return bool((self.seconds == np.floor(self.seconds)).all() and (self.seconds < 1e6).all())
 
     def names(self, photograph: str) -> str:
-        """The name by which it knows the photograph, which may lack the suffix; empty where it does not."""
-        return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in self.by_name), "")
+        """The name by which it knows the photograph, which may lack the suffix; empty where it does not.
+
+        Of several cameras it must know it with its camera's folder: photographs of two cameras may have one name.
+        """
+        named = self.by_camera if "/" in photograph else self.by_name
+        return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in named), "")
+
+    def _neighbours(self, seconds: float) -> list[int]:
+        """The poses between which this time is, or the one that counts for it; none where they are too far away."""
+        after = int(np.searchsorted(self.seconds, seconds))
+        near = [index for index in (after - 1, after) if 0 <= index < len(self.seconds)]
+        if not near:
+            return []
+        nearest = min(near, key=lambda index: abs(self.seconds[index] - seconds))
+        if abs(self.seconds[nearest] - seconds) < 1e-6:
+            return [nearest]
+        if len(near) < 2 or self.seconds[after] - self.seconds[after - 1] > _LONGEST_GAP_S:
+            return [nearest] if abs(self.seconds[nearest] - seconds) <= _NEAREST_S else []
+        return near
 
     def _interpolate_pose(self, seconds: float) -> Array | None:
         """The pose at this time, between its two neighbours; None where they are too far away."""
-        after = int(np.searchsorted(self.seconds, seconds))
-        near = [index for index in (after - 1, after) if 0 <= index < len(self.seconds)]
-        nearest = min(near, key=lambda index: abs(self.seconds[index] - seconds))
-        if abs(self.seconds[nearest] - seconds) < 1e-6:
-            return self.Ts[nearest]
-        if len(near) < 2 or self.seconds[after] - self.seconds[after - 1] > _LONGEST_GAP_S:
-            return self.Ts[nearest] if abs(self.seconds[nearest] - seconds) <= _NEAREST_S else None
-        between, T = self.seconds[after - 1 : after + 1], np.eye(4)
+        near = self._neighbours(seconds)
+        if len(near) < 2:
+            return self.Ts[near[0]] if near else None
+        between, T = self.seconds[near], np.eye(4)
         share = (seconds - between[0]) / (between[1] - between[0])
-        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(self.Ts[after - 1 : after + 1, :3, :3]))(share).as_matrix()
-        T[:3, 3] = (1.0 - share) * self.Ts[after - 1, :3, 3] + share * self.Ts[after, :3, 3]
+        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(self.Ts[near, :3, :3]))(share).as_matrix()
+        T[:3, 3] = (1.0 - share) * self.Ts[near[0], :3, 3] + share * self.Ts[near[1], :3, 3]
         return T
 
 
@@ -150,9 +195,10 @@ def poses_of(trajectory: Trajectory, frames: Sequence[Frame | DroppedFrame], whe
     found = trajectory.find_poses(frames)
     if not found and any(isinstance(each, Frame) for each in frames):
         first = sanitize_text(next(each.name for each in frames if isinstance(each, Frame)), 100)
+        known = [*trajectory.by_camera, *trajectory.by_name]
         has = (
-            f"photographs such as {sanitize_text(min(trajectory.by_name), 100)}"
-            if trajectory.by_name
+            f"photographs such as {sanitize_text(min(known), 100)}"
+            if known
             else (f"the times {trajectory.seconds[0]:.3f} to {trajectory.seconds[-1]:.3f} s")
         )
         raise PosesFileError(
@@ -195,7 +241,9 @@ def _read(path: Path, data: bytes) -> Trajectory:
         content = record_in(data, _Transforms)
         _check_count(len(content.frames))
         matrices = np.array([each.transform_matrix for each in content.frames], np.float64).reshape(-1, 4, 4)
-        return _make_named_trajectory([each.file_path for each in content.frames], matrices @ _OPENGL)
+        told = any(each.sigma_m is not None or each.sigma_deg is not None for each in content.frames)
+        sigmas = np.array([(each.sigma_m, each.sigma_deg) for each in content.frames], np.float64) if told else None
+        return _make_named_trajectory([each.file_path for each in content.frames], matrices @ _OPENGL, sigmas)
     if path.suffix == ".bin":
         return _parse_colmap(binary_images(data))
     text = data.decode()
@@ -213,18 +261,30 @@ def create_trajectory(poses: Iterable[tuple[str, Array]]) -> Trajectory:
     return _make_named_trajectory(names, np.stack(matrices) if matrices else np.zeros((0, 4, 4)))
 
 
-def _make_named_trajectory(paths: Sequence[str], Ts: Array) -> Trajectory:
-    """As `named`; Ts (M, 4, 4)."""
-    names = [PurePosixPath(path).name for path in paths]
+def _make_named_trajectory(
+    paths: Sequence[str], Ts: Array, sigmas: Sequence[Sequence[float]] | Array | None = None
+) -> Trajectory:
+    """As `create_trajectory`; Ts (M, 4, 4), sigmas (M, 2), NaN where a pose tells none."""
+    names = [path if "/" not in path and path != "." else PurePosixPath(path).name for path in paths]
     if not names:
         raise ValueError("it holds no poses")
-    by_name: dict[str, Array] = {}
-    for name, T in zip(names, Ts, strict=True):
-        if name in by_name:
-            raise ValueError(f"there are two poses of {sanitize_text(name, 100)}")
-        by_name[name] = T
+    by_name: dict[str, int] = {}  # places of the poses
+    by_camera: dict[str, int] = {}
+    shared = {name for name, count in Counter(names).items() if count > 1}  # by cameras, each in its folder
+    for place, (path, name) in enumerate(zip(paths, names, strict=True)):
+        folder = path.rstrip("/").rpartition("/")[0].rpartition("/")[2]
+        of_camera = "" if folder in ("", ".", "..") else f"{folder}/{name}"
+        if (name in shared and not of_camera) or of_camera in by_camera:
+            raise ValueError(f"there are two poses of {sanitize_text(of_camera or name, 100)}")
+        if of_camera:
+            by_camera[of_camera] = place
+        if name not in shared:
+            by_name[name] = place
     _check(names, Ts)
-    return Trajectory(by_name)
+    told = None if sigmas is None else _check_sigmas(names, sigmas)
+    known = {} if told is None else {key: told[at] for key, at in (by_name | by_camera).items() if told[at, 0] > 0}
+    poses = ({key: Ts[place] for key, place in places.items()} for places in (by_name, by_camera))
+    return Trajectory(next(poses), by_camera=next(poses), sigmas_by_name=known)
 
 
 def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
@@ -238,27 +298,42 @@ def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
 
 
 def _parse_tum(text: str) -> Trajectory:
-    names, numbers = [], array("d")
+    names, numbers, told = [], array("d"), array("d")
     for line in each_line(text):
         if line.strip() and not line.lstrip().startswith("#"):
-            name, *motion = line.split(maxsplit=8)
-            if len(motion) != 7:
-                raise ValueError("each line must have eight values")
-            x, y, z, qx, qy, qz, qw = map(float, motion)
+            name, *motion = line.split(maxsplit=10)
+            if len(motion) not in (7, 9):
+                raise ValueError("each line must have eight values, or ten with the sigmas in metres and degrees")
+            x, y, z, qx, qy, qz, qw, *sigmas = map(float, motion)
             _add(names, name)
             numbers.extend((x, y, z, qw, qx, qy, qz))
+            told.extend(sigmas or _UNTOLD)
     if not names:
         raise ValueError("each line must have eight values, and there must be one")
-    Ts = _motions(numbers)
+    Ts, by_line = _motions(numbers), np.array(told, np.float64).reshape(-1, 2)
     try:
         seconds = np.array([float(name) for name in names])
     except ValueError:  # names of photographs in place of times
-        return _make_named_trajectory(names, Ts)
+        return _make_named_trajectory(names, Ts, by_line)
     _check(names, Ts)
     if not np.isfinite(seconds).all():
         raise ValueError("times must be finite")
     order = np.argsort(seconds, kind="stable")
-    return Trajectory(seconds=seconds[order], Ts=Ts[order])
+    return Trajectory(seconds=seconds[order], Ts=Ts[order], sigmas=np.nan_to_num(_check_sigmas(names, by_line)[order]))
+
+
+def _check_sigmas(names: Sequence[str], sigmas: Sequence[Sequence[float]] | Array) -> Array:
+    """(M, 2) metres and degrees; NaN where a pose tells none. Raises ValueError where some are no sigmas."""
+    told = np.asarray(sigmas, np.float64).reshape(-1, 2)
+    untold = np.isnan(told).all(1)
+    usable = (told > 0).all(1) & (told[:, 0] <= LARGEST_M) & (told[:, 1] <= _LARGEST_DEG)
+    for index in np.flatnonzero(~(untold | usable)):
+        got = " and ".join("nothing" if math.isnan(value) else f"{value:g}" for value in told[index])
+        raise ValueError(
+            f"the sigmas of the pose of {sanitize_text(names[int(index)], 100)} must be metres and degrees above 0, "
+            f"up to {LARGEST_M:g} and {_LARGEST_DEG:g}; got {got}"
+        )
+    return told
 
 
 def _add(names: list[str], name: str) -> None:

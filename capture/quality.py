@@ -13,6 +13,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
+
 Image = npt.NDArray[np.uint8]  # (H, W, 3) RGB
 Plane = npt.NDArray  # (H, W) grey levels, uint8, or sums of at most BOX of them, uint16
 
@@ -32,12 +34,16 @@ THUMBNAIL_RATIO = 3.0  # of the largest image's longer side over a thumbnail's: 
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    blur_px: float = 8.0  # widest edges of a usable frame, pixels at 640; sharp photographs of smooth objects reach 7
-    relative_blur: float = 3.0  # a frame is unusable when its edges are so many times as wide as the sharpest frame's
-    exposed: float = 0.03  # least share of pixels that are neither black nor white; dark backgrounds are common
-    contrast: float = 3.0  # least standard deviation, grey levels; noise leaves up to 2, real photographs have 20
+    # Widest edges of a usable frame, pixels at 640; sharp photographs of smooth objects reach 7
+    max_blur_px: float = 8.0
+    # A frame is unusable when its edges are so many times as wide as the sharpest frame's
+    relative_blur: Internal[float] = 3.0
+    # Least share of pixels that are neither black nor white; dark backgrounds are common
+    min_exposed_share: float = 0.03
+    # Least standard deviation, grey levels; noise leaves up to 2, real photographs have 20
+    contrast: Internal[float] = 3.0
     # A frame is a copy when it differs by less from another; 0.05 is half a pixel of motion, at 640 pixels
-    novelty: float = 0.05
+    min_novelty: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -137,15 +143,15 @@ def novelty(image: Image, other: Image) -> float:
 def why_unusable(quality: Quality, limits: Limits, sharpest_px: float | None = None) -> str | None:
     """Why a frame should be left out; None where it is usable. `sharpest_px`: the least blur of its stream so far."""
     exposed = 1 - quality.dark - quality.bright
-    if exposed < limits.exposed:
+    if exposed < limits.min_exposed_share:
         what, share = ("under", quality.dark) if quality.dark > quality.bright else ("over", quality.bright)
         return f"{what}exposed: {share:.0%} of its pixels show nothing"
     if quality.contrast < limits.contrast:
         return f"blank: its contrast is {quality.contrast:.1f} grey levels, at least {limits.contrast} are needed"
     if quality.blur_px is None:
         return "blank or out of focus: it has no edges"
-    if quality.blur_px > limits.blur_px:
-        return f"blurred: its edges are {quality.blur_px:.1f} px wide, at most {limits.blur_px} are allowed"
+    if quality.blur_px > limits.max_blur_px:
+        return f"blurred: its edges are {quality.blur_px:.1f} px wide, at most {limits.max_blur_px} are allowed"
     if sharpest_px is not None and quality.blur_px > limits.relative_blur * max(sharpest_px, 1):
         return f"blurred: its edges are {quality.blur_px:.1f} px wide, those of the sharpest {sharpest_px:.1f}"
     return None
@@ -165,8 +171,10 @@ def why_too_small(size: tuple[int, int], largest: int) -> str | None:
 
 def why_redundant(measured: float, limits: Limits) -> str | None:
     """Why a frame of this `measured` novelty adds nothing to the frame it was compared with; None for a new view."""
-    if measured < limits.novelty:
-        return f"duplicate: it differs from an earlier one by {measured:.3f}, a new view by at least {limits.novelty}"
+    if measured < limits.min_novelty:
+        return (
+            f"duplicate: it differs from an earlier one by {measured:.3f}, a new view by at least {limits.min_novelty}"
+        )
     return None
 
 

@@ -15,6 +15,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, KeepAlive
+from splatnode.capture.process.config_keys import Internal
 
 log = logging.getLogger(__name__)
 
@@ -26,11 +27,11 @@ Seconds = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    silence_s: Seconds = 5.0  # so long without a frame, a live camera counts as lost
-    first_pause_s: Seconds = 1.0  # before it is opened again; doubled at each failure
-    longest_pause_s: Seconds = 15.0  # to which that pause grows
+    frame_timeout_s: Seconds = 5.0  # so long without a frame, a live camera counts as lost
+    first_pause_s: Internal[Seconds] = 1.0  # before it is opened again; doubled at each failure
+    longest_pause_s: Internal[Seconds] = 15.0  # to which that pause grows
     # After so long without a frame the process ends with 69, and the service manager decides
-    give_up_s: Seconds = 300.0
+    reconnect_timeout_s: Seconds = 300.0
 
 
 class ReaderState(Enum):
@@ -78,7 +79,7 @@ class Reader:
 
     @property
     def state(self) -> ReaderState:
-        if self._state is ReaderState.STREAMING and self._live and self.silent_s > self.config.silence_s:
+        if self._state is ReaderState.STREAMING and self._live and self.silent_s > self.config.frame_timeout_s:
             return ReaderState.DEGRADED
         if self._state is ReaderState.FINISHED and not self._items.empty():
             return ReaderState.STREAMING
@@ -96,7 +97,7 @@ class Reader:
             item = self._items.get(timeout=timeout_s)
         if isinstance(item, Failure):
             raise item.error
-        if not isinstance(item, Frame) and self._live and self.silent_s > self.config.give_up_s:
+        if not isinstance(item, Frame) and self._live and self.silent_s > self.config.reconnect_timeout_s:
             useless = "" if item is None else f" that can be used; the last: {item.reason}"
             raise CameraUnavailable(f"no frame for {self.silent_s:.0f} s{useless}")
         return item
@@ -131,7 +132,7 @@ class Reader:
                 return
             except CameraUnavailable as error:
                 lost_at = lost_at or time.monotonic()
-                if not was_there or time.monotonic() - lost_at > self.config.give_up_s:
+                if not was_there or time.monotonic() - lost_at > self.config.reconnect_timeout_s:
                     raise
                 self._state, self.why = ReaderState.DEGRADED, str(error)
                 log.warning("camera lost: %s; opening it again in %.0f s", error, pause)

@@ -72,22 +72,23 @@ class FrameSet:
     stamp: Stamp  # the earliest of them
 
 
+def are_taken_together(first: Stamp, later: Stamp, tolerance_s: float) -> bool:
+    """Whether an image may be of the frame set whose earliest image is `first`: times of two clocks never are."""
+    return first.clock is later.clock and 0 <= later.ns - first.ns <= tolerance_s * 1e9
+
+
 def form_frame_sets(frames: Iterable[tuple[str, str, Stamp]], tolerance_s: float = TOLERANCE_S) -> Sequence[FrameSet]:
     """Groups frames, given by name, camera id and time, into those that were taken together; in order of time.
 
     Every frame with a camera id is in exactly one set, if need be alone. All of a set are within `tolerance_s` of its
     earliest. Times of different clocks are never together.
     """
-    sets: list[tuple[dict[str, str], dict[str, Stamp]]] = []
+    sets: list[tuple[dict[str, str], Stamp]] = []
     for name, camera_id, stamp in sorted(frames, key=lambda each: (each[2].clock.value, each[2].ns, each[1], each[0])):
         if not camera_id:
             continue
-        if sets:
-            names, stamps = sets[-1]
-            first = min(stamps.values(), key=lambda each: each.ns)
-            together = first.clock is stamp.clock and stamp.ns - first.ns <= tolerance_s * 1e9
-            if together and camera_id not in names:
-                names[camera_id], stamps[camera_id] = name, stamp
-                continue
-        sets.append(({camera_id: name}, {camera_id: stamp}))
-    return [FrameSet(MappingProxyType(names), min(stamps.values(), key=lambda each: each.ns)) for names, stamps in sets]
+        if sets and camera_id not in sets[-1][0] and are_taken_together(sets[-1][1], stamp, tolerance_s):
+            sets[-1][0][camera_id] = name
+        else:
+            sets.append(({camera_id: name}, stamp))
+    return [FrameSet(MappingProxyType(names), first) for names, first in sets]

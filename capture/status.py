@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +17,7 @@ from splatnode.capture.messaging.network import (
     RECON_STATUS,
     Network,
     Service,
+    find_captures,
 )
 from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, NoAnswer, Subscriber, ask
 from splatnode.capture.messaging.spool import QuarantinedKeyframe
@@ -70,24 +72,39 @@ class _Listener(Subscriber):
 
 
 def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, Any] | None]:
-    """The next heartbeat of each process by its room's name; None for one that is silent. Raises NotAllowed."""
-    with _Listener(CAPTURE_STATUS, network) as capture, _Listener(RECON_STATUS, network) as recon:
+    """The next heartbeat of each process by its room's name; None for one that is silent. Raises NotAllowed.
+
+    A capture beside others is `capture@left`, by its camera id.
+    """
+    with contextlib.ExitStack() as listening:
+        services = {_name_capture(each): CAPTURE_STATUS.select_capture(each) for each in find_captures(network) or [""]}
+        services["recon"] = RECON_STATUS
+        listeners = {room: listening.enter_context(_Listener(each, network)) for room, each in services.items()}
+        found: dict[str, dict[str, Any] | None] = dict.fromkeys(listeners)
         deadline = time.monotonic() + wait_s
-        found: dict[str, dict[str, Any] | None] = {"capture": None, "recon": None}
         while time.monotonic() < deadline and None in found.values():
-            for room, subscriber in (("capture", capture), ("recon", recon)):
+            for room, subscriber in listeners.items():
                 if found[room] is None and (message := subscriber.latest(POLL_S)) is not None:
                     found[room] = message.header
         return found
 
 
+def _name_capture(camera_id: str) -> str:
+    return f"capture@{camera_id}" if camera_id else "capture"
+
+
+def parse_camera_id(room: str) -> str:
+    """The camera id of a capture beside others, by its name in what `heartbeats` returns; empty where it has none."""
+    return room.partition("@")[2]
+
+
 def mark_problems_seen(network: Network, rooms: list[str]) -> dict[str, str]:
     """Tells these processes that their problems have been seen; what they answered. Raises NotAllowed."""
-    services = {"capture": CAPTURE_CONTROL, "recon": RECON_CONTROL}
     answers = {}
     for room in rooms:
+        service = RECON_CONTROL if room == "recon" else CAPTURE_CONTROL.select_capture(parse_camera_id(room))
         try:
-            answers[room] = ask(services[room], network, MarkProblemsSeen(), Answer, ANSWER_S).message
+            answers[room] = ask(service, network, MarkProblemsSeen(), Answer, ANSWER_S).message
         except (NoAnswer, WireError) as error:
             answers[room] = str(error)
     return answers

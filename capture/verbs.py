@@ -25,6 +25,13 @@ def _camera_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _capture_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--camera-id", metavar="ID", help="of this capture, where several run beside one recon (camera_id)"
+    )
+    _camera_arguments(parser)
+
+
 def _config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write", type=Path, metavar="DIR", help="write them into this folder, which must be new or empty"
@@ -61,12 +68,12 @@ def _marker_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
-    parser.add_argument("--seen", action="store_true", help="the problems that are told need not be told again")
+    parser.add_argument("--acknowledge", action="store_true", help="the problems that are told need not be told again")
     add_json(parser)
 
 
 VERBS = (
-    Verb("capture", "run the camera's process", _camera_arguments, import_lazily("splatnode.capture.cli", "capture")),
+    Verb("capture", "run the camera's process", _capture_arguments, import_lazily("splatnode.capture.cli", "capture")),
     Verb(
         "record",
         "write what a camera sees into a folder",
@@ -80,9 +87,11 @@ VERBS = (
         import_lazily("splatnode.capture.cli", "config"),
     ),
     CALIBRATE,
-    Verb("find", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")),
     Verb(
-        "keys",
+        "list-cameras", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")
+    ),
+    Verb(
+        "keygen",
         "make this machine's keys; say who may connect",
         _keys_arguments,
         import_lazily("splatnode.capture.cli", "keys"),

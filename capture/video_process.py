@@ -6,7 +6,6 @@ what it does with a crafted stream is its own affair: here it can end without th
 
 from __future__ import annotations
 
-import contextlib
 import os
 import struct
 import subprocess
@@ -66,9 +65,7 @@ def decode_video(file: Path, every: int, max_pixels: int, span: Span = Span()) -
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
     command = python.command("splatnode.capture.video_process", os.fsdecode(file.absolute()), *map(str, numbers))
-    child = apart.start_process(command, subprocess.DEVNULL)
-    with child, contextlib.ExitStack() as cleanup:
-        cleanup.callback(child.kill)
+    with apart.start_process(command, subprocess.DEVNULL) as child:
         assert child.stdout is not None
         has_ended = yield from _receive_frames(child.stdout, max_pixels)
         if child.wait() != 0 or not has_ended:

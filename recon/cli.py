@@ -12,16 +12,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import msgspec
 from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.keyframe_selection import THINNED
 from splatnode.capture.lens_file import Lenses, read_lenses
-from splatnode.capture.pose_files import poses_of, read_poses
+from splatnode.capture.pose_files import Trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
-from splatnode.capture.rig_file import read_rig
 from splatnode.recon import cost
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.evaluate import methods
@@ -40,19 +38,20 @@ from splatnode.recon.evaluate.report import Bench, explain_missing_seconds, merg
 from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, format_run, run_bench
 from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric.arguments import collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, run, set_preview_interval
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
-from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_paths
+from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_sources
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.result import LIVE_PICTURE
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.report import bound_result_bytes, write_result_folder
 from splatnode.recon.result.snapshot import Snapshot, describe_moving
 from splatnode.recon.result.submap_index import FILE, is_map_set
+from splatnode.recon.rig_choice import apply_rig
 from splatnode.recon.viewer_process import Show, viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -64,13 +63,14 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
-    path, listed = parse_paths(args.source)
-    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args))
-    _check_apart(args.out, path)
+    path, listed, cameras = parse_sources(args.source, args.cameras, config.frame_set_tolerance_s)
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args), cameras)
+    for source in [path] if cameras is None else [path, *(camera.path for camera in cameras.cameras)]:
+        _check_apart(args.out, source)
     if not args.map and is_map_set(args.out):
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
-    if args.map and args.only_seen:
-        raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
+    if args.map and args.multi_view_only:
+        raise ValueError("--multi-view-only is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, request, config)
     with show_progress(quiet=args.json) as tell:
@@ -85,17 +85,23 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
     if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
         say(taken, error=True)
+    given, config = apply_rig(given, config, args.rig, tell)
     check_baseline(config, given)
-    known = _load_scale_evidence(args, given)
-    if known.poses is not None and trusts_poses(args):
-        given = add_poses(given, known.poses, config.metric.poses_sigma_m, config.metric.poses_sigma_deg)
+    trajectory = None if args.poses is None else read_poses(args.poses)
+    known = _load_scale_evidence(args, given, trajectory)
+    own = {} if trajectory is None else trajectory.find_sigmas(given.frames)
+    if known.poses is not None and trusts_poses(args, told=bool(own)):
+        given = add_poses(given, known.poses, args.poses_sigma, own)
         known = replace(known, poses=None)  # they are the photographs' own now
+        config = apply_changes(config, {"registration": {"trust_poses": True, **collect_drift_changes(args)}})
+    elif args.poses_drift is not None:
+        raise ValueError("--poses-drift is of poses that hold the cameras: give --poses FILE and --poses-sigma, too")
     needed_bytes = bound_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with hold_result_folder(args.out, needed_bytes), _viewer(args) as show:
         config = set_preview_interval(config, LOOK_EVERY) if args.view else config
         preset_name = args.preset or "balanced"
         made = reconstruct_source(
-            given, config, preset_name, without_guesses=args.only_seen, given=known, show=show, tell=tell
+            given, config, preset_name, without_guesses=args.multi_view_only, given=known, show=show, tell=tell
         )
         del given  # and with it photographs that lie in a folder
         tell(ProgressStep("writing the results"))
@@ -209,8 +215,8 @@ def _run_bench(args: argparse.Namespace) -> Bench:
     scoring = Scoring(
         make_rasterizer(on),
         partial(load_networks, args.weights_dir and args.weights_dir.absolute()),
-        replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
-        args.by_region,
+        replace(INTERPOLATED_START if args.interpolate_start else Settings(), best_gain=args.color_correct),
+        args.score_regions,
     )
     with opened(args.cores, args.ray) as engine:
         return run_bench(
@@ -224,9 +230,9 @@ def _run_bench(args: argparse.Namespace) -> Bench:
         )
 
 
-def _load_scale_evidence(args: argparse.Namespace, given: Source) -> Evidence:
+def _load_scale_evidence(args: argparse.Namespace, given: Source, trajectory: Trajectory | None) -> Evidence:
     """Loads the scale evidence that the options name. Raises ValueError where it fits none of the images."""
-    poses = None if args.poses is None else poses_of(read_poses(args.poses), given.frames, str(args.poses))
+    poses = None if trajectory is None else poses_of(trajectory, given.frames, str(args.poses))
     pairs = () if args.stereo is None else make_pairs(given.frames, stream_right_images(args.stereo, given.frames))
     return Evidence(poses=poses, pairs=pairs)
 
@@ -244,10 +250,6 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
     if args.prior is not None and args.prior != config.prior.kind:
         config = apply_changes(config, {"prior": {"kind": args.prior}})
     config = apply_changes(config, {"metric": collect_metric_changes(args)})
-    if trusts_poses(args):
-        config = apply_changes(config, {"registration": {"trust_poses": True}})
-    if getattr(args, "rig", None) is not None:
-        config = apply_changes(config, {"registration": {"rig": msgspec.to_builtins(read_rig(args.rig))}})
     flags = {
         "size": args.size,
         "device": args.device,
@@ -255,8 +257,11 @@ def _config(args: argparse.Namespace) -> ReconstructionConfig:
         "budget_s": args.budget_s,
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
-        "quick": args.quick or None,
-        "decision": None if args.require is None else {"require_percent": args.require},
+        "frame_set_tolerance_s": args.frame_set_tolerance,
+        "no_fallbacks": args.no_fallbacks or None,
+        "decision": None
+        if args.max_position_error is None
+        else {"max_position_error_percent": args.max_position_error},
     }
     return apply_changes(config, {key: value for key, value in flags.items() if value is not None})
 
@@ -279,5 +284,8 @@ def _print_summary(snapshot: Snapshot, out: Path) -> None:
             say(f"lengths: {snapshot.scale.sentence}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
-        say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
+        say(
+            f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches "
+            "(--no-fallbacks leaves them out)"
+        )
     say(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

@@ -8,7 +8,10 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from splatnode.capture.process.config import Plugin, merge_config, parse_config
+from splatnode.capture.process.config import Plugin, build_config, merge_config, replace_former_names
+from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.rig import TOLERANCE_S
+from splatnode.recon import former_names
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.metric import measurement as metric
@@ -37,10 +40,10 @@ class PriorChoice(Plugin):
 PREVIEW = training.RefinementConfig(
     iterations=20,
     half_resolution_share=1.0,
-    dssim=0.2,
+    ssim_lambda=0.2,
     first_opacity=None,
     dropout=ensemble.DropoutConfig(share=0.0),
-    rates=training.CAUTIOUS,
+    lr=training.CAUTIOUS,
     control=None,
 )
 
@@ -48,43 +51,48 @@ PREVIEW = training.RefinementConfig(
 class FallbackConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fallbacks, tried before images are rejected or left out for want of matches."""
 
-    # Within which further work begins; what has begun is finished. A second of one core that does nothing else is about
-    # 1, but it is counted by what is done, not by a clock: the same photographs get the same work on any machine
-    work: Annotated[float, Meta(ge=0)] = 4.0
-    # Nothing further begins after so long, by the clock, for who cannot wait. None: no clock decides; in a node it is 4
-    most_s: Annotated[float, Meta(ge=0)] | None = None
+    # Work up to which a further fallback begins; what has begun is finished. A second of one idle core is about 1, but
+    # it is counted by what is done, not by a clock: the same images get the same work on any machine
+    budget: Annotated[float, Meta(ge=0)] = 4.0
+    # Time after which no further fallback begins, by the clock. None: no clock decides; in a node it is 4
+    timeout_s: Annotated[float, Meta(ge=0)] | None = None
 
 
 class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    former_keys = former_names.KEYS
+
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     # Of the generators of random numbers: the same seed and photographs give the same scene
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     device: Device = "cpu"  # that Gaussians are refined on; cuda was run by us on NVIDIA H200s alone
-    quick: bool = False  # the first answer stands, also where it is no: nothing that takes longer is tried
+    no_fallbacks: bool = False  # reject at once: try no fallback first
     # What gives depth, and matches that plain features miss
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.ScreeningConfig = screening.ScreeningConfig()
     matching: matching.MatchingConfig = matching.MatchingConfig()
     registration: registration.RegistrationConfig = registration.RegistrationConfig()
-    verification: evidence.VerificationConfig = evidence.VerificationConfig()
+    verification: Internal[evidence.VerificationConfig] = evidence.VerificationConfig()
     decision: decision.DecisionConfig = decision.DecisionConfig()
-    ladder: FallbackConfig = FallbackConfig()
-    light: exposure.ExposureConfig = exposure.ExposureConfig()
-    denied: transients.TransientMaskConfig = transients.TransientMaskConfig()
-    completion: scene_background.DepthCompletionConfig = scene_background.DepthCompletionConfig()
-    seeding: initialization.GaussianInitializationConfig = initialization.GaussianInitializationConfig()
+    fallbacks: FallbackConfig = FallbackConfig()
+    exposure_compensation: exposure.ExposureConfig = exposure.ExposureConfig()
+    transient_mask: transients.TransientMaskConfig = transients.TransientMaskConfig()
+    completion: Internal[scene_background.DepthCompletionConfig] = scene_background.DepthCompletionConfig()
+    initialization: initialization.GaussianInitializationConfig = initialization.GaussianInitializationConfig()
     background: scene_background.BackgroundConfig = scene_background.BackgroundConfig()
-    # In place of completion, seeding and background: a Gaussian a pixel, for comparison
-    pixelwise: initialization.PixelwiseConfig | None = None
-    preview: training.RefinementConfig = PREVIEW  # the refinement after each keyframe
+    # In place of completion, initialization and background: a Gaussian a pixel, for comparison
+    pixelwise: Internal[initialization.PixelwiseConfig | None] = None
+    preview: Internal[training.RefinementConfig] = PREVIEW  # the refinement after each keyframe
     optimize: training.RefinementConfig = training.RefinementConfig()  # the refinement after the last keyframe
     metric: metric.MetricConfig = metric.MetricConfig()  # the scale in metres of what is published
+    # Images of several cameras were taken together, as a frame set, where their times are no further apart; seconds
+    frame_set_tolerance_s: Annotated[float, Meta(gt=0, le=10)] = TOLERANCE_S
     # From how much depth that other views confirm a scene counts as seen, also away from the cameras
-    consistent_depth: npz_files.ConsistentDepthConfig = npz_files.ConsistentDepthConfig()
+    consistent_depth: Internal[npz_files.ConsistentDepthConfig] = npz_files.ConsistentDepthConfig()
     # At most so many in the scene; None: as many as it calls for
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets
-    surplus: float = 2.0  # with such a limit a scene begins with this many times as many; its control leaves the best
+    # With such a limit a scene begins with this many times as many; its control leaves the best
+    surplus: Internal[float] = 2.0
     # For all, from the first photograph on; None: as long as it takes. The daemon has no such limit
     budget_s: Annotated[float, Meta(gt=0)] | None = None
 
@@ -102,11 +110,11 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
         return most if most is None or self.optimize.control is None else round(self.surplus * most)
 
     @property
-    def initialisation(self) -> initialization.SceneInitializationConfig:
+    def scene_initialization(self) -> initialization.SceneInitializationConfig:
         """Returns the configuration of the initial Gaussians of a scene."""
         most = self.first_gaussians
         return initialization.SceneInitializationConfig(
-            self.completion, self.seeding, self.background, self.pixelwise, most
+            self.completion, self.initialization, self.background, self.pixelwise, most
         )
 
 
@@ -118,7 +126,7 @@ PRESETS: dict[str, ReconstructionConfig] = {
     "balanced": ReconstructionConfig(),
     # Two scenes and one that agrees with both. For texture: two thirds more Gaussians, and LPIPS where its weights are
     "quality": ReconstructionConfig(
-        seeding=initialization.GaussianInitializationConfig(max_error=0.0009),
+        initialization=initialization.GaussianInitializationConfig(max_error=0.0009),
         optimize=training.RefinementConfig(
             checkpoints=(150, 500),
             ensemble=ensemble.EnsembleConfig(members=2),
@@ -145,7 +153,8 @@ def apply_changes(config: ReconstructionConfig, changes: Mapping[str, Any]) -> R
     kind, prior = tree["prior"]["kind"], changes.get("prior")
     if isinstance(prior, Mapping) and prior.get("kind", kind) != kind:
         tree["prior"] = {}
-    return parse_config(merge_config(tree, changes), ReconstructionConfig)
+    present = replace_former_names(changes, ReconstructionConfig, tree)
+    return build_config(merge_config(tree, present), ReconstructionConfig)
 
 
 def _flatten_plugins(tree: Any) -> Any:

@@ -54,6 +54,7 @@ class ReconstructionSummary:
     bounds: Mapping[str, Bounds]  # of the errors of each camera, by the name of its keyframe
     evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
     captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
+    camera_ids: Mapping[str, str] = field(default_factory=dict)  # by keyframe, of several cameras
     landmarks: Landmarks | None = None  # of a scene that is to be saved
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
     moving: Mapping[str, float] = field(default_factory=dict)  # share that was found to move, by keyframe
@@ -119,7 +120,8 @@ class Reconstruction:
         stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
         known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
         masked, moving = self._hidden
-        told = self.verdict, self.bounds, self.evidence_record, known
+        ids = {each.name: each.frame.camera_id for each in self.graph.keyframes if each.frame.camera_id}
+        told = self.verdict, self.bounds, self.evidence_record, known, ids
         return ReconstructionSummary(*told, masked=masked, moving=moving, given=self.prior_world, rig=self.rig)
 
     @property
@@ -184,7 +186,7 @@ def _estimate_from_images(
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
         return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
-    registration = register(graph.keyframes, graph.pairs, config.registration, pause)
+    registration = register(graph.keyframes, graph.pairs, config.registration, pause, config.frame_set_tolerance_s)
     pause()
     seen = None if registration is None else registration.image_part
     evidence = verify(graph, seen, config.verification, pause)

@@ -316,7 +316,9 @@ class IncrementalReconstruction:
             return False
         graph, placed = beside.graph, beside.registration
         pointmaps = carried | apply_image_masks(self._prior.further_pointmaps(graph, placed, carried), graph)
-        grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation, self.config.light)
+        grown = growth.grow(
+            moved, pointmaps, graph, placed, self.config.scene_initialization, self.config.exposure_compensation
+        )
         self._known = replace(self._known, pointmaps=pointmaps, show=prepare_scene_for_display(grown, self.config))
         self.clock.lap("points")
         return True

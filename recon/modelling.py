@@ -11,6 +11,7 @@ import torch
 
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.masks import fill_masked
+from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.budget import BudgetHit
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
@@ -24,7 +25,7 @@ from splatnode.recon.priors.pointmap import Pointmap, compute_consistent_depths
 from splatnode.recon.rasterize.dispatch import choose_device
 from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.npz_files import append_consistent_depth
-from splatnode.recon.result.snapshot import GaussianArrays, InGivenWorld, OnRig, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, InGivenWorld, OnRig, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import exposure as scene_exposure
 from splatnode.recon.scene import growth, transients
@@ -80,7 +81,7 @@ def create_initial_scene(
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     told = compute_exposure_priors(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
     exposures, headroom = scene_exposure.apply_headroom(
-        images, scene_exposure.estimate_exposures(pointmaps, images, config.light, told)
+        images, scene_exposure.estimate_exposures(pointmaps, images, config.exposure_compensation, told)
     )
     images = scene_exposure.compensate_images(images, exposures)
     seen_through = _find_transient_masks(pointmaps, images, masks, config) if all_at_hand else {}
@@ -88,7 +89,7 @@ def create_initial_scene(
         free, own = ~hidden, masks[name]
         masks[name] = free if own is None else free & own
         images[name] = fill_masked(images[name], free)
-    scene = initialize_scene(pointmaps, images, config.initialisation, masks, exposures, lenses)
+    scene = initialize_scene(pointmaps, images, config.scene_initialization, masks, exposures, lenses)
     shares = {name: float(hidden.mean()) for name, hidden in seen_through.items()}
     views = tuple(replace(view, moved=shares.get(view.name, 0.0)) for view in scene.views)
     return replace(scene, views=views, headroom=headroom)
@@ -101,7 +102,7 @@ def _find_transient_masks(
     config: ReconstructionConfig,
 ) -> dict[str, Mask]:
     """For each photograph that shows what others see through: the mask (h, w), True there, that no other mask hides."""
-    if not config.denied.enabled:
+    if not config.transient_mask.enabled:
         return {}
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     used = []
@@ -172,7 +173,7 @@ def snapshot(
     made = Snapshot(
         sequence=sequence,
         verdict=verdict,
-        cameras=scene.cameras(conclusion.bounds, conclusion.captured_at) if scene else (),
+        cameras=_publish_cameras(scene, conclusion, config.frame_set_tolerance_s) if scene else (),
         gaussians=scene.arrays() if scene else GaussianArrays.empty(),
         images=scene.images() if scene else {},
         dropped=tuple(dropped),
@@ -192,6 +193,17 @@ def snapshot(
         falloffs=_falloffs(scene) if scene else {},
     )
     return replace(made, verdict=append_consistent_depth(verdict, made.consistent_depth, config.consistent_depth))
+
+
+def _publish_cameras(scene: Scene, conclusion: ReconstructionSummary, tolerance_s: float) -> tuple[CameraEstimate, ...]:
+    """The cameras of a scene; of several cameras each with its id, and the number of the frame set that it is of."""
+    cameras, ids = scene.cameras(conclusion.bounds, conclusion.captured_at), conclusion.camera_ids
+    if not ids:
+        return cameras
+    timed = [(each.name, ids.get(each.name, ""), each.captured_at) for each in cameras if each.captured_at]
+    sets = form_frame_sets(timed, tolerance_s)
+    numbers = {name: number for number, each in enumerate(sets) for name in each.names.values()}
+    return tuple(replace(each, camera_id=ids.get(each.name, ""), frame_set=numbers.get(each.name)) for each in cameras)
 
 
 def _find_given_world(conclusion: ReconstructionSummary) -> InGivenWorld | None:

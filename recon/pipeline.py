@@ -16,6 +16,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.lenses.undistort import is_resampled
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import threads
@@ -255,10 +256,18 @@ def reconstruct_source(
     with threads.apply_thread_limit(most_threads):
         evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
         snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)
+    snapshot = _add_given_lenses(snapshot, source.frames)
     if without_guesses:
         snapshot = remove_unconfirmed(snapshot)
     kept = source if source.photographs is None else replace(source, frames=())
     return OfflineResult(snapshot, kept, config.seed, preset_name)
+
+
+def _add_given_lenses(snapshot: Snapshot, frames: Iterable[Frame | DroppedFrame]) -> Snapshot:
+    """The snapshot with the lens that was given for each camera, where its photograph was resampled by it."""
+    given = {each.name: each.intrinsics for each in frames if isinstance(each, Frame) and is_resampled(each)}
+    cameras = tuple(replace(camera, given_lens=given.get(camera.name)) for camera in snapshot.cameras)
+    return replace(snapshot, cameras=cameras)
 
 
 def run(

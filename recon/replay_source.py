@@ -1,6 +1,7 @@
 """What is reconstructed offline: a folder of photographs, some of its photographs, a recording, a film, or frames.
 
 A film is a video, an image topic of an MCAP file, or an episode of a LeRobot data set, by the name that `film` knows.
+Of several cameras there is a folder or a film each; what they took together is used, or left out, as one.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -19,14 +22,17 @@ from splatnode.capture import film
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose
+from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose, group_frame_sets
 from splatnode.capture.lens_file import Lenses, describe_image
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, mask_frames, open_masks
+from splatnode.capture.multi_camera import ALL as EVERY_CAMERA
+from splatnode.capture.multi_camera import CameraSet, select_cameras
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_name
 from splatnode.capture.quality import Limits
+from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +42,7 @@ MOST = 60  # keyframes of a video, or of a folder of more photographs
 EVERY = 300  # frames of a video, where all that are sharp and no copies are asked for
 IMAGES = "images"  # in the result folder: the keyframes of a video
 
-_OF_PHOTOGRAPHS = Config(per_second=1e9, patience_s=0.0)  # which were not taken at any rate
+_OF_PHOTOGRAPHS = Config(max_fps=1e9, patience_s=0.0)  # which were not taken at any rate
 
 
 @dataclass(frozen=True)
@@ -50,6 +56,22 @@ class Request:
     every_frame: bool = False  # all that are sharp and no copies
     masks: Path | None = None  # a folder of masks, or one for all; None: photographs are used whole
     lenses: Lenses | None = None  # in place of what EXIF tells
+    cameras: CameraSet | None = None  # that `source` has, or is the first of; None: it is one camera's
+
+    @property
+    def is_film(self) -> bool:
+        return film.is_film(self.source) if self.cameras is None else self.cameras.is_film
+
+    @property
+    def tolerance_s(self) -> float:
+        return TOLERANCE_S if self.cameras is None else self.cameras.tolerance_s
+
+    @property
+    def photographs(self) -> Path | None:
+        """The folder in which frames lie by their names; None: they lie in none."""
+        if self.is_film:
+            return None
+        return self.source if self.cameras is None else self.cameras.folder
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +81,7 @@ class Source:
     frames: tuple[Frame | DroppedFrame, ...]
     photographs: Path | None  # the folder that they lie in; None: they lie in none, as a film's
     choice: Choice | None  # None: all that were asked for are used
+    cameras: CameraSet | None = None  # whose they are; None: they are one camera's, or no source tells
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -73,44 +96,55 @@ class Source:
     def files(self) -> dict[str, bytes]:
         """The frames as files of the result folder, by their names in it; none where they lie in a folder already."""
         frames = () if self.photographs else self.frames
-        return {f"{IMAGES}/{each.name}": encode_png(each.image) for each in frames if isinstance(each, Frame)}
+        return {f"{IMAGES}/{each.name}": _encode_image(each) for each in frames if isinstance(each, Frame)}
+
+
+def _encode_image(frame: Frame) -> bytes:
+    """The file of a frame that has no place of its own: as it came where its name says so, else PNG."""
+    return encode_png(frame.image) if frame.encoded is None or not frame.camera_id else frame.encoded
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayRecording:
     """All keyframes of a recording, which are read again when they are needed."""
 
-    path: Path
-    listed: tuple[str, ...]  # the photographs of the folder that were named; none: all
+    request: Request
     choice: Choice
-    masks: Path | None = None
-    lenses: Lenses | None = None
 
     @property
-    def is_film(self) -> bool:
-        return film.is_film(self.path)
+    def path(self) -> Path:
+        return self.request.source
+
+    @property
+    def photographs(self) -> Path | None:
+        """The folder in which the keyframes lie; None: they lie in none, as a film's."""
+        return self.request.photographs
 
     def identity(self, config: Reconstruction) -> str:
         """32 hexadecimal digits that tell it, reconstructed in this way, from others.
 
         Of a folder the names count: it may hold the results, too, which change when it was last written.
         """
-        written_ns = film.file_and_part(self.path)[0].stat().st_mtime_ns if self.is_film else 0
+        request, cameras = self.request, self.request.cameras
+        written_ns = film.file_and_part(self.path)[0].stat().st_mtime_ns if request.is_film else 0
         known = [str(self.path.resolve()), written_ns, self.choice.names, config]
-        if self.masks is not None:
-            known.append(str(self.masks.resolve()))
-        if self.lenses is not None:
-            known.append(self.lenses)
+        if request.masks is not None:
+            known.append(str(request.masks.resolve()))
+        if request.lenses is not None:
+            known.append(request.lenses)
+        if cameras is not None:
+            known += [[each.camera_id, str(each.path.resolve())] for each in cameras.cameras]
+            known.append(cameras.tolerance_s)
         return hashlib.sha256(msgspec.json.encode(known)).hexdigest()[:32]
 
     def frames(self) -> Iterator[Frame | DroppedFrame]:
         """The keyframes in their order, and what the recording could not give."""
-        names = set(self.choice.names)
-        streamed = _stream(self.path, self.listed)
+        names, masks = set(self.choice.names), self.request.masks
+        streamed = _stream(self.request)
         chosen = (each for each in streamed if isinstance(each, DroppedFrame) or each.name in names)
-        if self.lenses is not None:
-            chosen = map(self.lenses.apply, chosen)
-        return chosen if self.masks is None else mask_frames(chosen, open_masks(self.masks))
+        if self.request.lenses is not None:
+            chosen = map(self.request.lenses.apply, chosen)
+        return chosen if masks is None else mask_frames(chosen, open_masks(masks))
 
 
 def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
@@ -131,31 +165,71 @@ def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
     return first.parent, tuple(folder.frame_name(path) for path in paths)
 
 
+def parse_sources(
+    paths: Sequence[Path], cameras: Sequence[str] | None = None, tolerance_s: float = TOLERANCE_S
+) -> tuple[Path, tuple[str, ...], CameraSet | None]:
+    """As `parse_paths`, and the cameras: those called `cameras`, or one of each of several folders or films.
+
+    Raises as `parse_paths` and `select_cameras`.
+    """
+    several = len(paths) > 1 and all(path.is_dir() or _is_film(path) for path in paths)
+    if cameras or several:
+        return paths[0], (), select_cameras(paths, cameras or (EVERY_CAMERA,), tolerance_s)
+    return *parse_paths(paths), None
+
+
+def _is_film(path: Path) -> bool:
+    """Whether this is a film, and no photograph, which is a file, too."""
+    _, part = film.file_and_part(path)
+    return bool(part) or (path.is_file() and path.suffix.lower() not in folder.SUFFIXES | folder.FOREIGN_SUFFIXES)
+
+
 def select_frames(
-    frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = ignore_progress
+    frames: Sequence[Frame],
+    views: int | None = None,
+    every_frame: bool = False,
+    tell: Tell = ignore_progress,
+    tolerance_s: float = TOLERANCE_S,
 ) -> Source:
-    """Photographs that lie in no folder, or what is used of them: as of a folder's.
+    """Photographs that lie in no folder, or what is used of them: as of a folder's. Of several cameras by frame sets.
 
     Raises ValueError as `load_source`.
     """
+    if any(frame.camera_id and frame.captured_at for frame in frames):
+        frames = _sort_by_sets(frames, tolerance_s)
+        if views:
+            _check_enough(views, len(frames))
+            sets = [each for each in group_frame_sets(frames, tolerance_s) if isinstance(each, tuple)]
+            return Source(_select_sets(sets, views), None, None)
     if views:
         return Source(tuple(frames[i] for i in _select_evenly(views, len(frames))), None, None)
     if every_frame or len(frames) <= ALL:
         return Source(tuple(frames), None, None)
     looked_through = report_items(frames, tell, "choosing keyframes", len(frames), "photograph")
-    choice = choose(looked_through, _OF_PHOTOGRAPHS, Limits(), MOST, "photograph")
+    choice = choose(looked_through, _OF_PHOTOGRAPHS, Limits(), MOST, "photograph", tolerance_s)
     return Source((*choice.keyframes, *choice.dropped), None, choice)
+
+
+def _sort_by_sets(frames: Sequence[Frame], tolerance_s: float) -> list[Frame]:
+    """The frames in the order of their frame sets, then those that are in none."""
+    by_name = {frame.name: frame for frame in frames}
+    timed = [(frame.name, frame.camera_id, frame.captured_at) for frame in frames if frame.captured_at is not None]
+    names = [name for each in form_frame_sets(timed, tolerance_s) for name in each.names.values()]
+    alone = [frame.name for frame in frames if frame.name not in set(names)]
+    ordered = [by_name[name] for name in (*names, *alone)]
+    stamps = sorted(frame.stamp_ns for frame in frames)
+    return [replace(frame, frame_id=i, stamp_ns=ns) for i, (frame, ns) in enumerate(zip(ordered, stamps, strict=True))]
 
 
 def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayRecording:
     """As `load_source`, without a limit to the number of keyframes."""
-    _check_there(request.source)
-    images: set[tuple[str, str, int, int]] = set()
+    _check_there(request)
+    images: set[tuple[str, str, str, int, int]] = set()
     looked_through = _record_sizes(_stream_candidates(request, tell), images)
-    choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request))
+    choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request), request.tolerance_s)
     if request.lenses is not None:
         request.lenses.check(images)
-    return ReplayRecording(request.source, request.listed, choice, request.masks, request.lenses)
+    return ReplayRecording(request, choice)
 
 
 def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
@@ -163,8 +237,8 @@ def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
 
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
-    _check_there(request.source)
-    found = _load_unmasked(request, tell)
+    _check_there(request)
+    found = replace(_load_unmasked(request, tell), cameras=request.cameras)
     if request.lenses is not None:
         found = apply_lenses(found, request.lenses)
     return found if request.masks is None else apply_masks(found, open_masks(request.masks), tell)
@@ -176,14 +250,28 @@ def apply_lenses(given: Source, lenses: Lenses) -> Source:
     return replace(given, frames=tuple(map(lenses.apply, given.frames)))
 
 
-def add_poses(given: Source, poses: Mapping[str, Array], sigma_m: float, sigma_deg: float) -> Source:
-    """The frames, each with its pose of `poses` (4, 4), metres, by their names, and its sigmas. Raises ValueError."""
+def add_poses(
+    given: Source,
+    poses: Mapping[str, Array],
+    sigmas: tuple[float, float] | None,
+    own: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> Source:
+    """The frames, each with its pose of `poses` (4, 4), metres, by their names, and its sigmas, metres and degrees.
+
+    `sigmas` are of those poses that have none of their `own`. Raises ValueError where neither tells a pose's.
+    """
 
     def add_pose(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
         if not isinstance(frame, Frame) or frame.name not in poses:
             return frame
+        told = own.get(frame.name, sigmas)
+        if told is None:
+            raise ValueError(
+                f"some poses tell how unsure they are, and that of {sanitize_name(frame.name)} does not: tell it for "
+                "each, or give --poses-sigma (poses_sigma) for those that do not"
+            )
         try:
-            return replace(frame, given_pose=make_given_pose(poses[frame.name], sigma_m, sigma_deg))
+            return replace(frame, given_pose=make_given_pose(poses[frame.name], *told))
         except ValueError as error:
             raise ValueError(f"{sanitize_name(frame.name)}: {error}") from error
 
@@ -196,19 +284,22 @@ def apply_masks(given: Source, find: Find, tell: Tell = ignore_progress) -> Sour
 
 
 def _load_unmasked(request: Request, tell: Tell) -> Source:
-    if film.is_film(request.source):
+    if request.is_film:
         if request.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
-        return _select_keyframes(request, None, tell)
+        return _select_keyframes(request, tell)
     names, there = _names(request), _list_photographs(request)
     if names or request.every_frame or len(_skip_raw_files(there)) <= ALL:
-        frames = folder.stream(folder.Config(folder=request.source, names=names or request.listed))
         of = len(names or there)
-        return Source(tuple(report_items(frames, tell, "reading", of, "photograph")), request.source, None)
-    return _select_keyframes(request, request.source, tell)
+        frames = report_items(_stream(request, names), tell, "reading", of, "photograph")
+        return Source(tuple(frames), request.photographs, None)
+    return _select_keyframes(request, tell)
 
 
-def _check_there(path: Path) -> None:
+def _check_there(request: Request) -> None:
+    path = request.source
+    if request.cameras is not None:  # they were found
+        return
     if not path.exists() and re.match(r"[a-z]+:/+", str(path)):
         raise ValueError(f"{str(path)!r} is an address; nothing is fetched: download it first and give the file")
     if not path.exists() and not film.is_film(path):
@@ -219,12 +310,15 @@ def _check_there(path: Path) -> None:
         first = data_set.list_parts(path)[0]
         raise ValueError(
             f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
-            f"{str(film.part_of(path, first))!r}, or give it to `splatnode batch`, which takes them all"
+            f"{str(film.part_of(path, first))!r}, or an episode with --cameras all, or give it to `splatnode batch`, "
+            "which takes them all"
         )
 
 
 def _list_photographs(request: Request) -> Sequence[str]:
-    """The names of the photographs that there are to choose from."""
+    """The names of the photographs that there are to choose from; of several cameras by frame sets, in their order."""
+    if request.cameras is not None:
+        return [name for each in request.cameras.form_frame_sets() for name in each.names.values()]
     return request.listed or folder.names_in(request.source)
 
 
@@ -233,21 +327,23 @@ def _skip_raw_files(names: Sequence[str]) -> Sequence[str]:
     return [name for name in names if folder.explain_unreadable_file(Path(name)) is None] or names
 
 
-def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFrame]:
-    if film.is_film(path):
-        return film.stream(path)
-    return folder.stream(folder.Config(folder=path, names=listed))
+def _stream(request: Request, names: tuple[str, ...] = ()) -> Iterator[Frame | DroppedFrame]:
+    if request.cameras is not None:
+        return request.cameras.stream(names)
+    if request.is_film:
+        return film.stream(request.source)
+    return folder.stream(folder.Config(folder=request.source, names=names or request.listed))
 
 
 def _stream_candidates(request: Request, tell: Tell) -> Iterator[Frame | DroppedFrame]:
     """All that there is to choose from; how many frames a video has is known at its end."""
-    of = 0 if film.is_film(request.source) else len(_list_photographs(request))
+    of = 0 if request.is_film else len(_list_photographs(request))
     doing = f"choosing keyframes of {sanitize_name(request.source.name)}"
-    return report_items(_stream(request.source, request.listed), tell, doing, of, _unit_name(request))
+    return report_items(_stream(request), tell, doing, of, _unit_name(request))
 
 
 def _record_sizes(
-    frames: Iterator[Frame | DroppedFrame], images: set[tuple[str, str, int, int]]
+    frames: Iterator[Frame | DroppedFrame], images: set[tuple[str, str, str, int, int]]
 ) -> Iterator[Frame | DroppedFrame]:
     """The frames, whose names, cameras and sizes are added to `images` as they pass."""
     for each in frames:
@@ -258,18 +354,19 @@ def _record_sizes(
 
 def _unit_name(request: Request) -> str:
     """One of those that keyframes are chosen of."""
-    return "frame" if film.is_film(request.source) else "photograph"
+    return "frame" if request.is_film else "photograph"
 
 
 def _selection(request: Request) -> Config:
-    config = Config() if film.is_film(request.source) else _OF_PHOTOGRAPHS
+    config = Config() if request.is_film else _OF_PHOTOGRAPHS
     return msgspec.structs.replace(config, every_frame=request.every_frame)
 
 
-def _select_keyframes(request: Request, photographs: Path | None, tell: Tell) -> Source:
+def _select_keyframes(request: Request, tell: Tell) -> Source:
     """The keyframes of a recording; with --views N so many, evenly spread: thinning leaves half of the most."""
     most = EVERY if request.every_frame else max(MOST, 2 * (request.views or 0))
-    choice = choose(_stream_candidates(request, tell), _selection(request), Limits(), most, _unit_name(request))
+    candidates, unit = _stream_candidates(request, tell), _unit_name(request)
+    choice = choose(candidates, _selection(request), Limits(), most, unit, request.tolerance_s)
     frames = choice.keyframes
     if request.every_frame and THINNED in choice.left_out:
         raise ValueError(
@@ -279,8 +376,20 @@ def _select_keyframes(request: Request, photographs: Path | None, tell: Tell) ->
     if request.views:
         if request.views > len(frames):
             raise ValueError(f"{request.views} views are asked for: {choice}; ask for at most as many")
-        frames = tuple(frames[i] for i in _space_evenly(len(frames), request.views))
-    return Source((*frames, *choice.dropped), photographs, choice)
+        sets = [each for each in group_frame_sets(frames, request.tolerance_s) if isinstance(each, tuple)]
+        frames = _select_sets(sets, request.views)
+    return Source((*frames, *choice.dropped), request.photographs, choice)
+
+
+_Each = TypeVar("_Each")
+
+
+def _select_sets(sets: Sequence[Sequence[_Each]], views: int) -> tuple[_Each, ...]:
+    """The images of frame sets that are evenly spread, whole, and at most `views` together; one set at least."""
+    count = len(sets)
+    while count > 1 and sum(len(sets[i]) for i in _space_evenly(len(sets), count)) > views:
+        count -= 1
+    return tuple(each for i in _space_evenly(len(sets), count) for each in sets[i])
 
 
 def _names(request: Request) -> tuple[str, ...]:
@@ -291,15 +400,23 @@ def _names(request: Request) -> tuple[str, ...]:
         return request.frames
     if not request.views:
         return ()
+    if request.cameras is not None:
+        sets = [tuple(each.names.values()) for each in request.cameras.form_frame_sets()]
+        _check_enough(request.views, sum(map(len, sets)))
+        return _select_sets(sets, request.views)
     names = _skip_raw_files(_list_photographs(request))
     return tuple(names[i] for i in _select_evenly(request.views, len(names)))
 
 
 def _select_evenly(views: int, count: int) -> list[int]:
     """So many of `count` photographs. Raises ValueError where there are fewer."""
+    _check_enough(views, count)
+    return _space_evenly(count, views)
+
+
+def _check_enough(views: int, count: int) -> None:
     if views > count:
         raise ValueError(f"{views} views are asked for: there are {count} photographs; ask for at most as many")
-    return _space_evenly(count, views)
 
 
 def _space_evenly(count: int, wanted: int) -> list[int]:

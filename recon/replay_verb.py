@@ -32,7 +32,22 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or "
         "seconds of one (film.mp4#t=10,20.5), or an image topic of an MCAP file (drive.mcap#/front/image), or an "
         "episode of a LeRobot data set (pusht#3/CAMERA), or what `splatnode record` wrote; of a film, and of more than "
-        "30 photographs, keyframes are chosen as a live camera's are",
+        "30 photographs, keyframes are chosen as a live camera's are; several folders, or several films, are those of "
+        "several cameras",
+    )
+    parser.add_argument(
+        "--cameras",
+        type=names,
+        metavar="A,B,C",
+        help="the cameras of one robot that SOURCE has, or all: the folders in a folder, the image topics of an MCAP "
+        "file, the cameras of an episode (pusht#3); of several sources, their names. They get one scene, and each its "
+        "own lens",
+    )
+    parser.add_argument(
+        "--frame-set-tolerance",
+        type=seconds,
+        metavar="S",
+        help="seconds between images of several cameras that were taken together (default: 0.02)",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     add_reconstruction_options(parser)
@@ -42,7 +57,6 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     _add_masks(parser)
     parser.add_argument(
         "--intrinsics",
-        "--calibration",
         type=Path,
         metavar="FILE",
         help="the lens of all photographs, or one of each image or camera: YAML as a camera's configuration has it, a "
@@ -84,12 +98,12 @@ def add_reconstruction_options(parser: argparse.ArgumentParser) -> tuple[argpars
             "photographs and writing files come on top, and cameras and first points take what they take",
         ),
         add(
-            "--quick",
+            "--no-fallbacks",
             action="store_true",
             help="refuse at once: try nothing that takes longer before the answer is no",
         ),
         add(
-            "--require",
+            "--max-position-error",
             type=percent,
             metavar="PERCENT",
             help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% "

@@ -15,7 +15,7 @@ def add_device(parser: argparse.ArgumentParser) -> argparse.Action:
 
 def add_multi_view_only(parser: argparse.ArgumentParser) -> argparse.Action:
     return parser.add_argument(
-        "--only-seen",
+        "--multi-view-only",
         action="store_true",
         help="leave out what no two photographs confirm, and the far background: holes in place of guesses",
     )

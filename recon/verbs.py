@@ -52,7 +52,7 @@ def _recon_arguments(parser: argparse.ArgumentParser) -> None:
     add_marker(parser)
 
 
-def _retract_arguments(parser: argparse.ArgumentParser) -> None:
+def _remove_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", metavar="NAME", help="of the keyframe, as the viewer and the report show it")
     parser.add_argument("--config", type=Path, metavar="CONFIG", help="of the daemon; default: the one on this machine")
 
@@ -105,8 +105,6 @@ def _add_lens(parser: argparse.ArgumentParser) -> None:
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument(
         "--intrinsics",
-        "--calibration",
-        dest="calibration",
         type=Path,
         metavar="FILE",
         help="their lens: YAML with width, height, fx, ..., COLMAP's cameras.txt, or Kalibr's camchain",
@@ -114,7 +112,7 @@ def _add_lens(parser: argparse.ArgumentParser) -> None:
     lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
 
 
-def _map_arguments(parser: argparse.ArgumentParser) -> None:
+def _occupancy_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("result", type=Path, metavar="RESULT", help="the folder that replay wrote, with depth.npz")
     parser.add_argument("--out", type=Path, metavar="DIR", help="default: RESULT/occupancy")
     parser.add_argument("--voxel", type=length, metavar="SIZE", help="default: a 64th of the median depth")
@@ -166,9 +164,9 @@ VERBS = (
         import_lazily("splatnode.recon.auditing.command", "audit"),
     ),
     Verb(
-        "map",
+        "occupancy",
         "tell which space of a scene is free, occupied, or not seen",
-        _map_arguments,
+        _occupancy_arguments,
         import_lazily("splatnode.recon.occupancy.command", "map_result"),
     ),
     Verb(
@@ -179,14 +177,14 @@ VERBS = (
     ),
     Verb(
         "recon",
-        "reconstruct what comes, for ever",
+        "run the mapping node: keyframes in, scenes out",
         _recon_arguments,
         import_lazily("splatnode.recon.daemon.node", "recon"),
     ),
     Verb(
-        "retract",
-        "take a keyframe back",
-        _retract_arguments,
+        "remove-keyframe",
+        "take a keyframe out of the scene of a running node",
+        _remove_arguments,
         import_lazily("splatnode.recon.daemon.node", "remove_keyframe"),
     ),
     BENCH,

@@ -35,7 +35,7 @@ def viewer(pictures: Path, command: Sequence[str] | None = None) -> Iterator[Sho
         config = Path(folder, "node.yaml")
         config.write_text(json.dumps({"network": {"directory": folder}}))  # YAML, whatever the folder's name is
         with _SnapshotServer(Network(directory=Path(folder))) as stage:
-            child = subprocess.Popen([*begin, str(config), "--until-final", "--out", str(pictures)])
+            child = subprocess.Popen([*begin, str(config), "--exit-when-final", "--out", str(pictures)])
             try:
                 yield stage.show
                 child.wait()

@@ -10,6 +10,7 @@ TYPE_CHECKING = False  # to a type checker it is true; `typing` would take time
 if TYPE_CHECKING:
     from splatnode.api.live_map import NodeMap
     from splatnode.api.node import Node, NodeUpdate, connect
+    from splatnode.api.publisher import Published, Publisher, RefusedImage
     from splatnode.api.reconstruct import Marker, Stereo, reconstruct
     from splatnode.api.result import Camera, Result, View, load
     from splatnode.api.session import Session, Update
@@ -28,6 +29,9 @@ __all__ = [
     "NodeUpdate",
     "NotLocated",
     "OccupancyMap",
+    "Published",
+    "Publisher",
+    "RefusedImage",
     "Result",
     "Session",
     "Stereo",
@@ -49,6 +53,9 @@ _MODULES = {
     "NodeUpdate": "splatnode.api.node",
     "NotLocated": "splatnode.recon.locating.outcome",
     "OccupancyMap": "splatnode.recon.occupancy.grid",
+    "Published": "splatnode.api.publisher",
+    "Publisher": "splatnode.api.publisher",
+    "RefusedImage": "splatnode.api.publisher",
     "Result": "splatnode.api.result",
     "Session": "splatnode.api.session",
     "Stereo": "splatnode.api.reconstruct",

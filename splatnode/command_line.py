@@ -10,7 +10,9 @@ SIGTERM is a clean stop with 0; the second one ends the process at once.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
+import faulthandler
 import logging
 import os
 import signal
@@ -23,10 +25,16 @@ from typing import NoReturn
 import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
+from splatnode.capture import former_names as capture_names
+from splatnode.capture.process.arguments import replace_former_words
+from splatnode.capture.process.files import default_runtime_directory
+from splatnode.capture.process.library_lines import keep_last_words, tell_last_words
 from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
-from splatnode.capture.process.terminal import is_output_closed, sanitize_output
+from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output, say
 from splatnode.capture.process.text import sanitize_lines, sanitize_text
+from splatnode.recon import former_names as recon_names
+from splatnode.viewer import former_names as viewer_names
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -39,6 +47,9 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
+# Hidden aliases: no help lists them
+FORMER_VERBS = recon_names.VERBS | capture_names.VERBS
+FORMER_FLAGS = recon_names.FLAGS | viewer_names.FLAGS | capture_names.FLAGS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -49,12 +60,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     parser = build_parser()
-    args = parser.parse_args(argv)
+    words, told = replace_former_words(sys.argv[1:] if argv is None else argv, FORMER_VERBS, FORMER_FLAGS)
+    for sentence in told:
+        say(f"splatnode: {sentence}", error=True)
+    args = parser.parse_args(words)
     if args.verb is None:
         parser.print_help(sys.stderr)
         return 2
     use_plain_lines()
-    logging.getLogger("splatnode").setLevel(logging.INFO)
+    logging.getLogger("splatnode").setLevel(logging.DEBUG if args.debug else logging.INFO)
+    _prepare_for_crash()
     stopping = threading.Event()
 
     def stop() -> None:
@@ -78,6 +93,15 @@ def _run(argv: Sequence[str] | None) -> int:
         return code
 
 
+def _prepare_for_crash() -> None:
+    """A crash in a library shows on standard error where it was, and what is said before it can be found afterwards."""
+    if not faulthandler.is_enabled():  # whoever has enabled it knows where it is to be told
+        with contextlib.suppress(OSError, ValueError, AttributeError, RuntimeError):  # there is no such descriptor
+            faulthandler.enable(beneath(sys.stderr))
+    tell_last_words(default_runtime_directory())
+    keep_last_words(default_runtime_directory())
+
+
 class _Parser(argparse.ArgumentParser):
     """One whose complaints repeat an argument as text that only shows."""
 
@@ -96,7 +120,9 @@ def build_parser() -> argparse.ArgumentParser:
     for verb in VERBS:
         subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
         verb.add_arguments(subparser)
-        subparser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        subparser.add_argument(
+            "--debug", action="store_true", help="show the traceback of an error, and all that is logged"
+        )
         subparser.set_defaults(verb=verb.name, run=verb.run)
     return parser
 

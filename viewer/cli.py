@@ -61,7 +61,7 @@ def view(args: argparse.Namespace) -> int:
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
     with show_progress() as tell:
-        say(write_movie(_moment(finished), args.export, width, height, args.pictures, of=args.what, tell=tell))
+        say(write_movie(_moment(finished), args.export, width, height, args.num_frames, of=args.what, tell=tell))
     return EXIT_GOOD
 
 
@@ -99,12 +99,12 @@ def _write_pictures(args: argparse.Namespace, finished: Moment | Maps | None, ne
     folder = _folder(args, finished)
     if finished is not None:
         with show_progress() as tell:
-            say(write_series(_moment(finished), folder, width, height, args.pictures, of=args.what, tell=tell))
+            say(write_series(_moment(finished), folder, width, height, args.num_frames, of=args.what, tell=tell))
         return EXIT_GOOD
     source = _source(finished, network)
     _lower_priority()
     with contextlib.closing(source):
-        update_picture(source, folder, width, height, until_final=args.until_final, say=say)
+        update_picture(source, folder, width, height, until_final=args.exit_when_final, say=say)
     return EXIT_GOOD
 
 
@@ -132,16 +132,14 @@ def _check_web(args: argparse.Namespace) -> None:
 
 def _load_finished_source(args: argparse.Namespace) -> Moment | Maps | None:
     """The result, or the folder of many, that is named; None where it is a running node."""
-    if args.photographs is not None and not args.photographs.is_dir():
-        raise FileNotFoundError(
-            f"--photographs must be the folder of a result's photographs; {args.photographs} is none"
-        )
+    if args.images is not None and not args.images.is_dir():
+        raise FileNotFoundError(f"--images must be the folder of a result's photographs; {args.images} is none")
     if args.what is None or _is_configuration(args.what):
         return None
     if is_map_set(args.what):
-        folder = args.photographs or args.what / "images"
+        folder = args.images or args.what / "images"
         return Maps(args.what, lambda cameras: load_images(cameras, [folder]), args.max_gaussians or BUDGET)
-    return load_result(args.what, args.photographs)
+    return load_result(args.what, args.images)
 
 
 def _moment(finished: Moment | Maps) -> Moment:

@@ -102,6 +102,14 @@ def source_colour(index: int) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
+def camera_colours(cameras: Sequence[CameraEstimate]) -> list[tuple[float, float, float]]:
+    """RGB of each camera: of several ones by their ids, in the order of these; of one camera each view has its own."""
+    ids = sorted({camera.camera_id for camera in cameras})
+    if ids in ([], [""]):
+        return [source_colour(index) for index in range(len(cameras))]
+    return [source_colour(ids.index(camera.camera_id)) for camera in cameras]
+
+
 def mean_camera_centre(cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.float64]:
     """(3,) the mean of the cameras' centres; the origin without any."""
     return np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0) if cameras else np.zeros(3)

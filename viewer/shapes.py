@@ -12,7 +12,7 @@ import numpy.typing as npt
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Scale
 from splatnode.viewer.analysis import Advice
-from splatnode.viewer.colours import source_colour
+from splatnode.viewer.colours import camera_colours
 from splatnode.viewer.state import Graph, Moment, ViewerState, edge_lines, node_marks
 from splatnode.viewer.viewpoint import Canvas, Viewpoint, look_at, scene_depth, scene_pivot, scene_spread, scene_up
 
@@ -92,20 +92,24 @@ def shapes(
         for index, camera in enumerate(snapshot.cameras)
         if eye is None or np.linalg.norm(camera.T_world_camera[:3, 3] - eye) > _AT_THE_EYE * depth
     ]
-    lines, photographs, labels = [], [], []
+    lines, photographs, labels, colours = [], [], [], camera_colours(snapshot.cameras)
     if state.path and len(snapshot.cameras) > 1:
         lines.append(Lines(path(snapshot.cameras), PATH_COLOUR, 1))
     if state.cameras:
         for index, camera in others:
             corners = image_corners(camera, camera.T_world_camera, depth)
-            lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
+            lines.append(Lines(frustum(camera.T_world_camera, corners), colours[index], 2))
             if state.photographs and camera.name in moment.photographs:
                 photographs.append(ImageQuad(camera.name, corners, moment.photographs[camera.name]))
+    if state.given:
+        lines += [
+            Lines(draw_given_pose(camera, depth), colours[i], 1) for i, camera in others if camera.given is not None
+        ]
     if state.graph and moment.graph is not None:
         lines += _graph(moment.graph)
     if state.uncertainty:
         for index, camera, axes in _select_uncertain_cameras(snapshot.cameras, eye):
-            lines.append(Lines(ellipsoid(camera, axes), source_colour(index), 1))
+            lines.append(Lines(ellipsoid(camera, axes), colours[index], 1))
     if state.tracked and tracked is not None and not state.follow:
         corners = image_corners(tracked, tracked.T_world_camera, 1.2 * depth)
         lines.append(Lines(frustum(tracked.T_world_camera, corners), TRACKED_COLOUR, 3))
@@ -160,6 +164,15 @@ def frustum(T_world_camera: Array, corners: Array) -> Array:
     roof = np.stack([np.stack([corners[0], top]), np.stack([corners[1], top])])
     edges = np.stack([np.stack([centre, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)])
     return np.concatenate([*edges, roof])
+
+
+def draw_given_pose(camera: CameraEstimate, depth: float) -> Array:
+    """(11, 2, 3) a frustum at the pose that was given for the camera, and a line from there to where it is."""
+    if camera.given is None:
+        return np.zeros((0, 2, 3))
+    T = camera.given.T_world_camera
+    way = np.stack([T[:3, 3], camera.T_world_camera[:3, 3]])[None]
+    return np.concatenate([frustum(T, image_corners(camera, T, depth)), way])
 
 
 def ellipsoid(camera: CameraEstimate, axes: Array) -> Array:

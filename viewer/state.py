@@ -219,6 +219,7 @@ class ViewerState:
     uncertainty: bool = True
     graph: bool = True
     ground: bool = True  # with the axes and the legend
+    given: bool = True  # poses that others gave, beside the estimated ones
     which_map: int = 0  # of a folder with several
     help: bool = False
     paused: bool = False
@@ -369,6 +370,7 @@ BINDINGS = (
     Binding("7", "show or hide where the cameras may be, with 95 %", _toggle("uncertainty")),
     Binding("8", "show or hide the graph of a map's scenes", _toggle("graph")),
     Binding("9", "show or hide the ground, the axes and the scale bar", _toggle("ground")),
+    Binding("0", "show or hide the poses that were given", _toggle("given")),
     Binding("d", "measure: the distance between two clicks", _measure),
     Binding("b", "show or hide the box to crop with", _toggle("boxed")),
     Binding("z", "undo the last crop or clean-up", _undo),

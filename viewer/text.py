@@ -55,12 +55,29 @@ def scale_lines(moment: Moment, ground: Ground | None) -> list[str]:
 
 
 def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
-    """How well `camera` is known, or where there is none, or one without bounds: how well all are at least."""
+    """How well `camera` is known, or where there is none, or one without bounds: how well all are at least.
+
+    With how far the poses that were given are from the estimated ones.
+    """
     snapshot = moment.snapshot
     if camera is not None and camera.bounds is not None:
-        return [f"{camera.name}: {format_camera_bounds(camera.bounds, snapshot.scale)}"]
+        bounds = format_camera_bounds(camera.bounds, snapshot.scale)
+        return [f"{camera.name}: {bounds}", *describe_given_poses(moment, camera)]
     known = format_widest_bounds(snapshot.cameras, snapshot.scale)
-    return [f"Cameras: {known}"] if known else []
+    return [*([f"Cameras: {known}"] if known else []), *describe_given_poses(moment)]
+
+
+def describe_given_poses(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
+    """How far the pose that was given for `camera`, or where there is none, the worst of all, is from its estimate."""
+    of = moment.snapshot.cameras if camera is None else (camera,)
+    known = [(each, residual) for each in of if (residual := each.pose_residual) is not None]
+    if not known:
+        return []
+    worst, (length, degrees) = max(known, key=lambda pair: pair[1][0])
+    off = f"{format_length(length, moment.snapshot.scale)} and {degrees:.2g} degrees"
+    if camera is not None:
+        return [f"{worst.name}: its given pose is off by {off}"]
+    return [f"Given poses: {len(known)}, at most {off} off ({worst.name})"]
 
 
 def depth_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:

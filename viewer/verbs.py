@@ -17,7 +17,7 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         help="a scene file, a result's folder, the folder of all scenes of a node, or a node's configuration (.yaml); "
         "default: the node on this machine",
     )
-    parser.add_argument("--photographs", type=Path, metavar="DIR", help="where a finished result's photographs are")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="where a finished result's photographs are")
     parser.add_argument(
         "--max-gaussians",
         type=positive,
@@ -62,8 +62,10 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")
     parser.add_argument("--size", type=size, metavar="WxH", help="of the window, or of pictures (960x720)")
-    parser.add_argument("--pictures", type=positive, default=100, metavar="N", help="of a turntable (default: 100)")
-    parser.add_argument("--until-final", action="store_true", help="without a window: stop when a scene is finished")
+    parser.add_argument("--num-frames", type=positive, default=100, metavar="N", help="of a turntable (default: 100)")
+    parser.add_argument(
+        "--exit-when-final", action="store_true", help="without a window: stop when a scene is finished"
+    )
 
 
 VERBS = (

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from splatnode.viewer.colours import source_colour
-from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, frustum_depth
+from splatnode.viewer.colours import camera_colours
+from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, draw_given_pose, frustum_depth
 from splatnode.viewer.state import Moment
 from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint, move_to_camera, overview
 
@@ -56,8 +56,8 @@ class ViserStage:
                 self._nodes["/gaussians"] = server.scene.add_gaussian_splats(
                     "/gaussians", **make_splat_arguments(snapshot.gaussians)
                 )
-            for index, camera in enumerate(snapshot.cameras):
-                self._draw_camera(index, camera, moment)
+            for camera, colour in zip(snapshot.cameras, camera_colours(snapshot.cameras), strict=True):
+                self._draw_camera(camera, colour, moment)
             for name in sorted(before.keys() - self._nodes.keys(), reverse=True):  # the others replaced their namesakes
                 before[name].remove()
             for text in self._texts:
@@ -103,17 +103,23 @@ class ViserStage:
             # A photograph right at the eye would be all that is seen: it is nearer than what is drawn.
             client.camera.near = 2.0 * self._depth if (away < self._depth).any() else _NEAR
 
-    def _draw_camera(self, index: int, camera: CameraEstimate, moment: Moment) -> None:
+    def _draw_camera(self, camera: CameraEstimate, colour: Colour, moment: Moment) -> None:
         own = sanitize_text(camera.name).replace("/", "∕")  # a stroke in a name would be a branch of the tree
         name = f"/cameras/{own}"
         photograph = moment.snapshot.images.get(camera.name)
         shown = photograph if self._switched[1] else None
-        frustum = _frustum(self.server, name, camera, self._depth, source_colour(index), shown)
+        frustum = _frustum(self.server, name, camera, self._depth, colour, shown)
         frustum.visible = self._switched[0]
         frustum.on_click(_make_click_handler(camera, moment))
         self._frusta.append((frustum, photograph))
         label = self.server.scene.add_label(f"{name}/name", sanitize_text(camera.name), font_screen_scale=0.7)
         self._nodes |= {name: frustum, f"{name}/name": label}
+        if camera.given is not None:  # no child of the frustum, which has the pose that was estimated
+            place, ends = f"/given/{own}", draw_given_pose(camera, self._depth).astype(np.float32)
+            rgb = tuple(round(255 * part) for part in colour)
+            self._nodes[place] = self.server.scene.add_line_segments(
+                place, points=ends, colors=rgb, thickness=1.0, thickness_units="screen"
+            )
 
 
 def make_splat_arguments(gaussians: GaussianArrays) -> dict[str, Any]:

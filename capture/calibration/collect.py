@@ -30,7 +30,7 @@ from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_li
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import SUFFIXES
 from splatnode.capture.lerobot.data_set import is_data_set
-from splatnode.capture.process.config import load_config, merge_config, parse_changes, parse_config
+from splatnode.capture.process.config import load_config, parse_changes, parse_layers
 from splatnode.capture.process.files import write_atomically
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.capture.reader import Reader, ReaderState
@@ -458,7 +458,7 @@ def _config(source: Path, changes: list[str]) -> CaptureConfig:
     """Loads the configuration: a folder, a recording and a film need none."""
     if source.suffix.lower() in (".yaml", ".yml"):
         return load_config(source, CaptureConfig, changes)
-    return parse_config(merge_config({"camera": _camera(source)}, parse_changes(changes)), CaptureConfig)
+    return parse_layers([{"camera": _camera(source)}, parse_changes(changes)], CaptureConfig)
 
 
 def _camera(source: Path) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from splatnode.capture.diorama.building.walk import CoarseView, Walk, compute_ov
 from splatnode.capture.diorama.render import Camera
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
+from splatnode.capture.process.config_keys import Internal
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
 BARE = 16.0  # texels a metre, where only surfaces matter: they are the same at every density, and soon made
@@ -35,14 +36,14 @@ Side = Annotated[int, msgspec.Meta(ge=16, le=4096)]
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keyframes: Count = 1000  # how many are made; the walk is as long as they need
-    width: Side = 480  # of an image, pixels
-    height: Side = 360  # of an image, pixels
+    width: Internal[Side] = 480  # of an image, pixels
+    height: Internal[Side] = 360  # of an image, pixels
     seed: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 0  # of the building and of the walk
-    noise: float = 1.0  # standard deviation of the sensor noise, grey levels
-    samples: Annotated[int, msgspec.Meta(ge=1, le=4)] = 2  # rays a pixel in each direction
+    noise: Internal[float] = 1.0  # standard deviation of the sensor noise, grey levels
+    samples: Internal[Annotated[int, msgspec.Meta(ge=1, le=4)]] = 2  # rays a pixel in each direction
     # The number of the keyframe from which on the robot is in another room; 0: it is never carried away
     kidnap_at: Annotated[int, msgspec.Meta(ge=0, le=100_000)] = 0
-    frames_per_second: FramesPerSecond = 2.0  # by the stamps
+    fps: FramesPerSecond = 2.0  # by the stamps
     pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are made
 
 
@@ -53,7 +54,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
 def _frames(config: Config) -> Iterator[Frame]:
     for index in range(config.keyframes):
-        stamp_ns = round(index / config.frames_per_second * 1e9)
+        stamp_ns = round(index / config.fps * 1e9)
         image, captured_at = render_image(config, index), Stamp(stamp_ns, Clock.RECORDING)
         yield Frame(index, frame_name(index), stamp_ns, image, intrinsics=None, captured_at=captured_at)
 

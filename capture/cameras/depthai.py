@@ -42,19 +42,19 @@ _MIN_FOCAL = 0.1  # in longer image sides; a device without calibration gives th
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    device: str = ""  # as `splatnode find` prints it: id, IP address or USB port; "": the only one
+    device: str = ""  # as `splatnode list-cameras` prints it: id, IP address or USB port; "": the only one
     width: Annotated[int, msgspec.Meta(ge=1)] = 1280  # of an image, pixels
     height: Annotated[int, msgspec.Meta(ge=1)] = 720  # of an image, pixels
-    frames_per_second: FramesPerSecond = 10.0  # that the camera is asked for
+    fps: FramesPerSecond = 10.0  # that the camera is asked for
     undistort: bool = True  # take the distortion out on the camera; otherwise it goes with the intrinsics
-    lock: bool = True  # hold exposure and white balance, once the camera has chosen them
+    lock_exposure: bool = True  # hold exposure and white balance, once the camera has chosen them
     # After the start, in which the camera chooses them; these frames are not given
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5
+    warmup_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5
     # Instead of what the camera chooses; None: it chooses
     exposure_us: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] | None = None
     iso: Annotated[int, msgspec.Meta(ge=100, le=1600)] = 400  # sensitivity, with exposure_us
     focus: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None  # position of the lens; None: as it is at the start
-    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # so long without a frame, the camera counts as lost
+    frame_timeout_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # so long without a frame, the camera counts as lost
     # The left one of the stereo cameras instead of the colour camera: the right one's picture goes with each frame, and
     # lengths are in metres by the baseline that the camera carries. Rectified on the camera; grey where the sensors are
     stereo: bool = False
@@ -103,7 +103,7 @@ def _colour(dai: ModuleType, pipeline: Any, config: Config) -> Source:
         (config.width, config.height),
         dai.ImgFrame.Type.BGR888i,
         dai.ImgResizeMode.CROP,
-        fps=config.frames_per_second,
+        fps=config.fps,
         enableUndistortion=config.undistort,
     )
     return Source(output.createOutputQueue(maxSize=2, blocking=False), (camera,), convert_frame)
@@ -118,10 +118,10 @@ def _pairs(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Sourc
     stereo.setRectification(True)
     size = (config.width, config.height)
     for camera, side in zip(cameras, (stereo.left, stereo.right), strict=True):
-        camera.requestOutput(size, resizeMode=dai.ImgResizeMode.CROP, fps=config.frames_per_second).link(side)
+        camera.requestOutput(size, resizeMode=dai.ImgResizeMode.CROP, fps=config.fps).link(side)
     stereo.rectifiedLeft.link(sync.inputs["left"])
     stereo.rectifiedRight.link(sync.inputs["right"])
-    sync.setSyncThreshold(timedelta(seconds=0.5 / config.frames_per_second))
+    sync.setSyncThreshold(timedelta(seconds=0.5 / config.fps))
     queue = sync.out.createOutputQueue(maxSize=2, blocking=False)
     return Source(queue, cameras, partial(convert_stereo_pair, baseline), lambda group: group["left"])
 
@@ -149,14 +149,14 @@ def find() -> list[dict[str, str]]:
 
 def read(dai: ModuleType, source: Source, config: Config, hold: Callable[[], None]) -> Iterator[Frame | DroppedFrame]:
     """The frames of a running pipeline's source; `hold` is called once the camera has settled."""
-    settled, held, frame_id = time.monotonic() + config.settle_s, not config.lock, 0
+    settled, held, frame_id = time.monotonic() + config.warmup_s, not config.lock_exposure, 0
     while True:
         try:
-            message = source.queue.get(timedelta(seconds=config.silence_s))
+            message = source.queue.get(timedelta(seconds=config.frame_timeout_s))
         except dai.MessageQueue.QueueException as error:
             raise CameraUnavailable(f"the camera ended its stream: {error}") from error
         if message is None:
-            raise CameraUnavailable(f"no frame for {config.silence_s:g} s; is the camera still plugged in?")
+            raise CameraUnavailable(f"no frame for {config.frame_timeout_s:g} s; is the camera still plugged in?")
         if not held and time.monotonic() < settled:
             continue
         if not held:

@@ -87,8 +87,10 @@ class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The camera's poses by odometry, a tracker or a drone's log, in metres; each photograph carries its own."""
 
     file: Path  # a TUM trajectory, nerfstudio's transforms.json, or the folder of a COLMAP model
-    sigma_m: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_M)] = POSE_SIGMA_M  # of each position, metres
-    sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = POSE_SIGMA_DEG  # of each orientation about each axis
+    # Standard deviation of each position for which the file tells none, metres
+    sigma_m: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_M)] = POSE_SIGMA_M
+    # And of each orientation about each axis, degrees
+    sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = POSE_SIGMA_DEG
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,7 +100,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intrinsics: Intrinsics | None = None
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     # By the stamps that the photographs get; those of a recording have their own
-    frames_per_second: FramesPerSecond = 10.0
+    fps: FramesPerSecond = 10.0
     pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are taken
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many times all are shown, each time under other names
     # Of a stereo camera, whose left photographs lie in `folder`: what the right one saw, by which lengths are in metres
@@ -140,9 +142,10 @@ def _load_poses(file: Path, paths: list[Path]) -> Trajectory:
     from splatnode.capture.pose_files import read_poses  # brings what interpolates
 
     poses = read_poses(file)
-    if poses.by_name and not any(poses.names(frame_name(path)) for path in paths):
+    known = [*poses.by_camera, *poses.by_name]
+    if known and not any(poses.names(frame_name(path)) for path in paths):
         raise ValueError(
-            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(poses.by_name), 100)}, and none of "
+            f"{str(file)!r} has poses of photographs such as {sanitize_text(min(known), 100)}, and none of "
             "those "
             f"here, such as {frame_name(paths[0])}; give the poses of these photographs"
         )
@@ -189,7 +192,7 @@ def _frames(
             height, width = image.shape[:2]
             if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
-            stamp_ns = round(frame_id / config.frames_per_second * 1e9)
+            stamp_ns = round(frame_id / config.fps * 1e9)
             # A file whose values are stretched is no file of this image: a recording would store it as it was.
             known = image, intrinsics, data if used is None else None, decoded.captured_at or name_time(name)
             item = make_frame(
@@ -251,7 +254,8 @@ def _attach_pose(item: Frame | DroppedFrame, poses: Trajectory | None, given: Po
     if T_world_camera is None:
         return item
     try:
-        return replace(item, given_pose=make_given_pose(T_world_camera, given.sigma_m, given.sigma_deg))
+        sigmas = poses.sigmas_of(item) or (given.sigma_m, given.sigma_deg)
+        return replace(item, given_pose=make_given_pose(T_world_camera, *sigmas))
     except ValueError as error:
         return DroppedFrame(item.name, f"its pose cannot be used: {error}")
 
@@ -329,6 +333,7 @@ def select_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
         inside = sorted(frame_name(child) for child in folder.iterdir() if child.is_dir() and image_paths(child))
         hidden = [f"{each.name}: {each.reason}" for each in _hidden_images(folder)]
         advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
+        advice += ", or all of them as the cameras of one robot with --cameras all" if len(inside) > 1 else ""
         advice = f"{hidden[0]}{f', and {len(hidden) - 1} more' if len(hidden) > 1 else ''}" if hidden else advice
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
     suffixes = sorted({path.suffix.lower() for path in paths})

@@ -41,8 +41,8 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         file=found.video,
         max_pixels=config.max_pixels,
         intrinsics=config.intrinsics,
-        from_s=found.from_s,
-        to_s=found.to_s,
+        start_s=found.from_s,
+        end_s=found.to_s,
     )
     early_s = _EARLY / found.rate if found.rate else 0.0
     return pace_frames(_frames(video.stream(part, early_s), found), config.pace)

@@ -84,7 +84,10 @@ def _select_topic(config: Config) -> Topic:
         held = f"it holds {sanitize_text(', '.join(others))}" if others else "it holds no messages of any schema"
         raise ValueError(f"{shown} must have a topic of images ({READ}); {held}")
     if not config.topic and len(there) > 1:
-        raise ValueError(f"{shown} has {len(there)} topics of images: {names}; name one, as in FILE.mcap#TOPIC")
+        raise ValueError(
+            f"{shown} has {len(there)} topics of images: {names}; name one, as in FILE.mcap#TOPIC, or "
+            "use several together with --cameras all"
+        )
     for topic in there:
         if config.topic in ("", topic.name):
             return topic

@@ -22,6 +22,7 @@ from splatnode.capture.diorama.scene import odometry, place
 from splatnode.capture.frame import Baseline, Clock, Frame, Intrinsics, RightImage, Stamp, grey
 from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.process.config_keys import Internal
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
@@ -36,11 +37,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width: Count = 640  # of an image, pixels
     height: Count = 480  # of an image, pixels
     seed: int = 0  # of the place and of the photographer's path
-    noise: float = 1.0  # standard deviation of the sensor noise, grey levels
-    samples: Count = 2  # rays a pixel in each direction
-    frames_per_second: FramesPerSecond = 2.0  # by the stamps
-    odometry: Odometry | None = None  # of the camera, which photographs then carry; nothing: they carry none
-    lens: Intrinsics | None = None  # that photographs are taken through, and carry; nothing: a pinhole's, unknown
+    noise: Internal[float] = 1.0  # standard deviation of the sensor noise, grey levels
+    samples: Internal[Count] = 2  # rays a pixel in each direction
+    fps: FramesPerSecond = 2.0  # by the stamps
+    odometry: Internal[Odometry | None] = None  # of the camera, which photographs then carry; nothing: they carry none
+    # That photographs are taken through, and carry; nothing: a pinhole's, unknown
+    lens: Internal[Intrinsics | None] = None
     # Of a stereo camera, metres: what its right half sees goes with each photograph; nothing: there is but one camera
     baseline_m: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
 
@@ -49,7 +51,7 @@ def stream(config: Config) -> Iterator[Frame]:
     """The photographs in the order of the path."""
     measured = simulate_odometry(config)
     for index, camera in enumerate(scene_cameras(config)):
-        stamp_ns = round(index / config.frames_per_second * 1e9)
+        stamp_ns = round(index / config.fps * 1e9)
         image, captured_at = render_image(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
         right = None if config.baseline_m is None else _right_image(config, camera, index, config.baseline_m)
         frame = Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at, right=right)

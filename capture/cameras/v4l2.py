@@ -27,18 +27,20 @@ _BY_ID, _BY_PATH = Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path")
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    device: str = ""  # as `splatnode find` prints it: a name that stays when ports and numbers change; "": the only one
+    device: str = (
+        ""  # as `splatnode list-cameras` prints it: a name that stays when ports and numbers change; "": the only one
+    )
     width: Annotated[int, msgspec.Meta(ge=1)] = 1280  # of an image, pixels
     height: Annotated[int, msgspec.Meta(ge=1)] = 720  # of an image, pixels
-    frames_per_second: FramesPerSecond = 30.0  # that the camera is asked for
+    fps: FramesPerSecond = 30.0  # that the camera is asked for
     # Format that the camera sends; USB 2 carries no more than 10 frames of 1280 x 720 a second as YUYV
-    pixels: Literal["MJPG", "YUYV"] = "MJPG"
-    lock: bool = True  # hold exposure, gain, white balance and focus, once the camera has chosen them
+    fourcc: Literal["MJPG", "YUYV"] = "MJPG"
+    lock_exposure: bool = True  # hold exposure, gain, white balance and focus, once the camera has chosen them
     # After the start, in which the camera chooses them; these frames are not given
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5
+    warmup_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5
     # Instead of what the camera chooses; None: it chooses
     exposure_us: Annotated[int, msgspec.Meta(ge=1)] | None = None
-    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 3.0  # so long without a frame, the camera counts as lost
+    frame_timeout_s: Annotated[float, msgspec.Meta(gt=0)] = 3.0  # so long without a frame, the camera counts as lost
     intrinsics: Intrinsics | None = None  # the lens, of a calibration at the same aspect ratio
 
 
@@ -73,21 +75,21 @@ def find(system: System | None = None) -> list[dict[str, str]]:
 def _frames(device: Device, config: Config) -> Iterator[Frame | DroppedFrame]:
     if not device.is_camera:
         raise OSError(errno.ENOTTY, "not a camera")
-    chosen = device.set_format(config.pixels, config.width, config.height)
+    chosen = device.set_format(config.fourcc, config.width, config.height)
     if chosen.pixels not in ("MJPG", "YUYV"):
         has = ", ".join(device.pixel_formats())
         raise CameraUnavailable(f"{device.path} gives {chosen.pixels}, and MJPG or YUYV is needed; it has: {has}")
     if config.intrinsics is not None:
         check_fits(config.intrinsics, [(chosen.width, chosen.height)])
-    device.set_rate(config.frames_per_second)
-    if config.lock:
+    device.set_rate(config.fps)
+    if config.lock_exposure:
         v4l2_device.run_free(device)
     device.start()
-    settled, locked, frame_id = time.monotonic() + config.settle_s, not config.lock, 0
+    settled, locked, frame_id = time.monotonic() + config.warmup_s, not config.lock_exposure, 0
     while True:
-        raw = device.read(config.silence_s)
+        raw = device.read(config.frame_timeout_s)
         if raw is None:
-            raise CameraUnavailable(f"{device.path} gave no frame for {config.silence_s:g} s")
+            raise CameraUnavailable(f"{device.path} gave no frame for {config.frame_timeout_s:g} s")
         if not locked and time.monotonic() < settled:
             continue
         if not locked:
@@ -145,7 +147,7 @@ def _explain(error: OSError, path: str, system: System | None) -> str:
 
 def _describe_cameras(found: list[dict[str, str]]) -> str:
     if not found:
-        return "none is connected. Plug one in, then: splatnode find"
+        return "none is connected. Plug one in, then: splatnode list-cameras"
     return "found: " + "; ".join(f"{camera['device']} {camera['description']}" for camera in found)
 
 

@@ -24,9 +24,9 @@ _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes b
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     file: Path  # the video
-    every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame is taken
-    from_s: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # where it begins, in seconds from the first frame
-    to_s: Annotated[float, msgspec.Meta(gt=0, le=1e9)] | None = None  # where it ends, likewise; None: with the video
+    stride: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame is taken
+    start_s: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # where it begins, in seconds from the first frame
+    end_s: Annotated[float, msgspec.Meta(gt=0, le=1e9)] | None = None  # where it ends, likewise; None: with the video
     max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame, at most; the decoder's memory is bounded accordingly
     pace: Pace = "fastest"  # recorded: at the pace of the video; fastest: as fast as frames are taken
     # The lens, of frames as they are shown: upright, of square pixels, at the same aspect ratio
@@ -36,7 +36,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def stream(config: Config, early_s: float = 0.0) -> Iterator[Frame | DroppedFrame]:
     """The frames at their times in the video; those that cannot be decoded are left out, and counted at the end.
 
-    A frame that is at most `early_s` before `from_s` or `to_s` counts as at it, for whoever knows these roughly.
+    A frame that is at most `early_s` before `start_s` or `end_s` counts as at it, for whoever knows these roughly.
     Raises FileNotFoundError, or ValueError where the file is no video that can be decoded, or the lens cannot be of
     its images. What goes wrong after a frame is named as a dropped frame, and ends the stream.
     """
@@ -47,10 +47,10 @@ def stream(config: Config, early_s: float = 0.0) -> Iterator[Frame | DroppedFram
 
 def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
-    from_ns = max(0, round((config.from_s - early_s) * 1e9))
-    span = Span(from_ns, None if config.to_s is None else max(0, round((config.to_s - early_s) * 1e9)))
+    from_ns = max(0, round((config.start_s - early_s) * 1e9))
+    span = Span(from_ns, None if config.end_s is None else max(0, round((config.end_s - early_s) * 1e9)))
     try:
-        for found in decode_video(config.file, config.every, config.max_pixels, span):
+        for found in decode_video(config.file, config.stride, config.max_pixels, span):
             if frame_id == 0:
                 _begin(found, config)
             yield _frame(found, frame_id, config)
@@ -65,9 +65,9 @@ def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
 
 
 def _describe_range(config: Config) -> str:
-    if config.to_s is not None:
-        return f" between {config.from_s:g} and {config.to_s:g} s"
-    return f" from {config.from_s:g} s on" if config.from_s else ""
+    if config.end_s is not None:
+        return f" between {config.start_s:g} and {config.end_s:g} s"
+    return f" from {config.start_s:g} s on" if config.start_s else ""
 
 
 def _begin(first: VideoFrame, config: Config) -> None:

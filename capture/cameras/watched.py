@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +16,7 @@ from splatnode.capture.frame import (
     CameraUnavailable,
     Clock,
     DroppedFrame,
+    ExposureSettings,
     Frame,
     Intrinsics,
     KeepAlive,
@@ -35,8 +36,13 @@ from splatnode.capture.image_file import (
     measure_values,
     read_image_file,
 )
-from splatnode.capture.lens_file import same_aspect
+from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
+from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import is_shortage, outlast
+from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 
 REMEMBERED = 100_000  # photographs that were taken and are no longer there: all may be back
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
@@ -44,14 +50,38 @@ _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: Path  # the folder that is watched
-    existing: bool = True  # whether what lies there at the start is taken, too
-    poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2  # between looks at the folder
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
+    include_existing: bool = True  # whether what lies there at the start is taken, too
+    poll_s: Internal[Annotated[float, msgspec.Meta(gt=0)]] = 0.2  # between looks at the folder
+    stable_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
     # A file that is not whole, or cannot be read, after so long is left out
-    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0
+    file_timeout_s: Internal[Annotated[float, msgspec.Meta(gt=0)]] = 60.0
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     # The lens, of all images of its aspect ratio, instead of what their EXIF tells
     intrinsics: Intrinsics | None = None
+    # Whether each image has a file beside it, image.json for image.jpg, that tells its pose, lens, time and more. The
+    # image waits for that file
+    sidecars: bool = False
+    camera_id: str = ""  # of several cameras, which one took the images; a sidecar file may tell another
+
+
+class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Holds what the file beside an image tells of it, by the names that a message has for them."""
+
+    captured_at: Stamp | None = None
+    camera_id: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)] | None = None
+    camera: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)] | None = None
+    intrinsics: Intrinsics | None = None
+    given_pose: GivenPose | None = None
+    motion: Motion | None = None
+    gravity: Gravity | None = None
+    exposure: ExposureSettings | None = None
+
+
+class UnusableSidecar(ValueError):
+    """A file beside an image that tells nothing that can be used; the text says why."""
+
+
+_SIDECAR_BYTES = 64 << 10  # no sidecar file is larger
 
 
 @dataclass(frozen=True)
@@ -93,7 +123,7 @@ class _Watched:
         """Raises CameraUnavailable."""
         if self._opened:
             self._here = set()  # while it was away, any name may have been given to another photograph
-        elif not self._config.existing:
+        elif not self._config.include_existing:
             self._done = {path.name: _version(path) for path in _list_images(self._config.folder)}
             self._here = set(self._done)
         self._opened = True
@@ -150,10 +180,15 @@ def _read_when_complete(
         if before is None or (before.size, before.changed_ns) != (found.st_size, found.st_mtime_ns):
             seen[path.name] = _FileState(found.st_size, found.st_mtime_ns, now, before.first if before else now)
             return None
-        if now - before.since < config.settle_s:
+        if now - before.since < config.stable_s:
             return None
         data = read_image_file(path, config.max_pixels)
         check_whole(data)
+        sidecar = _read_sidecar(path) if config.sidecars else None
+    except _NoSidecar as error:
+        return _drop_when_overdue(name, str(error), now - seen[path.name].first, config)
+    except UnusableSidecar as error:
+        return DroppedFrame(name, str(error))
     except FileNotFoundError:
         seen.pop(path.name, None)
         return None
@@ -166,12 +201,49 @@ def _read_when_complete(
         return _drop_when_overdue(name, f"cannot be read: {error.strerror}", now - first, config)
     except UnusableImage as error:
         return _drop_when_overdue(name, str(error), now - seen[path.name].first, config)
-    return _decode_frame(name, data, nearest_stamp(found.st_mtime_ns, Clock.FILE), config, frame_id)
+    item = _decode_frame(name, data, nearest_stamp(found.st_mtime_ns, Clock.FILE), config, frame_id)
+    return item if sidecar is None or isinstance(item, DroppedFrame) else _apply_sidecar(item, sidecar)
+
+
+class _NoSidecar(ValueError):
+    """The file beside an image is not there yet."""
+
+
+def _read_sidecar(path: Path) -> Sidecar:
+    """The file beside an image. Raises _NoSidecar, UnusableSidecar, OSError."""
+    beside = path.with_suffix(".json")
+    shown = frame_name(beside)
+    try:
+        data = read_bounded(beside, _SIDECAR_BYTES, UnusableSidecar, shown)
+    except FileNotFoundError:
+        raise _NoSidecar(
+            f"{shown} is not there, and camera.sidecars asks for it; write it before the image, under another name "
+            "that is then changed"
+        ) from None
+    with guard_untrusted(UnusableSidecar, shown):
+        try:
+            return record_in(data, Sidecar)
+        except (msgspec.DecodeError, ValueError) as error:
+            raise UnusableSidecar(f"{shown} cannot be used: {sanitize_text(error)}") from error
+
+
+def _apply_sidecar(made: Frame, sidecar: Sidecar) -> Frame | DroppedFrame:
+    """The frame with what the file beside its image tells. Dropped where the lens is of another aspect ratio."""
+    told = {name: value for name in sidecar.__struct_fields__ if (value := getattr(sidecar, name)) is not None}
+    lens = told.pop("intrinsics", None)
+    try:
+        made = replace(made, **told)
+        if lens is not None:
+            check_fits(lens, [(made.width, made.height)])
+            made = assign_lens(made, lens)
+    except ValueError as error:
+        return DroppedFrame(made.name, f"the file beside it cannot be used: {error}")
+    return made
 
 
 def _drop_when_overdue(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
     """None while it may still become whole, or readable."""
-    return None if waited_s < config.give_up_s else DroppedFrame(name, f"{why}, after {waited_s:.0f} s")
+    return None if waited_s < config.file_timeout_s else DroppedFrame(name, f"{why}, after {waited_s:.0f} s")
 
 
 def _decode_frame(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
@@ -185,7 +257,8 @@ def _decode_frame(name: str, data: bytes, written_at: Stamp, config: Config, fra
         intrinsics = config.intrinsics.resized(width, height)
     captured_at = decoded.captured_at or name_time(name) or written_at
     known = image, intrinsics, data if used is None else None, captured_at
-    item = make_frame(frame_id, name, time.monotonic_ns(), *known, exposure=decoded.exposure, camera=decoded.camera)
+    told = {"exposure": decoded.exposure, "camera": decoded.camera, "camera_id": config.camera_id}
+    item = make_frame(frame_id, name, time.monotonic_ns(), *known, **told)
     return apply_alpha_mask(item, decoded.mask)
 
 

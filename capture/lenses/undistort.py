@@ -41,6 +41,16 @@ def undistort_frame(frame: Frame) -> Frame:
     return replace(left, right=RightImage(grey(right.image), frame.right.baseline))
 
 
+def is_resampled(frame: Frame) -> bool:
+    """Whether `undistort_frame` makes another picture of the frame: its lens is no pinhole with square pixels."""
+    given = frame.intrinsics
+    return given is not None and (given.model == "fisheye" or not _is_square_pinhole(given))
+
+
+def _is_square_pinhole(given: Intrinsics) -> bool:
+    return not any(given.distortion) and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE
+
+
 def _undistort_single(frame: Frame) -> Frame:
     """As `undistort_frame`, of a frame without a right image."""
     given = frame.intrinsics
@@ -49,8 +59,7 @@ def _undistort_single(frame: Frame) -> Frame:
     given = given.resized(frame.width, frame.height)
     if given.model == "fisheye":
         return _undistort_fisheye(frame, given)
-    straight = not any(given.distortion)
-    if straight and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE:
+    if _is_square_pinhole(given):
         return frame if given == frame.intrinsics else replace(frame, intrinsics=given)
     coefficients = opencv.coefficients(given)
     left, top, right, bottom = _find_inner_rectangle(frame.name, given, coefficients)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import zlib
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -18,6 +19,7 @@ from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 _MOST_BYTES = 1 << 29  # of a record, and of what it is decompressed to
+_MOST_TIMES = 256  # the bytes of a file, and _MOST_BYTES beside, to which all its chunks are decompressed; lz4 has 255
 
 
 class UnusableLog(ValueError):
@@ -117,11 +119,11 @@ def _read_topic_records(stream: IO[bytes], wanted: Collection[str], known: _Topi
         for chunk in summary.chunk_indexes
         if not (channels.isdisjoint(chunk.message_index_offsets) and chunk.message_index_offsets)
     }
-    yield from _read_chunks(stream, sorted(offsets))
+    yield from unpack_chunks(_read_chunks(stream, sorted(offsets)), stream)
 
 
 def _read_chunks(stream: IO[bytes], offsets: Sequence[int]) -> Iterator[Any]:
-    """The records of the chunks at these rising places, none of which begins within another one.
+    """The chunks at these rising places, none of which begins within another one.
 
     So all of them together are no longer than the file, however many an index names.
     """
@@ -134,7 +136,7 @@ def _read_chunks(stream: IO[bytes], offsets: Sequence[int]) -> Iterator[Any]:
         stream.seek(offset)
         chunk = next(_reader(stream, skip_magic=True).records)
         behind = stream.tell()
-        yield from unpack_chunk(chunk)
+        yield chunk
 
 
 def _summary(stream: IO[bytes]) -> Any:
@@ -152,7 +154,26 @@ def _summary(stream: IO[bytes]) -> Any:
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
     stream.seek(0)
-    for record in _reader(stream).records:
+    yield from unpack_chunks(_reader(stream).records, stream)
+
+
+def unpack_chunks(records: Iterable[Any], stream: IO[bytes]) -> Iterator[Any]:
+    """The records of a file, those of chunks unpacked one after the other.
+
+    A chunk of 20 kB may hold half a gigabyte of zeros, and a file thousands of those: hours of work for nothing. Raises
+    UnusableLog where a chunk, or all so far together, hold more than any log does.
+    """
+    from mcap.records import Chunk
+
+    num_bytes = os.fstat(stream.fileno()).st_size
+    most, told = _MOST_TIMES * num_bytes + _MOST_BYTES, 0
+    for record in records:
+        if isinstance(record, Chunk):
+            told += record.uncompressed_size
+            if told > most:
+                raise UnusableLog(
+                    f"its {num_bytes} bytes may be decompressed to {most}, its chunks say that they hold {told} or more"
+                )
         yield from unpack_chunk(record)
 
 

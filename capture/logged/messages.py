@@ -208,6 +208,10 @@ class Fields:
     def message(self, number: int) -> Fields:
         return Fields(self.bytes(number))
 
+    def messages(self, number: int) -> list[Fields]:
+        """A repeated message."""
+        return [Fields(value) for value in self._values[number] if isinstance(value, bytes)]
+
     def doubles(self, number: int) -> tuple[float, ...]:
         """Repeated numbers, packed as proto3 writes them, or one by one."""
         packed = b"".join(value for value in self._values[number] if isinstance(value, bytes))

@@ -163,11 +163,14 @@ MAX_REQUESTS = 1000  # that one call of `serve` reads
 class KeyframeServer(Endpoint):
     """Capture's end: sends what lies in the spool until it is answered."""
 
-    def __init__(self, network: Network, spool: Spool) -> None:
-        """Takes the spool over and closes it. Raises AlreadyRunning where another process offers keyframes."""
+    def __init__(self, network: Network, spool: Spool, camera_id: str = "") -> None:
+        """Takes the spool over and closes it; `camera_id` is of a capture beside others. Raises AlreadyRunning where
+        another process offers its keyframes.
+        """
         with contextlib.ExitStack() as taken:
             taken.callback(spool.close)
-            super().__init__(network, offers=CAPTURE_KEYFRAMES)
+            service = CAPTURE_KEYFRAMES.select_capture(camera_id)
+            super().__init__(network, offers=service)
             self._resources.push(taken.pop_all())
         self.spool = spool
         self.numbering = Numbering()
@@ -175,7 +178,7 @@ class KeyframeServer(Endpoint):
         self.set_aside = 0  # by this process
         self.ignored = 0  # answers of recons that are not served
         self._turns = ConsumerArbiter()
-        self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=QUEUE)
+        self._router = self._bind(service, zmq.ROUTER, queue=QUEUE)
         self._router.router_mandatory = True  # a connection that is gone says so
 
     @property
@@ -287,9 +290,17 @@ class KeyframeClient(Endpoint):
     """Recon's end: receives each keyframe once, and acknowledges or refuses it."""
 
     def __init__(
-        self, network: Network, seen: Iterable[tuple[str, int]] = (), capacity: int = 4, recon: str | None = None
+        self,
+        network: Network,
+        seen: Iterable[tuple[str, int]] = (),
+        capacity: int = 4,
+        recon: str | None = None,
+        camera_id: str = "",
     ) -> None:
-        """`seen`: what the checkpoint holds, whose id is `recon`. `capacity`: frames that may be here unanswered."""
+        """`seen`: what the checkpoint holds, whose id is `recon`. `capacity`: frames that may be here unanswered.
+
+        `camera_id`: of the capture beside others that it is connected to.
+        """
         super().__init__(network)
         self.capacity = capacity
         self.duplicates = 0
@@ -300,7 +311,7 @@ class KeyframeClient(Endpoint):
         self._refused: dict[Key, str] = {}  # and why
         self._received: deque[ReceivedFrame] = deque()
         self._ready_said = -math.inf
-        self._dealer = self._connect(CAPTURE_KEYFRAMES, zmq.DEALER, queue=QUEUE)
+        self._dealer = self._connect(CAPTURE_KEYFRAMES.select_capture(camera_id), zmq.DEALER, queue=QUEUE)
 
     def receive(self, timeout_s: float) -> ReceivedFrame | None:
         """The next frame, oldest first, each once; None where none comes in `timeout_s`. Raises NotAllowed."""
@@ -315,6 +326,10 @@ class KeyframeClient(Endpoint):
             if remaining <= 0:
                 return None
             self._dealer.poll(math.ceil(1000 * min(remaining, READY_EVERY_S)))
+
+    def register(self, poller: zmq.Poller) -> None:
+        """Lets the poller wake up when something comes."""
+        poller.register(self._dealer, zmq.POLLIN)
 
     def acknowledge(self, frame: ReceivedFrame) -> None:
         """To be called once the frame is on the disk, so that it survives this process."""

@@ -96,7 +96,7 @@ def check_key(text: bytes, where: object) -> bytes:
     """The key in `text`. Raises KeyFileError, which names `where` it came from."""
     key = text.strip()
     if not _Z85.fullmatch(key):
-        raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keys")
+        raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keygen")
     return key
 
 
@@ -133,7 +133,7 @@ def _read_key(path: Path) -> bytes:
     try:
         return check_key(read_own(path, _LARGEST, only_ours=True), path)
     except FileNotFoundError as error:
-        raise KeyFileError(f"no key {path}. Run: splatnode keys {path.parent}") from error
+        raise KeyFileError(f"no key {path}. Run: splatnode keygen {path.parent}") from error
     except StrayFile as error:
         raise KeyFileError(str(error)) from error
 

@@ -16,7 +16,7 @@ import errno
 import logging
 import math
 import os
-import tempfile
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -30,7 +30,13 @@ from zmq.utils.monitor import recv_monitor_message
 from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
-from splatnode.capture.process.files import LockHeld, NotOwnerOnly, exclusive, make_owner_only_folder
+from splatnode.capture.process.files import (
+    LockHeld,
+    NotOwnerOnly,
+    default_runtime_directory,
+    exclusive,
+    make_owner_only_folder,
+)
 from splatnode.capture.process.logs import is_logged
 from splatnode.capture.process.system import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.text import sanitize_text
@@ -56,6 +62,10 @@ class Service:
         """Returns the service on which late subscribers ask for the state; it has a socket of its own."""
         return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
 
+    def select_capture(self, camera_id: str) -> Service:
+        """Returns capture's service where several captures run, each with a camera id; itself for the empty one."""
+        return Service(f"{self.name}@{camera_id}", self.pattern, self.tcp_port) if camera_id else self
+
 
 CAPTURE_KEYFRAMES = Service("capture.keyframes", Pattern.QUEUE, 0)
 CAPTURE_PREVIEW = Service("capture.preview", Pattern.BROADCAST, 1)
@@ -67,6 +77,11 @@ CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
 RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured
 RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
 
+
+# Of a capture beside others: a part of the names of its sockets, its spool and its frames.
+CAMERA_ID = "[A-Za-z0-9_-]{1,32}"  # a regular expression
+CaptureId = Annotated[str, msgspec.Meta(pattern=f"^(?:{CAMERA_ID})?$", max_length=32)]
+_CAPTURE = re.compile(rf"capture\.keyframes(?:@({CAMERA_ID}))?")
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +101,7 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of ipc sockets and locks. None: $RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/splatnode, else a folder under /tmp.
     directory: Path | None = None
     tcp: str | None = None  # the address to bind (robot) or to connect to (other machine), in place of ipc; needs keys
-    keys: Path | None = None  # the folder that `splatnode keys` made; None: no keys, and so no tcp
+    keys: Path | None = None  # the folder that `splatnode keygen` made; None: no keys, and so no tcp
     first_port: Annotated[int, msgspec.Meta(ge=1, le=65500)] = 47310  # of the tcp ports, which follow one another
     max_message_mb: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256  # a larger message is not taken, in 2^20 bytes
 
@@ -109,7 +124,11 @@ class AlreadyRunning(LockHeld):
 
     def __init__(self, service: Service, pid: int | None) -> None:
         who = f"process {pid}" if pid else "another process"
-        super().__init__(f"{service.name} is offered by {who} already; stop it, or give another network.directory", pid)
+        super().__init__(
+            f"{service.name} is offered by {who} already; stop it, or give another network.directory. Captures "
+            "of several cameras each need a camera_id of their own (over tcp also a network.first_port)",
+            pid,
+        )
 
 
 class NotAllowed(PermissionError):
@@ -263,7 +282,7 @@ class _Link:
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                raise NotAllowed(f"{self._address} does not let this machine in. Run there: splatnode keys --allow")
+                raise NotAllowed(f"{self._address} does not let this machine in. Run there: splatnode keygen --allow")
             self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
         if self._failures >= _MAX_FAILED_HANDSHAKES:
             raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
@@ -281,7 +300,7 @@ def _notice_dead_links(socket: zmq.Socket) -> None:
 
 def runtime_directory(network: Network) -> Path:
     """The private folder of sockets and locks, made where it is absent. Raises NetworkError where it is not private."""
-    directory = network.directory or _default_directory()
+    directory = network.directory or default_runtime_directory()
     try:
         make_owner_only_folder(directory, "network.directory (or $XDG_RUNTIME_DIR), for each process,", ours=False)
     except NotOwnerOnly as error:
@@ -289,12 +308,16 @@ def runtime_directory(network: Network) -> Path:
     return directory
 
 
-def _default_directory() -> Path:
-    if os.environ.get("RUNTIME_DIRECTORY"):
-        return Path(os.environ["RUNTIME_DIRECTORY"].split(":")[0])
-    if os.environ.get("XDG_RUNTIME_DIR"):
-        return Path(os.environ["XDG_RUNTIME_DIR"], "splatnode")
-    return Path(tempfile.gettempdir(), f"splatnode-{os.getuid()}")
+def find_captures(network: Network) -> list[str]:
+    """The camera ids of the captures whose sockets lie in the folder, also of one that was killed; empty: has no id.
+
+    Over tcp there is one for each first port.
+    """
+    if network.tcp is not None:
+        return [""]
+    sockets = (path for path in runtime_directory(network).glob("capture.keyframes*") if path.is_socket())
+    found = (_CAPTURE.fullmatch(path.name) for path in sockets)
+    return sorted(each[1] or "" for each in found if each)
 
 
 def _address(network: Network, service: Service) -> str:
@@ -311,7 +334,7 @@ def _curve_keys(network: Network) -> Keys | None:
     if network.tcp is None:
         return None
     if network.keys is None:
-        raise NetworkError("network.tcp needs network.keys, or anybody could connect. Run: splatnode keys FOLDER")
+        raise NetworkError("network.tcp needs network.keys, or anybody could connect. Run: splatnode keygen FOLDER")
     return read_keys(network.keys)
 
 

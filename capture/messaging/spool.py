@@ -20,6 +20,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from splatnode.capture.messaging.wire import MAGIC, VERSION, Name, Part, Text, check
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.files import (
     StrayFile,
     exclusive,
@@ -220,7 +221,7 @@ class SpoolConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     # Their size, in 2^20 bytes, at which likewise no further one is taken
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
-    quarantine: QuarantineConfig = QuarantineConfig()  # keyframes that recon refused
+    quarantine: Internal[QuarantineConfig] = QuarantineConfig()  # keyframes that recon refused
 
 
 _FILE = re.compile(r"[0-9]{12,18}-[0-9a-f]{32}-[0-9]{1,18}\.frame")  # number, session, sequence
@@ -240,17 +241,20 @@ class Key(NamedTuple):
 class Spool:
     """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
 
-    def __init__(self, config: SpoolConfig) -> None:
-        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate."""
+    def __init__(self, config: SpoolConfig, camera_id: str = "") -> None:
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate.
+
+        Captures beside one another have a camera id each, and so a spool each.
+        """
         self.config = config
-        self.directory = spool_directory(config)
+        self.directory = spool_directory(config, camera_id)
         make_owner_only_folder(self.directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
         self._resources = contextlib.ExitStack()
         self._resources.enter_context(exclusive(self.directory / "lock"))
         self._files: dict[Key, Path] = {}  # oldest first
         self._bytes: dict[Key, int] = {}
         self._acknowledged: list[Path] = []  # that are still to be removed
-        self.quarantine = Quarantine(self.directory.with_name("quarantine"), config.quarantine)
+        self.quarantine = Quarantine(self.directory.with_name(_name("quarantine", camera_id)), config.quarantine)
         remove_leftovers(self.directory)
         found = list_own_files(self.directory, _FILE, ".frame")
         for path in found:
@@ -280,13 +284,21 @@ class Spool:
         further_bytes = (self.config.max_mb << 20) - self.size_bytes
         return shortage(self.directory, further_bytes, "further keyframes (spool.max_mb)")
 
+    def check_room(self, size: int) -> None:
+        """Raises SpoolFull where a message of so many bytes would exceed the bound."""
+        if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
+            raise SpoolFull(
+                f"{len(self)} keyframes ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
+                "is splatnode recon running?"
+            )
+
     def store(self, key: Key, parts: Sequence[Part]) -> None:
         """Returns when the message is on the disk.
 
         Raises SpoolFull; what is_shortage tells, where another time may do.
         """
         size = size_in_file(parts)
-        self._make_sure_of_room(size)
+        self.check_room(size)
         path = self.directory / f"{self._number:012d}-{key.session}-{key.sequence}.frame"
         try:
             write_message(path, parts)
@@ -324,13 +336,6 @@ class Spool:
                 return
             self._acknowledged.pop()
 
-    def _make_sure_of_room(self, size: int) -> None:
-        if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
-            raise SpoolFull(
-                f"{len(self)} keyframes ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
-                "is splatnode recon running?"
-            )
-
     def _take_over(self, path: Path) -> None:
         _, session, sequence = path.stem.split("-")
         key = Key(session, int(sequence))
@@ -354,5 +359,9 @@ def _number(path: Path) -> int:
     return int(path.name.split("-")[0])
 
 
-def spool_directory(config: SpoolConfig) -> Path:
-    return (config.directory or state_directory()) / "spool"
+def spool_directory(config: SpoolConfig, camera_id: str = "") -> Path:
+    return (config.directory or state_directory()) / _name("spool", camera_id)
+
+
+def _name(folder: str, camera_id: str) -> str:
+    return f"{folder}-{camera_id}" if camera_id else folder

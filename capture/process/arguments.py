@@ -6,7 +6,7 @@ import argparse
 import gc
 import ipaddress
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -153,6 +153,29 @@ class Verb:
     summary: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
     run: Command
+
+
+def replace_former_words(
+    argv: Sequence[str], verbs: Mapping[str, str], flags: Mapping[str, Mapping[str, str]]
+) -> tuple[list[str], list[str]]:
+    """Returns a command line by the present names of its verb and flags, and a sentence for each former one.
+
+    `verbs` and, for each verb, `flags` give the present names by the former ones. What follows `--` stays.
+    """
+    if not argv:
+        return [], []
+    verb = verbs.get(argv[0], argv[0])
+    end = argv.index("--") if "--" in argv else len(argv)
+    words, of_verb = [verb], flags.get(verb, {})
+    for word in argv[1:end]:
+        flag, equals, value = word.partition("=")
+        words.append(of_verb.get(flag, flag) + equals + value)
+    told = {old: new for old, new in zip(argv, words, strict=False) if old != new}
+    sentences = [
+        f"{old.partition('=')[0]} is called {new.partition('=')[0]} now; the former name is read in this release only"
+        for old, new in told.items()
+    ]
+    return [*words, *argv[max(1, end) :]], sentences
 
 
 def import_lazily(module: str, function: str) -> Command:

@@ -3,6 +3,7 @@
 Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
 names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. A field
 whose type is a Mapping of Plugins holds several by name, which is also their kind where they say no other.
+`config_keys` knows internal keys and former names.
 """
 
 from __future__ import annotations
@@ -12,13 +13,24 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
-from typing import Any, ClassVar, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
 
+from splatnode.capture.process.config_keys import (
+    KeyPlace,
+    find_nearest_key,
+    has_fields,
+    is_internal,
+    join_keys,
+    list_documented_keys,
+    list_field_types,
+    replace_former_name,
+)
 from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_of
@@ -42,12 +54,40 @@ class Plugin:
     package: ClassVar[str]
     needs: ClassVar[tuple[str, ...]] = ("Config",)
     usual: ClassVar[str | None] = None
+    entry_points: ClassVar[str | None] = None  # the group by which other packages bring plug-ins; None: none may
     kind: str
     config: Any  # the module's Config
 
     @property
     def module(self) -> ModuleType:
-        return import_module(f"{self.package}.{self.kind}")
+        return self.load_module(self.kind)
+
+    @classmethod
+    def load_module(cls, kind: str) -> ModuleType:
+        """The module of a kind that there is. Raises ConfigError where one of another package does not load."""
+        if kind in cls._names():
+            return import_module(f"{cls.package}.{kind}")
+        point, *others = entry_points(group=cls.entry_points or "", name=kind)
+        if others:
+            raise ConfigError(f"{kind}: several packages bring a plug-in of this name; uninstall all but one of them")
+        brought = f"{kind}: the plug-in {point.value}{f' of {point.dist.name}' if point.dist else ''}"
+        try:
+            module = point.load()
+        except Exception as error:  # it is another's code
+            raise ConfigError(
+                f"{brought} does not load ({type(error).__name__}: {sanitize_text(error)}); install that package anew, "
+                "or choose another kind"
+            ) from error
+        missing = [needed for needed in cls.needs if not hasattr(module, needed)]
+        if missing:
+            raise ConfigError(f"{brought} has no {' and no '.join(missing)}; it must be a module that has both")
+        return module
+
+    @classmethod
+    def kinds_elsewhere(cls) -> list[str]:
+        """The names of plug-ins that other packages bring; none of them is imported. Ours count before theirs."""
+        found = entry_points(group=cls.entry_points) if cls.entry_points else ()
+        return sorted({point.name for point in found}.difference(cls._names()))
 
     @classmethod
     def kinds(cls) -> list[str]:
@@ -69,7 +109,15 @@ class Plugin:
 
 def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
     """The YAML file at `path` with `changes`, such as ["camera.folder=photos"], as a `schema`. Raises ConfigError."""
-    return parse_config(merge_config(read_yaml(path), parse_changes(changes)), schema)
+    return parse_layers([read_yaml(path), parse_changes(changes)], schema)
+
+
+def parse_layers(layers: Sequence[Mapping[str, Any]], schema: type[T]) -> T:
+    """The layers, as people wrote them, each laid over those before it, as a `schema`. Raises ConfigError."""
+    tree: dict[str, Any] = {}
+    for layer in layers:
+        tree = merge_config(tree, replace_former_names(layer, schema, tree))
+    return build_config(tree, schema)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -87,7 +135,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
-    """["camera.loops=2", "camera.frames-per-second=5"] -> {"camera": {"loops": 2, "frames_per_second": 5}}."""
+    """["camera.loops=2", "camera.max-pixels=5"] -> {"camera": {"loops": 2, "max_pixels": 5}}."""
     tree: dict[str, Any] = {}
     for change in changes:
         key, equals, value = change.partition("=")
@@ -111,16 +159,65 @@ def merge_config(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[st
 
 
 def parse_config(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
-    """`raw` as a `schema` (Struct or dataclass); `where` is the key under which it stands. Raises ConfigError."""
+    """`raw`, as somebody wrote it, as a `schema`; `where` is the key under which it stands. Raises ConfigError."""
+    return build_config(replace_former_names(raw, schema, {}, where), schema, where)
+
+
+def build_config(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
+    """`raw`, of present names only, as a `schema` (Struct or dataclass). Raises ConfigError."""
     with guard_untrusted(ConfigError, where):
         try:
             return record_of(_check_keys(raw, schema, where), schema, dec_hook=_decode)
         except msgspec.ValidationError as error:
             message, _, path = str(error).partition(" - at `$")
-            key = _join(where, path.rstrip("`").lstrip("."))
+            key = join_keys(where, path.rstrip("`").lstrip("."))
             raise ConfigError(
                 f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}"
             ) from error
+
+
+def replace_former_names(
+    raw: Mapping[str, Any], schema: type, base: Mapping[str, Any], where: str = ""
+) -> dict[str, Any]:
+    """`raw`, as somebody wrote it, by present names; `base`, which it changes, has the kinds that it does not say.
+
+    Former and internal keys are told, each once a process. Raises ConfigError where a key has both of its names.
+    """
+    with guard_untrusted(ConfigError, where):
+        return _replace_names(raw, schema, base, KeyPlace(where))
+
+
+def _replace_names(raw: Any, schema: Any, base: Any, place: KeyPlace) -> Any:
+    if not isinstance(raw, Mapping):
+        return raw
+    base = base if isinstance(base, Mapping) else {}
+    if typing.get_origin(schema) is Mapping:
+        plugin = typing.get_args(schema)[1]
+        return {
+            name: _replace_names(each, plugin, base.get(name) or {"kind": name}, dataclasses.replace(place, where=key))
+            for name, each in raw.items()
+            for key in [join_keys(place.where, str(name))]
+        }
+    if isinstance(schema, type) and issubclass(schema, Plugin):
+        kind = raw.get("kind", base.get("kind", schema.usual))
+        if not (schema.is_kind(kind) or kind in schema.kinds_elsewhere()):
+            return raw  # which is refused where the whole is read
+        try:
+            module = schema.load_module(str(kind))
+        except ConfigError:
+            return raw  # likewise
+        place, schema = dataclasses.replace(place, kind=str(kind)), module.Config
+    if not has_fields(schema):
+        return raw
+    place, types, result = place.enter(schema), list_field_types(schema), {}
+    for key, value in raw.items():
+        present = replace_former_name(str(key), place, schema)
+        if present != key and present in raw:
+            raise ConfigError(f"{join_keys(place.where, present)}: given twice, once as {key}; give it once")
+        below = types.get(present)
+        inner = _struct_in(below) if present in types else None
+        result[present] = _replace_names(value, inner, base.get(present), place.descend(present, is_internal(below)))
+    return result
 
 
 def _check_keys(raw: Any, schema: Any, where: str) -> Any:
@@ -129,30 +226,34 @@ def _check_keys(raw: Any, schema: Any, where: str) -> Any:
         return raw
     if typing.get_origin(schema) is Mapping:
         plugin = typing.get_args(schema)[1]
-        return {name: _check_keys(_add_kind(name, each), plugin, _join(where, str(name))) for name, each in raw.items()}
+        return {
+            name: _check_keys(_add_kind(name, each), plugin, join_keys(where, str(name))) for name, each in raw.items()
+        }
     if isinstance(schema, type) and issubclass(schema, Plugin):
         return _plugin(raw, schema, where)
-    if not _has_fields(schema):
+    if not has_fields(schema):
         return raw
     types = typing.get_type_hints(schema)
     unknown = sorted((str(key) for key in raw if key not in types), key=lambda key: key not in OF_VERBS)
     if unknown:
-        elsewhere = _locate_key(unknown[0], types, where)
+        elsewhere, allowed = _locate_key(unknown[0], types, where), list_documented_keys(schema)
+        nearest = None if elsewhere else find_nearest_key(unknown[0], allowed)
         raise ConfigError(
-            f"{_join(where, sanitize_text(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(types)}"
+            f"{join_keys(where, sanitize_text(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(allowed)}"
+            + (f"; the nearest is {join_keys(where, nearest)}" if nearest else "")
         )
     missing = [name for name in _list_required_fields(schema) if name not in raw]
     if missing:
-        raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
-    return {key: _check_keys(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
+        raise ConfigError(f"{join_keys(where, missing[0])}: missing; it has no default")
+    return {key: _check_keys(value, _struct_in(types[key]), join_keys(where, key)) for key, value in raw.items()}
 
 
 def _locate_key(key: str, types: Mapping[str, Any], where: str) -> str:
     """Says where a key that is none of these belongs, if one of them has it, or another verb."""
     for name, annotation in types.items():
         struct = _struct_in(annotation)
-        if _has_fields(struct) and key in typing.get_type_hints(struct):
-            return f", which belongs under {_join(where, name)}"
+        if has_fields(struct) and key in typing.get_type_hints(struct):
+            return f", which belongs under {join_keys(where, name)}"
     return f", which is of the configuration of {OF_VERBS[key]}" if key in OF_VERBS and not where else ""
 
 
@@ -162,17 +263,16 @@ def _add_kind(kind: object, raw: Any) -> Any:
 
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
-    if not schema.is_kind(kind):
-        raise ConfigError(
-            f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {sanitize_text(repr(kind), 100)}"
-        )
-    module = import_module(f"{schema.package}.{kind}")
+    elsewhere = schema.kinds_elsewhere()
+    if not (kind in elsewhere or schema.is_kind(kind)):
+        known = ", ".join([*schema.kinds(), *elsewhere])
+        raise ConfigError(f"{join_keys(where, 'kind')}: expected one of {known}, got {sanitize_text(repr(kind), 100)}")
+    try:
+        module = schema.load_module(str(kind))
+    except ConfigError as error:
+        raise ConfigError(f"{join_keys(where, 'kind')}: {error}") from error
     rest = {key: value for key, value in raw.items() if key != "kind"}
-    return schema(kind, parse_config(rest, module.Config, where))
-
-
-def _has_fields(schema: Any) -> bool:
-    return isinstance(schema, type) and (issubclass(schema, msgspec.Struct) or dataclasses.is_dataclass(schema))
+    return schema(kind, build_config(rest, module.Config, where))
 
 
 def _list_required_fields(schema: Any) -> list[str]:
@@ -184,9 +284,11 @@ def _list_required_fields(schema: Any) -> list[str]:
 
 def _struct_in(annotation: Any) -> Any:
     """The Struct or dataclass in `annotation`, also where it may be None; else, and of a Mapping, the annotation."""
+    if typing.get_origin(annotation) is Annotated:
+        annotation = typing.get_args(annotation)[0]
     if typing.get_origin(annotation) is Mapping:
         return annotation
-    return next((choice for choice in typing.get_args(annotation) if _has_fields(choice)), annotation)
+    return next((choice for choice in typing.get_args(annotation) if has_fields(choice)), annotation)
 
 
 def _decode(kind: type, value: Any) -> Any:
@@ -196,7 +298,3 @@ def _decode(kind: type, value: Any) -> Any:
     if kind is Path and isinstance(value, str):
         return Path(value).expanduser()
     raise ValueError(f"Expected {kind.__name__.lower()}, got {type(value).__name__}")
-
-
-def _join(where: str, key: str) -> str:
-    return f"{where}.{key}" if where and key and not key.startswith("[") else where + key

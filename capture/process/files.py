@@ -461,6 +461,17 @@ def state_directory() -> Path:
     return (Path(named).expanduser() if named else home("XDG_STATE_HOME") / ".local" / "state") / "splatnode"
 
 
+def default_runtime_directory() -> Path:
+    """The folder of what need not outlive the machine's next start, such as sockets: $RUNTIME_DIRECTORY, which systemd
+    sets, else $XDG_RUNTIME_DIR/splatnode, else one among the temporary folders. It may not be there yet.
+    """
+    if os.environ.get("RUNTIME_DIRECTORY"):
+        return Path(os.environ["RUNTIME_DIRECTORY"].split(":")[0])
+    if os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(os.environ["XDG_RUNTIME_DIR"], "splatnode")
+    return Path(tempfile.gettempdir(), f"splatnode-{os.getuid()}")
+
+
 def home(instead: str) -> Path:
     """The user's own folder. Raises ValueError, which names the variable to set `instead`, where there is none.
 

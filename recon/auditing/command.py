@@ -19,7 +19,7 @@ EXIT_GOOD, EXIT_NOTHING = 0, 65
 def audit(args: argparse.Namespace) -> int:
     """Prints what moved, then what stood still; EXIT_NOTHING where no camera could be compared."""
     landmarks = read_landmarks(args.result)
-    given = None if args.calibration is None else read_lens(args.calibration)
+    given = None if args.intrinsics is None else read_lens(args.intrinsics)
     visits = find_recordings(args.recordings)
     if given is not None:
         check_lens(given, load_first_frames(visits))

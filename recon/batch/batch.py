@@ -29,11 +29,13 @@ from splatnode.capture import recording as capture_recording
 from splatnode.capture.cameras import mcap
 from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.lerobot import data_set
+from splatnode.capture.process.arguments import replace_former_words
 from splatnode.capture.process.files import open_itself, read_bounded
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.records import record_in, record_of
 from splatnode.capture.process.system import SHORT_OF_MEMORY, outlast, raise_shortage
 from splatnode.capture.process.text import sanitize_name, sanitize_text
+from splatnode.recon.former_names import FLAGS
 from splatnode.recon.jobs.child import Child, End, Limits
 from splatnode.recon.jobs.engine import run_processes
 from splatnode.recon.result.export.limits import read_json_file
@@ -430,7 +432,8 @@ class Ledger:
             raise OtherBatch(f"{self.path} is not the ledger of a batch ({error}); give another --out") from error
         if header.batch != _FORMAT:
             raise OtherBatch(f"{self.path} has format {header.batch}, expected {_FORMAT}; give another --out")
-        if header.command != command:
+        known, _ = replace_former_words(header.command[1:], {}, FLAGS)  # that a former release began
+        if header.command[:1] + known != command:
             raise OtherBatch(
                 f"{self.path} is of a batch with other options: {sanitize_text(' '.join(header.command))}. Now they "
                 "are "

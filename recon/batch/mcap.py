@@ -12,7 +12,7 @@ from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from splatnode.capture.logged.mcap import UnusableLog, unpack_chunk
+from splatnode.capture.logged.mcap import UnusableLog, unpack_chunks
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.recon.result.export.foxglove import Message, add_messages, encode_mcap
 
@@ -95,8 +95,8 @@ def _contents(stream: IO[bytes], left_out: Collection[str]) -> Iterator[tuple]:
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
     """Up to the end of the data; what follows is an index."""
-    for record in StreamReader(stream, emit_chunks=True).records:
+    for record in unpack_chunks(StreamReader(stream, emit_chunks=True).records, stream):
         if isinstance(record, DataEnd):
             return
-        yield from unpack_chunk(record)
+        yield record
     raise UnusableLog("it ends before the end of its data")

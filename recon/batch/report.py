@@ -18,6 +18,7 @@ import numpy as np
 from splatnode.capture.cameras.folder import image_paths
 from splatnode.capture.image_file import UnusableImage, read_image_file
 from splatnode.capture.process.files import sync_folder
+from splatnode.capture.process.library_lines import catch_library_lines
 from splatnode.capture.process.text import cell, escape_text
 from splatnode.recon.batch.batch import Outcome
 from splatnode.recon.result.snapshot import format_rounded_up
@@ -40,7 +41,8 @@ def make_data_url(result: Path, source: Path) -> str | None:
         data = read_image_file(path)
     except (UnusableImage, OSError):
         return None
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
+    with catch_library_lines():
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_REDUCED_COLOR_2)
     return None if image is None else _encode_preview(image)
 
 

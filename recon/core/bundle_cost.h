@@ -28,8 +28,8 @@ struct Bundle {
     const double *prior_means, *prior_information;
     int32_t num_cameras, num_lenses, num_points, fixed_camera;  // fixed_camera -1: given poses hold all of them
     double robust_squared;
-    // Given poses, world to camera: rotations (C, 3, 3), centres (C, 3), and the information (C, 2) of a turn about each
-    // axis and of a position in each direction; 0: nothing is given.
+    // Given poses, world to camera: rotations (C, 3, 3), centres (C, 3), and the information (6 C, 6 C) of their errors in
+    // the cameras' axes, of each a turn and a shift; 0 on the diagonal: nothing is given. Null: nothing of any camera.
     const double *given_rotations, *given_centres, *given_information;
     // A rig: cameras of a frame set have one pose together, and each its mount on the rig. Rotations (., 3, 3) and
     // translations (., 3) of S sets, world to rig, and of M mounts, rig to camera, are parameters after the lenses.
@@ -162,11 +162,49 @@ inline double deviation_cost(const PoseDeviation& d, const double* information) 
     return cost;
 }
 
-static double pose_cost(const Bundle& bundle) {
+// What pulls the cameras: Gaussian priors on how far they are from their given poses, which may depend on each other.
+struct PosePriors {
+    std::vector<int> cameras;         // that have a given pose
+    std::vector<PoseDeviation> seen;  // of each of these
+    std::vector<double> deviations;   // (6,) of each of these: turn, shift
+    std::vector<double> pull;         // likewise: information times deviations
+
+    explicit PosePriors(const Bundle& bundle) {
+        if (!bundle.given_information) return;
+        for (int camera = 0; camera < bundle.num_cameras; ++camera) {
+            if (!(information(bundle, camera, 0)[kPose * camera] > 0)) continue;
+            cameras.push_back(camera);
+            seen.push_back(deviate_camera(bundle, camera));
+            deviations.insert(deviations.end(), seen.back().turn, seen.back().turn + 3);
+            deviations.insert(deviations.end(), seen.back().shift, seen.back().shift + 3);
+        }
+        pull.assign(deviations.size(), 0.0);
+        for (size_t a = 0; a < cameras.size(); ++a)
+            for (int i = 0; i < kPose; ++i) {
+                const double* row = information(bundle, cameras[a], i);
+                for (size_t b = 0; b < cameras.size(); ++b)
+                    for (int j = 0; j < kPose; ++j)
+                        pull[kPose * a + i] += row[kPose * cameras[b] + j] * deviations[kPose * b + j];
+            }
+    }
+
+    // The i-th row of a camera.
+    static const double* information(const Bundle& bundle, int camera, int i) {
+        return bundle.given_information + size_t(kPose * camera + i) * kPose * bundle.num_cameras;
+    }
+
+    double cost() const {
+        double sum = 0;
+        for (size_t i = 0; i < pull.size(); ++i) sum += deviations[i] * pull[i];
+        return sum;
+    }
+};
+
+// What the rig says: how far cameras are from where their frame sets and mounts have them, and mounts from given ones.
+static double rig_cost(const Bundle& bundle) {
+    if (bundle.num_sets == 0) return 0;
     double cost = 0;
     for (int camera = 0; camera < bundle.num_cameras; ++camera) {
-        const double* information = bundle.given_information + 2 * camera;
-        if (information[0] > 0 || information[1] > 0) cost += deviation_cost(deviate_camera(bundle, camera), information);
         if (bundle.set_of_camera[camera] < 0) continue;
         const RigPose by_rig(bundle, camera);
         const double *rotation = bundle.rotations + 9 * camera, *translation = bundle.translations + 3 * camera;
@@ -195,7 +233,7 @@ static double total_cost(const Bundle& bundle) {
     });
     double cost = 0;
     for (const double value : costs) cost += value;
-    return cost + LensPriors(bundle).cost() + pose_cost(bundle);
+    return cost + LensPriors(bundle).cost() + PosePriors(bundle).cost() + rig_cost(bundle);
 }
 
 // Derivatives of a residual (2) by its camera's pose and lens (12) and by its point (3), and its weight.

@@ -156,29 +156,69 @@ void eliminate(const Bundle& bundle, int point, double damping, System& system, 
     reduce(inverse, right, num_columns, system.size, sums);
 }
 
-// What a given pose says of the one whose parameters begin at `start`. Turns are small, so that a turn's deviation
-// changes as the turn itself does.
-void add_given_pose(const PoseDeviation& d, const double* information, int start, double damping, System& system) {
-    const double of_turn = information[0], of_shift = information[1];
-    if (!(of_turn > 0 || of_shift > 0)) return;
-    const double *q = d.seen, *shift = d.shift;
-    // A turn by w moves R c by w x R c: this by its columns.
+// How a deviation (turn, shift) changes with its camera's pose, (6, 6): a turn by w moves R c by w x R c. Turns are small,
+// so that a turn's deviation changes as the turn itself does.
+void differentiate_deviation(const PoseDeviation& d, double by_pose[kPose][kPose]) {
+    const double* q = d.seen;
     const double by_turn[3][3] = {{0, q[2], -q[1]}, {-q[2], 0, q[0]}, {q[1], -q[0], 0}};
-    for (int i = 0; i < 3; ++i) {
-        double* of_rotation = &system.matrix[size_t(start + i) * system.size + start];
-        double* of_translation = &system.matrix[size_t(start + 3 + i) * system.size + start];
-        double pull = of_turn * d.turn[i];
-        for (int j = 0; j < 3; ++j) {
-            double product = 0;
-            for (int k = 0; k < 3; ++k) product += by_turn[k][i] * by_turn[k][j];
-            if (j <= i) of_rotation[j] += of_shift * product;
-            if (j == i) of_rotation[j] += of_turn + (of_shift * product + of_turn) * damping;
-            of_translation[j] += of_shift * by_turn[i][j];
-            pull += of_shift * by_turn[j][i] * shift[j];
+    for (int i = 0; i < kPose; ++i)
+        for (int j = 0; j < kPose; ++j) by_pose[i][j] = i == j ? 1.0 : i >= 3 && j < 3 ? by_turn[i - 3][j] : 0.0;
+}
+
+// What given poses say of their cameras, of two of them where these depend on each other.
+void add_given_poses(const Bundle& bundle, double damping, System& system) {
+    const PosePriors priors(bundle);
+    const size_t count = priors.cameras.size();
+    std::vector<double> derivatives(count * kPose * kPose);
+    for (size_t a = 0; a < count; ++a)
+        differentiate_deviation(priors.seen[a],
+                                reinterpret_cast<double(*)[kPose]>(&derivatives[a * kPose * kPose]));
+    for (size_t a = 0; a < count; ++a) {
+        const double* first = &derivatives[a * kPose * kPose];
+        for (size_t b = 0; b <= a; ++b) {
+            const double* second = &derivatives[b * kPose * kPose];
+            double half[kPose][kPose] = {};  // information times the second's derivatives
+            bool any = false;
+            for (int i = 0; i < kPose; ++i) {
+                const double* row = PosePriors::information(bundle, priors.cameras[a], i) + kPose * priors.cameras[b];
+                for (int k = 0; k < kPose; ++k) {
+                    if (row[k] == 0) continue;
+                    any = true;
+                    for (int j = 0; j < kPose; ++j) half[i][j] += row[k] * second[kPose * k + j];
+                }
+            }
+            if (!any) continue;
+            for (int i = 0; i < kPose; ++i) {
+                double* row = &system.matrix[size_t(kPose * priors.cameras[a] + i) * system.size];
+                for (int j = 0; j < kPose; ++j) {
+                    if (a == b && j > i) continue;
+                    double product = 0;
+                    for (int k = 0; k < kPose; ++k) product += first[kPose * k + i] * half[k][j];
+                    row[kPose * priors.cameras[b] + j] += product * (a == b && i == j ? 1 + damping : 1.0);
+                }
+            }
         }
-        of_translation[3 + i] += of_shift * (1 + damping);
-        system.gradient[start + i] += pull;
-        system.gradient[start + 3 + i] += of_shift * shift[i];
+        for (int i = 0; i < kPose; ++i)
+            for (int k = 0; k < kPose; ++k)
+                system.gradient[kPose * priors.cameras[a] + i] += first[kPose * k + i] * priors.pull[kPose * a + k];
+    }
+}
+
+// What a given mount says of its own, as a given pose does of its camera.
+void add_given_mount(const Bundle& bundle, int mount, double damping, System& system) {
+    const double* information = bundle.given_mount_information + 2 * mount;
+    if (!(information[0] > 0 || information[1] > 0)) return;
+    const PoseDeviation d = deviate_mount(bundle, mount);
+    double by_pose[kPose][kPose];
+    differentiate_deviation(d, by_pose);
+    const int start = first_mount(bundle) + kPose * mount;
+    for (int i = 0; i < kPose; ++i) {
+        double* row = &system.matrix[size_t(start + i) * system.size + start];
+        for (int k = 0; k < kPose; ++k) {
+            const double weighed = information[k / 3] * by_pose[k][i];
+            system.gradient[start + i] += weighed * (k < 3 ? d.turn[k] : d.shift[k - 3]);
+            for (int j = 0; j <= i; ++j) row[j] += weighed * by_pose[k][j] * (i == j ? 1 + damping : 1.0);
+        }
     }
 }
 
@@ -261,14 +301,10 @@ void assemble(const Bundle& bundle, double damping, System& system) {
         row[i] += information[i] * damping;
         system.gradient[first + i] += priors.pull[i];
     }
-    for (int camera = 0; camera < bundle.num_cameras; ++camera) {
-        add_given_pose(deviate_camera(bundle, camera), bundle.given_information + 2 * camera, kPose * camera, damping,
-                       system);
-        add_rig(bundle, camera, damping, system);
-    }
-    for (int mount = 0; mount < bundle.num_mounts; ++mount)
-        add_given_pose(deviate_mount(bundle, mount), bundle.given_mount_information + 2 * mount,
-                       first_mount(bundle) + kPose * mount, damping, system);
+    add_given_poses(bundle, damping, system);
+    if (bundle.num_sets == 0) return;
+    for (int camera = 0; camera < bundle.num_cameras; ++camera) add_rig(bundle, camera, damping, system);
+    for (int mount = 0; mount < bundle.num_mounts; ++mount) add_given_mount(bundle, mount, damping, system);
 }
 
 }  // namespace

@@ -9,15 +9,14 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from splatnode.capture.messaging.keyframe_queue import KeyframeClient
-from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.process.logs import Problems, is_logged
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.daemon.captures import Captures, FrameSetConfig, WaitingFrame
 from splatnode.recon.daemon.checkpoint.records import StoredFrame
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.frames.keyframe import Keyframe
@@ -36,6 +35,7 @@ class ArrivedKeyframe:
 
     keyframe: Keyframe
     at_s: float  # monotonic
+    frame_set: int | None = None  # of keyframes that were taken together, the same number; None: it is alone
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,13 @@ def _do_nothing() -> None:
 
 def _are_both_keyframes(one: Event, other: Event) -> bool:
     return isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)
+
+
+def are_one_set(one: Event, other: Event) -> bool:
+    """Whether both are keyframes that were taken together."""
+    if not (isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)):
+        return False
+    return one.frame_set is not None and one.frame_set == other.frame_set
 
 
 class Inbox:
@@ -79,6 +86,17 @@ class Inbox:
             self._events.append(event)
             self._changed.notify_all()
 
+    def enqueue_together(
+        self, events: Sequence[Event], stopping: threading.Event, meanwhile: Callable[[], None] = _do_nothing
+    ) -> None:
+        """As `enqueue`, of events of which none is to be seen without the others; all go in where one has room."""
+        with self._changed:
+            while len(self._events) >= CAPACITY and not stopping.is_set():
+                self._changed.wait(WAIT_S)
+                meanwhile()
+            self._events.extend(events)
+            self._changed.notify_all()
+
     def enqueue_now(self, event: RemovedFrame) -> None:
         """Also where the inbox is full: who gives commands does not wait for the work."""
         with self._changed:
@@ -86,11 +104,16 @@ class Inbox:
             self._changed.notify_all()
 
     def dequeue(self, timeout_s: float) -> list[Event]:
-        """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time."""
+        """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time.
+
+        Keyframes of one frame set are never apart: with them there may be more.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []
-            while self._events and 0 < len(events) < BATCH and _are_both_keyframes(events[0], self._events[0]):
+            while self._events and events and _are_both_keyframes(events[0], self._events[0]):
+                if len(events) >= BATCH and not are_one_set(events[-1], self._events[0]):
+                    break
                 events.append(self._events.popleft())
             self._changed.notify_all()
             return events
@@ -112,7 +135,10 @@ class Intake:
         inbox: Inbox,
         problems: Problems,
         stopping: threading.Event,
+        frame_sets: FrameSetConfig | None = None,
+        further_captures: Sequence[int] = (),
     ) -> None:
+        self._frame_sets, self._further_captures = frame_sets or FrameSetConfig(), further_captures
         self._network, self._config, self._store, self._inbox = network, config, store, inbox
         self._problems, self._stopping = problems, stopping
         self.full = ""  # why keyframes cannot be stored
@@ -124,8 +150,14 @@ class Intake:
         """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
         while not self._stopping.is_set():
             try:
-                with KeyframeClient(self._network, self._store.frame_keys, recon=self._store.identity) as client:
-                    self._receive(client)
+                with Captures(
+                    self._network,
+                    self._store.identity,
+                    lambda: self._store.frame_keys,
+                    self._frame_sets,
+                    self._further_captures,
+                ) as captures:
+                    self._receive(captures)
             except Exception as error:
                 expected = isinstance(error, NotAllowed)
                 self._report_unconnected(str(error) if expected else f"{type(error).__name__}: {error}")
@@ -133,55 +165,63 @@ class Intake:
                     log.exception("the connection that keyframes come by failed")
                 self._stopping.wait(RETRY_S)
 
-    def _receive(self, client: KeyframeClient) -> None:
+    def _receive(self, captures: Captures) -> None:
         before = self.refused
         while not self._stopping.is_set():
-            received = client.receive(timeout_s=RECEIVE_S)
-            self.refused, self.duplicates = before + client.refused, client.duplicates
-            self._problems.count("keyframes that were refused", self.refused, client.why_refused)
-            if client.served is not None:
-                self._report_unconnected("" if client.served else ANOTHER_IS_SERVED)
-            if received is not None:
-                self._store_received(client, received)
+            together = captures.receive(timeout_s=RECEIVE_S)
+            self.refused, self.duplicates = before + captures.num_refused, captures.duplicates
+            self._problems.count("keyframes that were refused", self.refused, captures.why_refused)
+            if captures.is_served is not None:
+                self._report_unconnected("" if captures.is_served else ANOTHER_IS_SERVED)
+            arrived_s = time.monotonic()
+            stored = [each for frame in together if (each := self._store_received(captures, frame)) is not None]
+            if stored:  # what the camera could not give is told with the next scene, and disturbs none
+                self._enqueue_keyframes(captures, stored, arrived_s)
 
-    def _store_received(self, client: KeyframeClient, received: ReceivedFrame) -> None:
-        arrived_s = time.monotonic()
+    def _store_received(self, captures: Captures, waiting: WaitingFrame) -> StoredFrame | None:
+        """The frame as it is stored, and acknowledged; None where it is refused, or no image."""
+        client, received = waiting.client, waiting.received
         while not self._stopping.is_set():
             try:
                 stored = self._store.add_frame(received)
             except Exception as error:
                 if is_shortage(error):
-                    self._wait_for_memory(client, received.frame.name)
+                    self._wait_for_memory(captures, received.frame.name)
                     continue
                 if not isinstance(error, OSError):
                     client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
-                    return
+                    return None
                 self._report_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
                 self._stopping.wait(RETRY_S)
-                client.say_ready()
+                captures.say_ready()
                 continue
             self.full = ""
             client.acknowledge(received)
-            if stored is not None:  # what the camera could not give is told with the next scene, and disturbs none
-                self._enqueue_keyframe(client, stored, arrived_s)
-            return
+            return stored
+        return None
 
-    def _enqueue_keyframe(self, client: KeyframeClient, stored: StoredFrame, arrived_s: float) -> None:
-        self.newest = stored.number
-        name = stored.frame.name
-        try:
-            keyframe = self._prepare_keyframe(client, stored)
-        except Exception as error:  # a frame that cannot be used must not stop those that can
-            if is_shortage(error):  # the daemon stops: the next start prepares it
-                return
-            if is_logged(self._problems.add("keyframes that cannot be used", f"{name}: {error}")):
-                log.exception("%s cannot be used", name)
-            self._forget(name, f"cannot be used: {error}")
-            self._inbox.enqueue(RemovedFrame(name), self._stopping, client.say_ready)
-            return
-        self._inbox.enqueue(ArrivedKeyframe(keyframe, arrived_s), self._stopping, client.say_ready)
+    def _enqueue_keyframes(self, captures: Captures, together: Sequence[StoredFrame], arrived_s: float) -> None:
+        """Hands keyframes that were taken together to the worker, as one."""
+        frame_set = together[0].number if len(together) > 1 else None
+        events: list[Event] = []
+        for stored in together:
+            self.newest = stored.number
+            name = stored.frame.name
+            try:
+                keyframe = self._prepare_keyframe(captures, stored)
+            except Exception as error:  # a frame that cannot be used must not stop those that can
+                if is_shortage(error):  # the daemon stops: the next start prepares it
+                    break
+                if is_logged(self._problems.add("keyframes that cannot be used", f"{name}: {error}")):
+                    log.exception("%s cannot be used", name)
+                self._forget(name, f"cannot be used: {error}")
+                events.insert(0, RemovedFrame(name))  # first: nothing is between the others
+            else:
+                events.append(ArrivedKeyframe(keyframe, arrived_s, frame_set))
+        if events:
+            self._inbox.enqueue_together(events, self._stopping, captures.say_ready)
 
-    def _prepare_keyframe(self, client: KeyframeClient, stored: StoredFrame) -> Keyframe:
+    def _prepare_keyframe(self, captures: Captures, stored: StoredFrame) -> Keyframe:
         """Waits where the memory does not suffice; while the daemon stops, that is raised."""
         while True:
             try:
@@ -189,15 +229,15 @@ class Intake:
             except Exception as error:
                 if not is_shortage(error) or self._stopping.is_set():
                     raise
-                self._wait_for_memory(client, stored.frame.name)
+                self._wait_for_memory(captures, stored.frame.name)
             else:
                 self.full = ""
                 return keyframe
 
-    def _wait_for_memory(self, client: KeyframeClient, name: str) -> None:
+    def _wait_for_memory(self, captures: Captures, name: str) -> None:
         self._report_full(f"{name} has to wait: {SHORT_OF_MEMORY}")
         self._stopping.wait(RETRY_S)
-        client.say_ready()
+        captures.say_ready()
 
     def _forget(self, name: str, reason: str) -> None:
         try:

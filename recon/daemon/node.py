@@ -121,7 +121,7 @@ class Daemon:
             make_sure_of_room(_FILES + files_for_strangers(network, _SOCKETS), _THREADS)
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
             self._depths = self._resources.enter_context(StateServer(RECON_DEPTH, network))
-            maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.map.live else None
+            maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.occupancy.live else None
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
             self._store = Store(config.checkpoint or state_directory() / "recon")
@@ -133,7 +133,10 @@ class Daemon:
         self._inbox = Inbox()
         self._newest = _NewestSnapshot()
         self._problems = Problems()
-        self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
+        several = config.frame_sets, config.further_captures
+        self._intake = Intake(
+            network, config.reconstruction, self._store, self._inbox, self._problems, stopping, *several
+        )
         self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._scene_numbers = Numbering()
@@ -174,7 +177,7 @@ class Daemon:
                 self._publish()
                 self._publish_map(self._worker.current_map)
                 if time.monotonic() >= next_status_s:
-                    next_status_s = time.monotonic() + self._config.status_every_s
+                    next_status_s = time.monotonic() + self._config.status_interval_s
                     self._heart.do(self._beat)
                     if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager restarts it
                         manager.alive(self._told)
@@ -236,25 +239,32 @@ class Daemon:
         if isinstance(command, MarkProblemsSeen):
             self._problems.mark_seen()
             return Answer(True, "the problems are not told again")
-        left, here = self._worker.find_inactive_scenes(command.name), command.name in self._store.names
+        together = self._store.find_frame_set(command.name, self._config.frame_sets.tolerance_s)
+        others = [name for name in together if name != command.name]
+        answer = self._remove_keyframe(command.name)
+        removed = [name for name in others if answer.done and self._remove_keyframe(name).done]
+        if not removed:
+            return answer
+        return Answer(True, sanitize_text(f"{answer.message}; with it {', '.join(removed)}, taken at the same time"))
+
+    def _remove_keyframe(self, name: str) -> Answer:
+        left, here = self._worker.find_inactive_scenes(name), name in self._store.names
         if not left and not here:
             known = ", ".join(sorted(self._store.names)) or "none yet"
-            return Answer(False, sanitize_text(f"no keyframe {command.name!r}; there are: {known}"))
+            return Answer(False, sanitize_text(f"no keyframe {name!r}; there are: {known}"))
         try:
             if left:
-                self._store.request_removal(command.name, left)
+                self._store.request_removal(name, left)
             if here:
-                self._store.forget(command.name, "retracted")
+                self._store.forget(name, "retracted")
         except OSError as error:
-            return Answer(
-                False, sanitize_text(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
-            )
+            return Answer(False, sanitize_text(f"{name} cannot be removed ({error.strerror}): make room on the disk"))
         if here:
-            self._inbox.enqueue_now(RemovedFrame(command.name))
-        event(log, logging.INFO, "retracted", frame=command.name, left=",".join(left))
+            self._inbox.enqueue_now(RemovedFrame(name))
+        event(log, logging.INFO, "retracted", frame=name, left=",".join(left))
         those = f"{', '.join(left)}, which the camera has left, is built anew without it when no keyframe waits"
         told = [*(["the scene is built anew without it"] if here else []), *([those] if left else [])]
-        return Answer(True, sanitize_text(f"{command.name} is removed; {'; '.join(told)}"))
+        return Answer(True, sanitize_text(f"{name} is removed; {'; '.join(told)}"))
 
     def _make_status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None

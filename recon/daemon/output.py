@@ -51,7 +51,7 @@ class MetricScaler:
         which it is measured in its files, too; for others where stereo pairs are measured by them.
         """
         evidence = self.collect_evidence(work.graph.keyframes)
-        config = self._config if snapshot.final else msgspec.structs.replace(self._config, network=False)
+        config = self._config if snapshot.final else msgspec.structs.replace(self._config, depth_network=False)
         came = evidence.tracked or evidence.motions
         if evidence.pairs or (snapshot.final and (config != MetricConfig() or came)):
             snapshot = add_landmarks(snapshot, work.find_reconstruction())
@@ -221,7 +221,7 @@ class OccupancyPublisher:
             self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers))
         except WireError as error:
             log.warning("the map of %s cannot be sent: %s", scene_id, error)
-            return f"the map is too large: {error}; choose a larger map.voxel"
+            return f"the map is too large: {error}; choose a larger occupancy.voxel"
         return ""
 
 

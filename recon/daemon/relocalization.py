@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,9 +22,10 @@ from scipy.special import chdtr
 from splatnode.capture.config import PreviewHeader, decode_preview
 from splatnode.capture.frame import Intrinsics, Stamp
 from splatnode.capture.lenses.undistort import undistort_image
-from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.messaging.wire import Message
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.logs import Problems, event, is_logged
 from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe
@@ -43,18 +45,21 @@ DAMPING = 1e-9  # added to the normal matrix, which points in one line leave sin
 class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Relocalisation: where in the finished scene a preview was taken, and whether the camera has moved since."""
 
-    every_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
-    num_features: int = 2000  # of a preview, at most
-    longer_side: int = 800  # of the preview in which features are found, pixels
-    keyframes: int = 3  # with which a preview is compared: those with the most matches
-    min_alpha: float = 0.8  # least rendered opacity at a keyframe's feature; below, its depth is not known well enough
-    min_inliers: int = 20  # points from which a camera is resected
-    min_share: float = 0.3  # least inlier ratio; matches with another place reach 0.2
-    max_error_px: float = 3.0  # reprojection error of an inlier, at `longer_side`
-    independent: int = 50  # inliers share errors of the scene: more than so many make the position no more certain
-    certainty: float = 0.999  # least probability that the camera has moved, to say so
-    shift_px: float = 3.0  # median shift of the points in the image, at `longer_side`; a smaller one is no motion
-    confirmations: int = 2  # previews in a row that must show the motion
+    interval_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
+    num_features: Internal[int] = 2000  # of a preview, at most
+    longer_side: Internal[int] = 800  # of the preview in which features are found, pixels
+    keyframes: Internal[int] = 3  # with which a preview is compared: those with the most matches
+    # Least rendered opacity at a keyframe's feature; below, its depth is not known well enough
+    min_alpha: Internal[float] = 0.8
+    min_inliers: Internal[int] = 20  # points from which a camera is resected
+    min_share: Internal[float] = 0.3  # least inlier ratio; matches with another place reach 0.2
+    max_error_px: Internal[float] = 3.0  # reprojection error of an inlier, at `longer_side`
+    # Inliers share errors of the scene: more than so many make the position no more certain
+    independent: Internal[int] = 50
+    certainty: Internal[float] = 0.999  # least probability that the camera has moved, to say so
+    # Median shift of the points in the image, at `longer_side`; a smaller one is no motion
+    shift_px: Internal[float] = 3.0
+    confirmations: Internal[int] = 2  # previews in a row that must show the motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +206,7 @@ class Tracker:
 
 def _feature_config(config: TrackingConfig) -> features.FeatureConfig:
     side = config.longer_side
-    return features.FeatureConfig(num_features=config.num_features, max_longer_side=side, min_longer_side=side)
+    return features.FeatureConfig(max_num_features=config.num_features, max_image_size=side, min_longer_side=side)
 
 
 def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tuple[Array, npt.NDArray[np.bool_]]:
@@ -248,6 +253,7 @@ log = logging.getLogger(__name__)
 
 READ_S = 0.05  # between reads: a queue that is full keeps the oldest, and this one holds what a second brings
 RETRY_S = 1.0  # after the connection failed
+LOOK_S = 1.0  # between looks at which captures there are
 
 
 class PreviewReceiver:
@@ -270,17 +276,23 @@ class PreviewReceiver:
         """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
         while not self._stopping.is_set():
             try:
-                with Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader) as subscriber:
-                    self._receive(subscriber)
+                camera_id = self._find_first()
+                with Subscriber(CAPTURE_PREVIEW.select_capture(camera_id), self._network, PreviewHeader) as subscriber:
+                    self._receive(subscriber, camera_id)
             except NotAllowed:  # which the keyframes' connection tells, too
                 self._stopping.wait(RETRY_S)
             except Exception as error:  # a key's file, for one, may be written just now
                 self._report_unconnected(error)
                 self._stopping.wait(RETRY_S)
 
-    def _receive(self, subscriber: Subscriber) -> None:
-        """Raises NotAllowed."""
+    def _find_first(self) -> str:
+        """The camera id of the capture that is watched: of several the first, in the order of their ids."""
+        return next(iter(find_captures(self._network)), "")
+
+    def _receive(self, subscriber: Subscriber, camera_id: str) -> None:
+        """Until another capture is to be watched. Raises NotAllowed."""
         self._unconnected = ""
+        next_look_s = time.monotonic() + LOOK_S
         before = self._refused
         while not self._stopping.wait(READ_S):
             newest = subscriber.latest(0)
@@ -289,6 +301,10 @@ class PreviewReceiver:
             if newest is not None:
                 with self._lock:
                     self._newest = newest
+            if time.monotonic() >= next_look_s:
+                next_look_s = time.monotonic() + LOOK_S
+                if self._find_first() != camera_id:
+                    return
 
     def _report_unconnected(self, error: Exception) -> None:
         """Once, however long it lasts."""
@@ -329,7 +345,7 @@ class Watcher:
 
     def run(self) -> None:
         """Until the daemon stops."""
-        if self._config.every_s <= 0:
+        if self._config.interval_s <= 0:
             return
         receiving = threading.Thread(target=self._previews.run, name="previews", daemon=True)
         receiving.start()
@@ -339,7 +355,7 @@ class Watcher:
     def _watch(self) -> None:
         watched: FinalScene | None = None
         tracker = None
-        while not self._stopping.wait(self._config.every_s):
+        while not self._stopping.wait(self._config.interval_s):
             finished = self._finished()
             if finished is not watched:
                 watched, tracker, self.motion, self.tracked = finished, None, None, None

@@ -165,7 +165,7 @@ class ActiveSubmap:
             bounds=result_snapshot.format_widest_bounds(snapshot.cameras, snapshot.scale),
         )  # fmt: skip
         self._output.save(self._store, self._work, final=False)
-        if time.monotonic() - self._exported_s >= self._config.export_every_s:
+        if time.monotonic() - self._exported_s >= self._config.export_interval_s:
             self.export_provisionally()
         give_back_memory()
 
@@ -191,7 +191,7 @@ class ActiveSubmap:
         They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
         If that does not help them, another place begins with them.
         """
-        lost = len(self._find_untracked()) >= self._config.lost_after
+        lost = len(self._find_untracked()) >= self._config.new_submap_after
         pause = partial(self._pause_until, math.inf if lost else time.monotonic() + PATIENCE_S)
         aside = [keyframe.name for keyframe in self._work.keyframes_deferred]
         joined = membership.has_links_to_deferred(self._work, pause) and (
@@ -199,7 +199,7 @@ class ActiveSubmap:
         )
         if self._check_lost(newest):
             return True
-        for keyframe in self._work.keyframes_deferred[: -max(MOST_ASIDE, self._config.lost_after)]:
+        for keyframe in self._work.keyframes_deferred[: -max(MOST_ASIDE, self._config.new_submap_after)]:
             self._forget(keyframe.name, "it does not fit the scene")
         return joined
 
@@ -209,7 +209,7 @@ class ActiveSubmap:
         for keyframe in strangers:
             if keyframe.name in newest:
                 event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
-        if len(strangers) < self._config.lost_after:
+        if len(strangers) < self._config.new_submap_after:
             return False
         self._begin_submap(strangers)
         return True
@@ -329,7 +329,7 @@ class ActiveSubmap:
         more = True
         while more:
             fitted = set(self._work.names)
-            with self._work.fallback_budget(self._config.fallback_s):
+            with self._work.fallback_budget(self._config.fallback_timeout_s):
                 try:
                     membership.verify_keyframes(self._work, self._forget, self._pause)
                 finally:

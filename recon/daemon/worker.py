@@ -12,6 +12,7 @@ import msgspec
 
 from splatnode.capture.process.files import is_disk_error
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
 from splatnode.recon.daemon.atlas.pose_graph import EdgeKind
@@ -20,10 +21,11 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.finalizer import InactiveSubmaps
 from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
-from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
 from splatnode.recon.daemon.output import Output, PublishedSnapshot
 from splatnode.recon.daemon.status import PLACES, SubmapStatus
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
+from splatnode.recon.frames.keyframe import Keyframe
 
 log = logging.getLogger(__name__)
 
@@ -42,15 +44,17 @@ class Worker:
         stopping: threading.Event,
     ) -> None:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
-        asked = config.reconstruction.ladder
-        ladder = asked if asked.most_s is not None else msgspec.structs.replace(asked, most_s=LADDER_S)
-        self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None, ladder=ladder)
+        asked = config.reconstruction.fallbacks
+        ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
+        self._recipe = msgspec.structs.replace(
+            config.reconstruction, max_gaussians=limit, budget_s=None, fallbacks=ladder
+        )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._report_problem)
         self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause)
-        self._free_space = OccupancyMapper(config.map)
+        self._free_space = OccupancyMapper(config.occupancy)
         self._atlas = LoopDetector(store.directory, self._recipe, self._output.places)
-        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_s)
+        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_timeout_s)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
         self._shortage = ""  # the last one that was told
@@ -105,11 +109,11 @@ class Worker:
         found = self._restore()
         self.loading = 0
         if found is not None:
-            self._backlog = [ArrivedKeyframe(keyframe, time.monotonic()) for keyframe in found.new]
+            self._backlog = number_frame_sets(found.new, self._config.frame_sets.tolerance_s)
             self._run_step(lambda: self.place.resume(found))
         give_back_memory()
         while not self._stopping.is_set():
-            worked = self._process_events(min(IDLE_S, self._config.settle_s))
+            worked = self._process_events(min(IDLE_S, self._config.idle_finalize_s))
             if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
                 self._run_step(self._process_idle, present=False)
         self._run_step(self.place.export_provisionally)
@@ -143,7 +147,7 @@ class Worker:
             self._run_step(lambda: self._add_keyframes(arrived))
         elif left_out:
             self._run_step(lambda: self.place.remove_frames(left_out))
-        elif self.place.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.settle_s:
+        elif self.place.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.idle_finalize_s:
             return False
         else:
             self._run_step(lambda: self._add_keyframes([]) if self.place.owed else self.place.finalize())
@@ -153,7 +157,10 @@ class Worker:
     def _take_events(self, wait_s: float) -> Sequence[Event]:
         """Returns the events to process next: first what an earlier process stored, a batch at a time."""
         if self._backlog:
-            events, self._backlog = self._backlog[:BATCH], self._backlog[BATCH:]
+            count = min(BATCH, len(self._backlog))
+            while count < len(self._backlog) and are_one_set(self._backlog[count - 1], self._backlog[count]):
+                count += 1
+            events, self._backlog = self._backlog[:count], self._backlog[count:]
             return events
         return self._inbox.dequeue(wait_s)
 
@@ -223,6 +230,19 @@ class Worker:
     def _report_problem(self, problem: str) -> None:
         self.problem = problem
         log.error("%s", problem)
+
+
+def number_frame_sets(keyframes: Sequence[Keyframe], tolerance_s: float) -> list[ArrivedKeyframe]:
+    """Keyframes that an earlier process stored, each with the number of its frame set, those of one side by side."""
+    frames = [each.frame for each in keyframes]
+    timed = [(each.name, each.camera_id, each.captured_at) for each in frames if each.captured_at is not None]
+    sets = {name: number for number, each in enumerate(form_frame_sets(timed, tolerance_s)) if len(each.names) > 1
+            for name in each.names.values()}  # fmt: skip
+    first = {number: index for index, each in reversed(list(enumerate(frames)))
+             if (number := sets.get(each.name)) is not None}  # fmt: skip
+    order = sorted(range(len(frames)), key=lambda index: (first.get(sets.get(frames[index].name, -1), index), index))
+    now_s = time.monotonic()
+    return [ArrivedKeyframe(keyframes[index], now_s, sets.get(frames[index].name)) for index in order]
 
 
 def _format_keyframe_count(number: int) -> str:

@@ -66,11 +66,11 @@ def list_variants(methods: Collection[str]) -> list[Variant]:
 
 def make_configs(whole: ReconstructionConfig) -> dict[str, ReconstructionConfig]:
     """The variants that are no methods by themselves, by name."""
-    losses = whole.optimize.regularise.losses
+    losses = whole.optimize.regularizers.losses
 
     def replace_regularise(**changes: object) -> ReconstructionConfig:
-        changed = msgspec.structs.replace(whole.optimize.regularise, **changes)
-        return msgspec.structs.replace(whole, optimize=msgspec.structs.replace(whole.optimize, regularise=changed))
+        changed = msgspec.structs.replace(whole.optimize.regularizers, **changes)
+        return msgspec.structs.replace(whole, optimize=msgspec.structs.replace(whole.optimize, regularizers=changed))
 
     with_one = {f"{BASE}+{part}": replace_regularise(losses={name: losses[name]}) for part, name in _LOSSES.items()}
     without_one = {
@@ -116,8 +116,8 @@ def extract_start_config(config: ReconstructionConfig) -> ReconstructionConfig:
         screening=config.screening,
         verification=config.verification,
         decision=config.decision,
-        quick=config.quick,
-        ladder=config.ladder,
+        no_fallbacks=config.no_fallbacks,
+        fallbacks=config.fallbacks,
     )
 
 
@@ -169,11 +169,11 @@ def _make_instantsplat_config(iterations: int, losses: Mapping[str, LossChoice])
         pixelwise=initialization.PixelwiseConfig(),
         optimize=training.RefinementConfig(
             iterations=iterations,
-            dssim=0.2,
+            ssim_lambda=0.2,
             dropout=ensemble.DropoutConfig(share=0.0),
             control=None,
-            rates=_INSTANTSPLAT_RATES,
-            regularise=regularizers.RegularizerConfig(losses),
+            lr=_INSTANTSPLAT_RATES,
+            regularizers=regularizers.RegularizerConfig(losses),
         ),
     )
 
@@ -197,8 +197,8 @@ def add_surroundings(config: ReconstructionConfig, surroundings: Literal["shell"
     """A start with what ours has around the pixels that stereo knows, where MASt3R would know all of them."""
     by_pixel = msgspec.structs.replace(config.pixelwise or initialization.PixelwiseConfig(), surroundings=surroundings)
     if surroundings == "fill":
-        losses = msgspec.structs.replace(config.optimize.regularise, min_confidence=DENSE_CONFIDENCE)
-        config = msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, regularise=losses))
+        losses = msgspec.structs.replace(config.optimize.regularizers, min_confidence=DENSE_CONFIDENCE)
+        config = msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, regularizers=losses))
     return msgspec.structs.replace(config, pixelwise=by_pixel)
 
 

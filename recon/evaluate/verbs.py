@@ -24,17 +24,17 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument(
-        "--interpolated-start",
+        "--interpolate-start",
         action="store_true",
         help="seek a held-out view's pose from between its neighbours, not from the true one: 300 steps, three sizes",
     )
     parser.add_argument(
-        "--best-gain",
+        "--color-correct",
         action="store_true",
         help="bring each render to the exposure and white balance of the held-out photograph before it is scored",
     )
     parser.add_argument(
-        "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
+        "--score-regions", action="store_true", help="score also what two training photographs show, one, or none"
     )
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
     _add_engine(parser, "runs", "a run", 3600.0)
@@ -65,7 +65,7 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
         "--counts", type=counts, default=(3, 6, 12), metavar="N,N,N", help="photographs of a window (default: 3,6,12)"
     )
     parser.add_argument(
-        "--told",
+        "--known-lens",
         choices=("nothing", "exif", "given"),
         default="nothing",
         help="windows of a known camera: splatnode is told the true lens, or EXIF's focal length within 3 %%",
@@ -75,10 +75,14 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
         "--windows", action="store_true", help="instead of the matrix: windows of 3, 6 and 12 consecutive photographs"
     )
     parser.add_argument(
-        "--per-kind", type=positive, default=2, metavar="N", help="windows of a scene, count and stride (default: 2)"
+        "--windows-per-kind",
+        type=positive,
+        default=2,
+        metavar="N",
+        help="windows of a scene, count and stride (default: 2)",
     )
     parser.add_argument(
-        "--fresh",
+        "--no-cache",
         action="store_true",
         help="time each window from its photographs on, too, with nothing kept of others",
     )
@@ -112,7 +116,7 @@ BENCH = Verb(
 )
 
 STABILITY = Verb(
-    "stability",
+    "robustness",
     "measure how often the answer is wrong",
     _stability_arguments,
     import_lazily("splatnode.recon.evaluate.stability.command", "stability"),

@@ -21,7 +21,7 @@ class FallbackState:
 
     graph: ViewGraph
     config: ReconstructionConfig
-    work: float = 0.0  # that went into them, as `config.ladder.work` counts it
+    work: float = 0.0  # that went into them, as `config.fallbacks.budget` counts it
 
     def add_work(self, work: float) -> FallbackState:
         """The same, after so much further work."""

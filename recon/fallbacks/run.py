@@ -44,11 +44,11 @@ def run_fallbacks(
 ) -> Reconstruction:
     """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
 
-    With `config.quick` it is `estimate`. `config.ladder` bounds the work that is added: what it comes to is looked at
-    between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate that have
-    begun are finished. Where that does not help, photographs in doubt are left out. `pause` may raise.
+    With `config.no_fallbacks` it is `estimate`. `config.fallbacks` bounds the work that is added: what it comes to is
+    looked at between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate
+    that have begun are finished. Where that does not help, photographs in doubt are left out. `pause` may raise.
     """
-    if config.quick:
+    if config.no_fallbacks:
         return estimate
     if _lacks_matches(estimate):
         estimate = _try_fallbacks(estimate, rejected, config, pause, rungs, until)
@@ -62,7 +62,7 @@ def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, rungs: Seq
     """
     digest, names = hashlib.blake2b(digest_size=16), graph.names
     available = [f"{rung.name}: {rung.obstacle()}" for rung in rungs]
-    for text in (repr(config.ladder), *available, *sorted(names)):
+    for text in (repr(config.fallbacks), *available, *sorted(names)):
         digest.update(f"{text}\0".encode(errors="surrogateescape"))
     by_name = {tuple(sorted((names[i], names[j]))): pair for (i, j), pair in graph.pairs.items()}
     for pair in sorted(by_name):
@@ -80,7 +80,7 @@ def _try_fallbacks(
     rungs: Sequence[Fallback],
     until: float,
 ) -> Reconstruction:
-    means, most_s = FallbackState(estimate.graph, config), config.ladder.most_s
+    means, most_s = FallbackState(estimate.graph, config), config.fallbacks.timeout_s
     until = until if most_s is None else min(until, time.monotonic() + most_s)
     tried: list[str] = []
     not_tried: list[str] = []
@@ -124,7 +124,7 @@ def _run_fallback(
 
 def _is_exhausted(means: FallbackState, until: float) -> bool:
     """Whether nothing further begins, for these means or from `until` on, a time of `time.monotonic()`."""
-    return means.work >= means.config.ladder.work or is_over(until)
+    return means.work >= means.config.fallbacks.budget or is_over(until)
 
 
 def find_doubtful_keyframes(estimate: Reconstruction) -> frozenset[str]:

@@ -128,7 +128,7 @@ def screen(summaries: Sequence[FrameSummary], config: ScreeningConfig) -> tuple[
 def _code(measured: quality.Quality, limits: quality.Limits) -> Code:
     """The verdict on an unusable frame: nothing to see on it, else too blurred."""
     blank = measured.blur_px is None or measured.contrast < limits.contrast
-    exposed = 1.0 - measured.dark - measured.bright >= limits.exposed
+    exposed = 1.0 - measured.dark - measured.bright >= limits.min_exposed_share
     return Code.LOW_TEXTURE if blank or not exposed else Code.BLUR
 
 

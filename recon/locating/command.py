@@ -26,7 +26,7 @@ EXIT_GOOD, EXIT_REFUSED = 0, 65
 def locate(args: argparse.Namespace) -> int:
     """A line a photograph; EXIT_GOOD where all were placed."""
     landmarks = read_landmarks(args.result)
-    given = None if args.calibration is None else read_lens(args.calibration)
+    given = None if args.intrinsics is None else read_lens(args.intrinsics)
     if given is not None:
         check_lens(given, stream_query_frames(args.images, None))
     records, refused, of_other_lens = [], 0, 0

@@ -226,7 +226,7 @@ def choose_hypothesis(
 
 # Fewer features, of a smaller picture: it is seen from nearly the same place.
 QUICK = LocalizationConfig(
-    features=matching_features.FeatureConfig(num_features=3000, min_longer_side=800, max_longer_side=1000),
+    features=matching_features.FeatureConfig(max_num_features=3000, min_longer_side=800, max_image_size=1000),
     posing=pose_candidates.PoseSearchConfig(iterations=2_000, rounds=2),
 )
 _STRONGEST = 1500  # features by which the camera is found at first

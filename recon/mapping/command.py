@@ -33,7 +33,7 @@ from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.submap_index import FILE
 
-_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "rig")
 
 
 def replay_map(args: argparse.Namespace, request: Request, config: ReconstructionConfig) -> int:
@@ -48,7 +48,7 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
     began_s = time.monotonic()
     with hold_result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         remove_result(args.out)  # of one scene, beside which nobody would find the map's
-        frames = _write_frames(source, args.out) if source.is_film else source.frames()
+        frames = _write_frames(source, args.out) if source.photographs is None else source.frames()
         told = _ProgressPrinter(args.json, len(source.choice.names))
         with _limit_log_level():
             make_scenes(frames, source.identity(config), make_node_config(config, args.out), told)
@@ -110,7 +110,7 @@ def _make_report(source: ReplayRecording, out: Path, reports: Reports, seconds: 
     placed = {camera.name for name in reports for camera in read_cameras(out / name / "cameras.json")}
     left_out = [name for name in source.choice.names if name not in placed]
     return {
-        "photographs": str(out / IMAGES if source.is_film else source.path),
+        "photographs": str(source.photographs or out / IMAGES),
         "selection": source.choice.record(),
         "keyframes_in_a_map": len(placed),
         "left_out": [{"name": name, "reason": why.get(name, "it is in no scene")} for name in left_out],

@@ -57,7 +57,7 @@ def check_incomplete(out: Path) -> None:
 
 def make_node_config(config: ReconstructionConfig, out: Path) -> daemon.DaemonConfig:
     """Makes the configuration of a node that reconstructs as `config` says, and writes only into `out`."""
-    return daemon.DaemonConfig(reconstruction=config, checkpoint=out / CHECKPOINT, out=out, export_every_s=NEVER_S)
+    return daemon.DaemonConfig(reconstruction=config, checkpoint=out / CHECKPOINT, out=out, export_interval_s=NEVER_S)
 
 
 def make_scenes(

@@ -103,7 +103,7 @@ def _apply_moving_mask(keyframe: Keyframe, mask: Mask) -> Keyframe:
 
 def moving_masks(graph: ViewGraph) -> dict[str, Mask]:
     """For each keyframe that shows a thing which moved: the mask (H, W) at full size, False on the thing."""
-    if not graph.config.moving.enabled:
+    if not graph.config.dynamic_objects.enabled:
         return {}
     moving = moving_points(graph)
     found = {}

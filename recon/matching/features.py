@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.core import library, pointer
 from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Features
 
@@ -149,12 +150,12 @@ _NO_BLUR = 0.01  # sigma, pixels, along the other side: OpenCV takes 0 for "as a
 class FeatureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Local features: many SIFT keypoints with RootSIFT descriptors, also of images with a simulated tilt."""
 
-    num_features: int = 8000  # of an image, at most: the strongest
-    contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
-    max_longer_side: int = 1600  # larger images are shrunk before features are found, pixels
-    min_longer_side: int = 1000  # smaller images are enlarged, pixels: a third more matches at 640 x 480
+    max_num_features: int = 8000  # of an image, at most: the strongest
+    contrast: Internal[float] = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
+    max_image_size: int = 1600  # larger images are shrunk before features are found, pixels
+    min_longer_side: Internal[int] = 1000  # smaller images are enlarged, pixels: a third more matches at 640 x 480
     # Pixels at REFERENCE_SIDE: a keypoint of a tilted image this near to a known point is that point
-    snap_px: float = 1.5
+    snap_px: Internal[float] = 1.5
 
 
 def extract(image: Image, config: FeatureConfig) -> Features:
@@ -221,7 +222,7 @@ def count_search_pixels(image: Image, config: FeatureConfig) -> float:
 def _search_scale(image: Image, config: FeatureConfig) -> float:
     """Returns the factor by which `image` is resized before its features are detected."""
     longer = max(image.shape[:2])
-    return float(np.clip(1.0, config.min_longer_side / longer, config.max_longer_side / longer))
+    return float(np.clip(1.0, config.min_longer_side / longer, config.max_image_size / longer))
 
 
 def _detect(image: Image, tilt: float, config: FeatureConfig) -> tuple[Array, npt.NDArray[np.uint8]]:
@@ -236,7 +237,7 @@ def _detect(image: Image, tilt: float, config: FeatureConfig) -> tuple[Array, np
         grey = cv2.GaussianBlur(grey, (0, 0), sigmaX=sigma_x, sigmaY=sigma_y)
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
-    points, descriptors = detect(np.asarray(grey, np.uint8), config.num_features, config.contrast)
+    points, descriptors = detect(np.asarray(grey, np.uint8), config.max_num_features, config.contrast)
     # The detector's pixel centres are whole numbers; ours are at halves.
     return (points.astype(np.float64) + 0.5) * (width / size[0], height / size[1]), descriptors
 

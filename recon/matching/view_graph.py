@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.clock import is_over
@@ -41,10 +42,10 @@ class MatchingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of matching: local features, which pairs are matched and how, which get simulated tilts."""
 
     features: features.FeatureConfig = features.FeatureConfig()
-    candidates: candidates.PairSelectionConfig = candidates.PairSelectionConfig()
-    pair_matching: matching_pair_matching.PairMatchingConfig = matching_pair_matching.PairMatchingConfig()
-    tilting: matching_pair_matching.AffineSimulationConfig = matching_pair_matching.AffineSimulationConfig()
-    moving: MovingObjectsConfig = MovingObjectsConfig()
+    candidates: Internal[candidates.PairSelectionConfig] = candidates.PairSelectionConfig()
+    pair_matching: Internal[matching_pair_matching.PairMatchingConfig] = matching_pair_matching.PairMatchingConfig()
+    tilting: Internal[matching_pair_matching.AffineSimulationConfig] = matching_pair_matching.AffineSimulationConfig()
+    dynamic_objects: MovingObjectsConfig = MovingObjectsConfig()
 
 
 T = TypeVar("T")

@@ -65,7 +65,7 @@ def fit_gaussians(
         checkpoints=(),
         first_opacity=None,
         control=ControlChoice("prune", prune.Config()),
-        rates=_rates(),
+        lr=_rates(),
     )
     *_, scene = training.refine(Scene(tuple(views), begun), config, seed=seed, max_gaussians=most)
     found = iter(scene.views)

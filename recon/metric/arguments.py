@@ -8,6 +8,8 @@ from typing import Any
 
 from splatnode.capture.process.text import measurement_argument, parse_measurement, sanitize_text
 
+DRIFT_DEG = 0.5  # of odometry's direction after a metre, where nobody tells it
+
 
 def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:
     """Adds the option --marker, which applies to many recordings alike."""
@@ -44,11 +46,20 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
         type=_parse_two_sigmas,
         metavar="METRES,DEGREES",
         help="how unsure each pose is: the standard deviation of its position and of its orientation, absolute in the "
-        "poses' world. With a lens that is told (--intrinsics) the poses then hold the cameras, also where photographs "
-        "share no matches; poses that the photographs contradict are named and let go",
+        "poses' world; a file may tell it for single poses (two more columns of TUM, or sigma_m and sigma_deg in "
+        "transforms.json). With a lens that is told (--intrinsics) the poses then hold the cameras, also where "
+        "photographs share no matches; poses that the photographs contradict are named and let go",
     )
     parser.add_argument(
-        "--poses-only-check",
+        "--poses-drift",
+        type=_parse_drift,
+        metavar="PERCENT[,DEGREES]",
+        help="with sigmas: the poses are odometry's and drift from the first photograph on, a step by PERCENT of its "
+        "length (standard deviation in each direction, and of all lengths alike), its direction by DEGREES a metre, "
+        "growing with the root of the way (default: 0.5), as 2%%,0.5",
+    )
+    parser.add_argument(
+        "--check-poses",
         action="store_true",
         help="only compare the poses with the cameras that the photographs alone tell, and take metres and axes from "
         "them, as without --poses-sigma",
@@ -83,9 +94,35 @@ def _parse_two_sigmas(text: str) -> tuple[float, float]:
     return metres, degrees
 
 
-def trusts_poses(args: argparse.Namespace) -> bool:
-    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far."""
-    return args.poses_sigma is not None and not args.poses_only_check
+def _parse_drift(text: str) -> tuple[float, float]:
+    percent, _, degrees = text.partition(",")
+    try:
+        share, turn = float(percent.strip().removesuffix("%")) / 100.0, float(degrees) if degrees else DRIFT_DEG
+    except ValueError:
+        share = turn = -1.0
+    if not (0.0 < share <= 0.5 and 0.0 <= turn <= 90.0):
+        raise argparse.ArgumentTypeError(
+            f"must be a share above 0 %, up to 50 %, and degrees if you know them, as 2%,0.5; got "
+            f"{sanitize_text(text, 100)!r}"
+        )
+    return share, turn
+
+
+def collect_drift_changes(args: argparse.Namespace) -> dict[str, float]:
+    """Collects the changes of the configuration's `registration` that --poses-drift sets. Raises ValueError."""
+    if args.poses_drift is None:
+        return {}
+    if args.poses is None:
+        raise ValueError("--poses-drift is of --poses FILE, which is not given: which poses drift?")
+    return dict(zip(("poses_drift", "poses_drift_deg"), args.poses_drift, strict=True))
+
+
+def trusts_poses(args: argparse.Namespace, told: bool = False) -> bool:
+    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far.
+
+    `told`: their file says it.
+    """
+    return (told or args.poses_sigma is not None) and not args.check_poses
 
 
 def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
@@ -98,11 +135,11 @@ def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     if (args.stereo is None) != (args.stereo_baseline is None):
         raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
     if args.stereo_baseline is not None:
-        changes |= _parse_length("stereo", args.stereo_baseline)
+        changes |= _parse_length("stereo_baseline", args.stereo_baseline)
     if args.poses_sigma is not None and args.poses is None:
         raise ValueError("--poses-sigma is of --poses FILE, which is not given: how unsure are which poses?")
-    if args.poses_only_check and args.poses is None:
-        raise ValueError("--poses-only-check is of --poses FILE, which is not given: which poses are to be checked?")
+    if args.check_poses and args.poses is None:
+        raise ValueError("--check-poses is of --poses FILE, which is not given: which poses are to be checked?")
     if args.poses_sigma is not None:
         changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes
@@ -110,7 +147,7 @@ def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
 
 def collect_marker_changes(args: argparse.Namespace) -> dict[str, float]:
     """Collects the changes that --marker alone sets. Raises ValueError."""
-    return {} if args.marker is None else _parse_length("marker", args.marker)
+    return {} if args.marker is None else _parse_length("marker_size", args.marker)
 
 
 def _parse_length(what: str, text: str) -> dict[str, float]:

@@ -53,7 +53,7 @@ def gather_evidence(
         gravities={each.name: each.gravity for each in known if each.gravity is not None},
         pairs=tuple(pair for pair in map(make_own_pair, known) if pair is not None),
     )
-    if config.marker_m is None:
+    if config.marker_size_m is None:
         return came
     tell(ProgressStep("looking for markers"))
     return replace(came, sightings=tuple(detect_markers(known, config.marker_dictionary)))

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.calibration.board import DICTIONARIES
+from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.registration.undistortion import radial_of
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -89,9 +90,9 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Standard deviation of each measured distance, as a share of it
     baseline_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.01
     # Side of the black square of printed markers in the scene, metres; nothing: none are looked for. --marker sets it
-    marker_m: Annotated[float, msgspec.Meta(gt=0, le=_LARGEST_MARKER)] | None = None
+    marker_size_m: Annotated[float, msgspec.Meta(gt=0, le=_LARGEST_MARKER)] | None = None
     # Standard deviation of that side as it was measured, metres: what a ruler can tell
-    marker_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_LARGEST_MARKER)] = 0.0005
+    marker_size_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_LARGEST_MARKER)] = 0.0005
     marker_dictionary: str = "4X4_50"  # of OpenCV's ArUco dictionaries, as `splatnode marker` prints, or APRILTAG_36h11
     # Standard deviation of given poses that come without: of each position in each direction, metres
     poses_sigma_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] = 0.01
@@ -100,17 +101,22 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.02
     # Standard deviation of an error that all motions between photographs share, as a share of their length: the radius
     # of wheels is not exactly what it is taken for
-    motions_shared: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.01
+    odometry_scale_sigma: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.01
     # Standard deviation of a motion that comes without one: in each direction, as a share of its length
-    motions_drift: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.02
-    motions_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = 2.0  # and about each axis, degrees
+    odometry_drift: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = MOTION_DRIFT
+    odometry_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = MOTION_SIGMA_DEG  # and about each axis, degrees
     # Metres between the cameras of given stereo pairs; nothing: none are given
-    stereo_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] | None = None
+    stereo_baseline_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] | None = None
     # Standard deviation of that distance, metres
-    stereo_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_MAX_METRES)] = 0.0003
-    network: bool = False  # ask Depth Anything V2 Metric Indoor Small, where its weights are
+    stereo_baseline_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_MAX_METRES)] = 0.0003
+    depth_network: bool = False  # ask Depth Anything V2 Metric Indoor Small, where its weights are
     # Standard deviation of the network's error in a place, all views alike, as a share
-    network_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.15
+    depth_network_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.15
+
+    @property
+    def poses_sigmas(self) -> tuple[float, float]:
+        """Metres and degrees."""
+        return self.poses_sigma_m, self.poses_sigma_deg
 
     @property
     def baselines(self) -> tuple[Baseline, ...]:
@@ -121,10 +127,10 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(
                 f"a marker's dictionary must be one of {', '.join(DICTIONARIES)}; got {self.marker_dictionary[:40]!a}"
             )
-        if self.marker_m is not None and self.marker_sigma_m >= 0.5 * self.marker_m:
+        if self.marker_size_m is not None and self.marker_size_sigma_m >= 0.5 * self.marker_size_m:
             raise ValueError(
-                f"a marker's side must be known to less than half of itself, got {self.marker_m:g} m with a standard "
-                f"deviation of {self.marker_sigma_m:g} m"
+                f"a marker's side must be known to less than half of itself, got {self.marker_size_m:g} m with a "
+                f"standard deviation of {self.marker_size_sigma_m:g} m"
             )
         for baseline in self.baselines:
             if not 1 / _MAX_METRES <= baseline.metres <= _MAX_METRES or baseline.first == baseline.second:

@@ -32,7 +32,7 @@ from splatnode.recon.metric.stereo import (
 )
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.snapshot import InGivenWorld, Snapshot, format_rounded_up
+from splatnode.recon.result.snapshot import GivenCameraPose, InGivenWorld, Snapshot, format_rounded_up
 from splatnode.recon.result.verdict import Scale, join_sentences
 
 # Of the scene's size: a grid as coarse as its coordinates may be. A render then has 40 dB against the same elsewhere.
@@ -66,6 +66,8 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
     unit = agreed.metres_per_unit
     to_metres = Similarity(unit, np.eye(3), np.zeros(3)) if aligned is None else aligned.rescale(unit)
     metric = _transform_snapshot(snapshot, to_metres)
+    if aligned is not None:
+        metric = _add_given_poses(metric, config, evidence)
     return replace(metric, scale=Scale(True, source, (low, high)))
 
 
@@ -76,9 +78,9 @@ def _collect_measurements(
     said: list[Measurement | str] = [
         estimate_scale_from_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines
     ]
-    if config.marker_m is not None:
+    if config.marker_size_m is not None:
         said += estimate_scale_from_markers(
-            make_metric_views(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m
+            make_metric_views(snapshot), evidence.sightings, config.marker_size_m, config.marker_size_sigma_m
         )
     aligned = None
     if snapshot.given is not None:
@@ -99,13 +101,13 @@ def _collect_measurements(
     if snapshot.rig is not None and snapshot.rig.metres_per_unit is not None:
         known = f"the given rig of {len(snapshot.rig.mounts)} cameras"
         said.append(Measurement(snapshot.rig.metres_per_unit, snapshot.rig.scale_sigma, known))
-    said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.motions_shared)
+    said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.odometry_scale_sigma)
     for (baseline_m, sigma_m), pairs in _group_stereo_pairs(config, evidence).items():
         said.append(
             estimate_scale_from_stereo(make_metric_views(snapshot), snapshot.landmarks, pairs, baseline_m, sigma_m)
         )
-    if config.network:
-        said.append(_estimate_scale_from_network(snapshot, config.network_sigma))
+    if config.depth_network:
+        said.append(_estimate_scale_from_network(snapshot, config.depth_network_sigma))
     return said, aligned
 
 
@@ -141,7 +143,7 @@ def _explain_too_far(snapshot: Snapshot, aligned: PoseAlignment) -> str:
 
 def _group_stereo_pairs(config: MetricConfig, evidence: Evidence) -> dict[tuple[float, float], list[StereoPair]]:
     """The stereo pairs by how far apart their cameras are, and its standard deviation, metres."""
-    usual = None if config.stereo_m is None else (config.stereo_m, config.stereo_sigma_m)
+    usual = None if config.stereo_baseline_m is None else (config.stereo_baseline_m, config.stereo_baseline_sigma_m)
     rigs: dict[tuple[float, float], list[StereoPair]] = {} if usual is None else {usual: []}
     for pair in evidence.pairs:
         own = usual if pair.baseline is None else (pair.baseline.metres, pair.baseline.sigma_m)
@@ -155,6 +157,16 @@ def _estimate_scale_from_network(snapshot: Snapshot, sigma: float) -> Measuremen
     if loaded is None:
         return "no weights of the metric network: splatnode weights list tells where they are had"
     return estimate_scale_from_network(snapshot, MetricDepth(loaded.name, loaded), sigma)
+
+
+def _add_given_poses(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Snapshot:
+    """The snapshot in the world of given poses, with these beside its cameras."""
+    given = {
+        name: GivenCameraPose(pose.matrix, pose.sigma_m, pose.sigma_deg) for name, pose in evidence.tracked.items()
+    }
+    given |= {name: GivenCameraPose(T, *config.poses_sigmas) for name, T in (evidence.poses or {}).items()}
+    cameras = tuple(replace(camera, given=given.get(camera.name)) for camera in snapshot.cameras)
+    return replace(snapshot, cameras=cameras)
 
 
 def _transform_snapshot(snapshot: Snapshot, by: Similarity) -> Snapshot:

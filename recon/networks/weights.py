@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from splatnode.capture.process.files import NotOwnerOnly, check_owner_only, home
+from splatnode.capture.process.library_lines import ignore_file_warnings
 from splatnode.capture.process.terminal import progress
 from splatnode.capture.process.text import sanitize_text
 
@@ -373,7 +374,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     _check_archive(path)
     try:
         # Only plain data and this one class, which holds attributes and does nothing, are let through.
-        with torch.serialization.safe_globals([argparse.Namespace]):
+        with ignore_file_warnings(), torch.serialization.safe_globals([argparse.Namespace]):
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except pickle.UnpicklingError as error:
         named = re.search(r"GLOBAL ([\w.]+)", str(error))

@@ -17,6 +17,7 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import pseudo_views
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
@@ -29,10 +30,13 @@ class EnsembleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     members: Annotated[int, Meta(ge=1)] = 1  # scenes that are refined; 1: that one, and nothing after it
     # Steps of the refinement after them, on photographs as often as on pseudo views; nothing is pruned any more
-    iterations: Annotated[int, Meta(ge=1)] = 400
-    rates: Annotated[float, Meta(gt=0, le=1)] = 0.3  # its step sizes of Gaussians, of those in `optimize.rates`
-    pseudo_views: Annotated[int, Meta(ge=1)] = 6  # for each photograph; at most as many as there are steps on them
-    off_path: Annotated[float, Meta(ge=0)] = 0.3  # their largest distance from the cameras' path, in its steps
+    iterations: Internal[Annotated[int, Meta(ge=1)]] = 400
+    # Its step sizes of Gaussians, of those in `optimize.lr`
+    rates: Internal[Annotated[float, Meta(gt=0, le=1)]] = 0.3
+    # For each photograph; at most as many as there are steps on them
+    pseudo_views: Internal[Annotated[int, Meta(ge=1)]] = 6
+    # Their largest distance from the cameras' path, in its steps
+    off_path: Internal[Annotated[float, Meta(ge=0)]] = 0.3
 
 
 def seed_of(member: int, seed: int) -> int:
@@ -77,9 +81,9 @@ MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are 
 class DropoutConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Dropout of Gaussians whose depth is uncertain, so that none relies on another in front of it or behind it."""
 
-    share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
-    sure: float = 0.6  # least confidence of stereo at which the uncertainty is 0
-    until: float = 0.7  # share of the refinement after which no Gaussian is left out
+    share: Internal[float] = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
+    sure: Internal[float] = 0.6  # least confidence of stereo at which the uncertainty is 0
+    until: Internal[float] = 0.7  # share of the refinement after which no Gaussian is left out
 
 
 class Dropout:

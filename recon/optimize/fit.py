@@ -49,7 +49,7 @@ class Trainer:
         self._scene, self._config, self._max_gaussians = scene, config, max_gaussians
         gaussians = scene.gaussians.map(lambda tensor: tensor.clone())
         self._gaussians = gaussians
-        rates = config.rates
+        rates = config.lr
         self._rates = {name: getattr(rates, name) for name in PARAMETERS}
         self._finals = dict.fromkeys(PARAMETERS, rates.final) | {"means": rates.final_means}
         self._shifts = Shifts(gaussians) if rates.means_unit == "extent" else None  # who moves the means; None: Adam
@@ -72,13 +72,13 @@ class Trainer:
         measures = (*(self._measure for _ in scene.views), *(None for _ in beside))
         self._images = {
             half: [
-                make_training_image(view, mask, scale, config.dssim, device, keep=few, measure=measure)
+                make_training_image(view, mask, scale, config.ssim_lambda, device, keep=few, measure=measure)
                 for view, mask, measure in zip(views, shown, measures, strict=True)
             ]
             for half, scale in _SCALES.items()
             if config.half_resolution_share > 0 or not half
         }
-        self._regularisation = _regularisation(scene, fitted, config.regularise, seed)
+        self._regularisation = _regularisation(scene, fitted, config.regularizers, seed)
         self._iterations = scene.iterations
         # Photometric, of each step on a view of the scene. In one block: small tensors that are kept among those of the
         # steps would split the memory that these give back.
@@ -115,7 +115,7 @@ class Trainer:
         self._move_gaussians(progress)
         if refine_pose and T_world_camera.grad is not None:
             gradient = twist_gradient(self._Ts_world_camera[index].detach(), T_world_camera.grad.to(_PROCESSOR))
-            self._move_camera(index, gradient, self._config.rates.final_pose**progress)
+            self._move_camera(index, gradient, self._config.lr.final_pose**progress)
         self._iterations += 1
         self._control_density(index, self._images[half], progress)
         self._adam.zero_grad()

@@ -13,6 +13,7 @@ from msgspec import Meta
 from torch import Tensor
 from torch.nn import functional
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.core import library
 from splatnode.recon.networks.lpips import MIN_SIDE
 from splatnode.recon.optimize.losses.loss import Schedule
@@ -273,8 +274,8 @@ def _address(tensor: Tensor | None) -> ctypes.c_void_p | None:
 class PerceptualLossConfig(Schedule, frozen=True, forbid_unknown_fields=True):
     """None by default. The weight is of each step, in the mean."""
 
-    start: float = 0.5  # share of the iterations after which it counts
-    every: Annotated[int, Meta(ge=1)] = 5  # steps from one in which it counts to the next one
+    start: Internal[float] = 0.5  # share of the iterations after which it counts
+    every: Internal[Annotated[int, Meta(ge=1)]] = 5  # steps from one in which it counts to the next one
 
     def weight_in_step(self, step: int, progress: float) -> float:
         """The weight in step `step`, counted from 0, at `progress` in [0, 1]; 0 where the loss is not computed."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.networks.depth_anything import load_relative
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, LossChoice, Schedule
 from splatnode.recon.optimize.point_render import PointRender, render_points
@@ -128,10 +129,12 @@ class RegularizerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """
 
     losses: Mapping[str, LossChoice] = {}  # by names of your own, which the report uses; a weight of 0 costs nothing
-    pseudo_views: int = 12  # how many views between the cameras are drawn for losses that need them
-    off_path: float = 0.1  # largest distance of these from the cameras' path, in distances of neighbouring cameras
-    nearest_points: int = 8  # points that are blended in a pixel (K of equation 6)
-    min_confidence: float = 0.3  # least confidence of the points that are rendered and of the depths that are compared
+    pseudo_views: Internal[int] = 12  # how many views between the cameras are drawn for losses that need them
+    # Largest distance of these from the cameras' path, in distances of neighbouring cameras
+    off_path: Internal[float] = 0.1
+    nearest_points: Internal[int] = 8  # points that are blended in a pixel (K of equation 6)
+    # Least confidence of the points that are rendered and of the depths that are compared
+    min_confidence: Internal[float] = 0.3
 
     @property
     def active_losses(self) -> dict[str, LossChoice]:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize import ensemble as optimize_ensemble
 from splatnode.recon.optimize import photometric_losses, regularizers
 from splatnode.recon.optimize.control import prune
@@ -50,16 +51,16 @@ class LearningRates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     means: Rate = 0.4  # of positions, in `means_unit`
     # extent: standard deviations of each Gaussian along its axes; depth: the median depth, in every direction alike
-    means_unit: Literal["extent", "depth"] = "extent"
+    means_unit: Internal[Literal["extent", "depth"]] = "extent"
     quats: Rate = 2e-2  # of orientations, as quaternions
     log_scales: Rate = 1e-1  # of the logarithms of the standard deviations
     logit_opacities: Rate = 1e-1  # of the logits of the opacities
     sh: Rate = 3e-2  # of colours, as spherical harmonics
-    translation: Rate = 2e-4  # of cameras' positions
-    rotation: Rate = 2e-4  # of cameras' rotations, radians
-    final_means: Share = 0.1  # part to which the rate of the means has fallen at the end, exponentially
-    final: Share = 0.3  # part to which the other rates of the Gaussians have fallen
-    final_pose: Share = 0.1  # part to which those of the cameras have fallen
+    translation: Internal[Rate] = 2e-4  # of cameras' positions
+    rotation: Internal[Rate] = 2e-4  # of cameras' rotations, radians
+    final_means: Internal[Share] = 0.1  # part to which the rate of the means has fallen at the end, exponentially
+    final: Internal[Share] = 0.3  # part to which the other rates of the Gaussians have fallen
+    final_pose: Internal[Share] = 0.1  # part to which those of the cameras have fallen
 
 
 # Of few steps: steps of a share of a Gaussian's extent take some hundred to settle. Chosen for a refinement of 500.
@@ -70,20 +71,21 @@ class RefinementConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The refinement of the preset `balanced`."""
 
     iterations: Annotated[int, Meta(ge=0)] = 500  # steps of the optimiser, one view each
-    checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown and judged, besides the last one
-    looks: tuple[int, ...] = ()  # iterations after which it is shown, too, to somebody who watches
-    half_resolution_share: Share = 0.0  # share of the iterations, at the start, on images of half the size
-    dssim: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
+    # Iterations after which the scene is shown and judged, besides the last one
+    checkpoints: Internal[tuple[int, ...]] = (150,)
+    looks: Internal[tuple[int, ...]] = ()  # iterations after which it is shown, too, to somebody who watches
+    half_resolution_share: Internal[Share] = 0.0  # share of the iterations, at the start, on images of half the size
+    ssim_lambda: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
     # Largest opacity of what photographs seeded, as the refinement of a begun scene starts: soft Gaussians settle more
     # freely, in a hundred steps and more, so they are left as seeded where a time limit may end it. null: as seeded
-    first_opacity: Annotated[float, Meta(gt=0, lt=1)] | None = 0.1
+    first_opacity: Internal[Annotated[float, Meta(gt=0, lt=1)] | None] = 0.1
     perceptual: photometric_losses.PerceptualLossConfig = (
         photometric_losses.PerceptualLossConfig()
     )  # LPIPS of renders against photographs
     dropout: optimize_ensemble.DropoutConfig = optimize_ensemble.DropoutConfig()
     refine_poses: bool = True  # whether cameras are refined together with the Gaussians
-    rates: LearningRates = LearningRates()
-    regularise: regularizers.RegularizerConfig = (
+    lr: LearningRates = LearningRates()  # Adam's learning rates at the start; lengths over the median depth
+    regularizers: regularizers.RegularizerConfig = (
         regularizers.RegularizerConfig()
     )  # losses beside the photometric one; none by default
     # Density control, which adds and removes Gaussians; None: their number stays
@@ -183,7 +185,7 @@ def _run_refinement(
 
 def _make_agreement_config(config: RefinementConfig) -> RefinementConfig:
     """Returns the configuration of the refinement after an ensemble."""
-    given, rates = config.ensemble, config.rates
+    given, rates = config.ensemble, config.lr
     shorter = {name: given.rates * getattr(rates, name) for name in PARAMETERS}
     return msgspec.structs.replace(
         config,
@@ -191,7 +193,7 @@ def _make_agreement_config(config: RefinementConfig) -> RefinementConfig:
         checkpoints=(),
         looks=(),
         half_resolution_share=0.0,
-        rates=msgspec.structs.replace(rates, **shorter),
+        lr=msgspec.structs.replace(rates, **shorter),
         control=None,
     )
 

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph
 from splatnode.recon.priors import stereo
@@ -19,11 +20,11 @@ from splatnode.recon.registration.registration import Registration
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    stereo: stereo.StereoConfig = stereo.StereoConfig()
-    seed: int = 0  # of the random planes that stereo begins with
+    stereo: Internal[stereo.StereoConfig] = stereo.StereoConfig()
+    seed: Internal[int] = 0  # of the random planes that stereo begins with
     # Few sparse points lie on what is far, so stereo searches this many times farther than they reach; in inverse
     # depth, in which it samples, that is a small part of the range.
-    far_margin: float = 8.0
+    far_margin: Internal[float] = 8.0
 
 
 class DepthEstimator(Protocol):

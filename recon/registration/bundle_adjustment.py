@@ -36,16 +36,33 @@ _MIN_EIGENVALUE = 1e-14  # of the information at unit curvature: what is flatter
 
 @dataclass(frozen=True, eq=False)
 class GivenPoses:
-    """Poses of C cameras that are known within sigmas: Gaussian priors, each independent of the others."""
+    """Poses of C cameras that are known within sigmas: Gaussian priors, which may depend on each other, as by drift."""
 
     rotations: Array  # (C, 3, 3) world to camera
     centres: Array  # (C, 3) world
     sigmas: Array  # (C, 2) of a turn about each axis, radians, and of a position in each direction; inf: not known
+    # (6 C, 6 C) covariance of the errors in the cameras' axes, of each a turn and a shift, in place of `sigmas`, which
+    # tell what is known at all; None: each pose is independent of the others
+    joint: Array | None = None
+
+    @property
+    def covariance(self) -> Array:
+        """(6 C, 6 C); 0 where nothing is known."""
+        known = np.repeat(self.is_held, _POSE)
+        if self.joint is not None:
+            return np.where(known[:, None] & known, self.joint, 0.0)
+        return np.diag(np.where(known, np.repeat(self.sigmas, 3, axis=1).ravel(), 0.0) ** 2)
 
     @property
     def information(self) -> Array:
-        """(C, 2)"""
-        return 1.0 / self.sigmas**2
+        """(6 C, 6 C) of the poses that hold their cameras; 0 where nothing is known."""
+        found = np.zeros((_POSE * len(self.sigmas),) * 2)
+        (known,) = np.nonzero(np.repeat(self.is_held, _POSE))
+        if self.joint is None:
+            found[known, known] = 1.0 / np.repeat(self.sigmas, 3, axis=1).ravel()[known] ** 2
+        else:
+            found[np.ix_(known, known)] = np.linalg.inv(self.joint[np.ix_(known, known)])
+        return found
 
     @property
     def is_held(self) -> npt.NDArray[np.bool_]:
@@ -60,7 +77,9 @@ class GivenPoses:
 
     def relabel(self, old: Index) -> GivenPoses:
         """Camera i has the pose of camera `old[i]`."""
-        return GivenPoses(self.rotations[old], self.centres[old], self.sigmas[old])
+        rows = (_POSE * np.asarray(old)[:, None] + np.arange(_POSE)).ravel()
+        joint = None if self.joint is None else self.joint[np.ix_(rows, rows)]
+        return GivenPoses(self.rotations[old], self.centres[old], self.sigmas[old], joint)
 
 
 @dataclass(frozen=True, eq=False)
@@ -420,7 +439,7 @@ def _native(
         *(pointer(array) for array in arrays),
         len(problem.rotations), len(problem.log_focals), len(problem.points),
         fixed_camera if problem.given is None else -1, config.robust_px**2,
-        *(pointer(array) for array in held),
+        *(pointer(array) for array in held), *([None] * (3 - len(held))),
         *(pointer(array) for array in tied),
         rig.num_sets, rig.num_mounts,
     )  # fmt: skip
@@ -428,10 +447,9 @@ def _native(
 
 
 def _pack_known_poses(problem: Problem, config: BundleAdjustmentConfig) -> list[Array]:
-    """Rotations, centres and information of the given poses, as the core reads them; 0 where nothing is given."""
+    """Rotations, centres and information of the given poses, as the core reads them; none where nothing is given."""
     if problem.given is None:
-        count = len(problem.rotations)
-        return [np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 2))]
+        return []
     given = problem.given
     values = given.rotations, given.centres, config.noise_px**2 * given.information
     return [np.ascontiguousarray(each, dtype=np.float64) for each in values]

@@ -66,7 +66,7 @@ def _along_lines(one: Keyframe, other: Keyframe, given: Given, pair: Pair) -> In
     lines = np.c_[rays[0], np.ones(len(rays[0]))] @ (cross_matrix(translation[None])[0] @ rotation).T
     lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
     pixel = longer_side(other.frame) / REFERENCE_SIDE / _focal(other)  # at REFERENCE_SIDE, at depth 1
-    turned = float(np.hypot(*poses.sigmas[[i, j], 0]))
+    turned = float(np.hypot(*(poses.sigmas[[i, j], 0] if poses.joint is None else given.angle_sigmas[[i, j]])))
     band = np.clip(_SIGMAS * np.sqrt(2.0) * turned / pixel, _LEAST_PX, _WIDEST_PX) * pixel
     along, *beside = _mutual(descriptors, lines, rays[1], band, (0.0, *_ASIDE))
     by_chance = max(map(len, beside))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.registration import bundle_adjustment
+from splatnode.recon.registration.drift import NO_DRIFT, Drift, compute_drift_covariance
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +27,12 @@ class Given:
     poses: bundle_adjustment.GivenPoses
     origin: Array  # (3,) metres, in the given world
     metres: float
+    away: float  # how far away what the cameras look at is, where their axes tell it; else some distance
+
+    @property
+    def angle_sigmas(self) -> Array:
+        """(C,) radians by which points appear elsewhere, as the poses' sigmas and the distance are; inf: no pose."""
+        return np.hypot(self.poses.sigmas[:, 0], self.poses.sigmas[:, 1] / self.away)
 
 
 @dataclass(frozen=True)
@@ -74,10 +81,13 @@ class Offset:
         return float(np.degrees(np.arccos(np.clip((np.trace(self.T_camera_given[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
 
 
-def collect_known_poses(keyframes: Sequence[Keyframe], offset: Offset | None = None) -> Given | None:
+def collect_known_poses(
+    keyframes: Sequence[Keyframe], offset: Offset | None = None, drift: Drift = NO_DRIFT
+) -> Given | None:
     """The poses of those keyframes whose lens is told; None where fewer than two hold a scale.
 
-    They must be farther apart than they are unsure. `offset` is taken out of them.
+    They must be farther apart than they are unsure. `offset` is taken out of them; they drift in the order in which
+    their frames came.
     """
     known = [i for i, keyframe in enumerate(keyframes) if has_pose(keyframe)]
     if len(known) < _LEAST_POSES:
@@ -96,9 +106,28 @@ def collect_known_poses(keyframes: Sequence[Keyframe], offset: Offset | None = N
     if apart <= np.median(sigmas[known, 1]):
         return None
     origin, metres = centres[known].mean(0), max(apart, _LEAST_SPREAD)
+    joint = None
+    if drift != NO_DRIFT:
+        way = sorted(known, key=lambda i: (keyframes[i].frame.frame_id, keyframes[i].name))
+        sigmas, joint = _let_drift(rotations, centres, sigmas, way, drift, metres)
     sigmas[:, 1] /= metres
     centres[known] = (centres[known] - origin) / metres
-    return Given(bundle_adjustment.GivenPoses(rotations, centres, sigmas), origin, metres)
+    poses = bundle_adjustment.GivenPoses(rotations, centres, sigmas, joint)
+    depths = axis_depths(rotations[known], centres[known])
+    return Given(poses, origin, metres, float(np.median(depths)) if len(depths) else _FAR_OFF)
+
+
+def _let_drift(
+    rotations: Array, centres: Array, sigmas: Array, way: Sequence[int], drift: Drift, metres: float
+) -> tuple[Array, Array]:
+    """The sigmas (C, 2) of poses that drift on their `way`, and the covariance (6 C, 6 C), whose unit has `metres`."""
+    rows = (6 * np.array(way)[:, None] + np.arange(6)).ravel()
+    joint = np.zeros((6 * len(sigmas),) * 2)
+    joint[np.ix_(rows, rows)] = compute_drift_covariance(rotations[way], centres[way], drift)
+    joint[rows, rows] += np.repeat(sigmas[way] ** 2, 3, axis=1).ravel()
+    wider = np.sqrt(np.diag(joint).reshape(-1, 2, 3).mean(2))
+    unit = np.tile(np.repeat([1.0, 1.0 / metres], 3), len(sigmas))
+    return np.where(np.isfinite(sigmas), wider, np.inf), unit[:, None] * joint * unit
 
 
 def has_pose(keyframe: Keyframe) -> bool:

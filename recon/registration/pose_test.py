@@ -31,6 +31,7 @@ class Residual:
     turn: Array  # (3,) radians, about the camera's axes
     shift: Array  # (3,) along them, in the problem's unit
     probability: float  # that an error as large comes by chance; 1 where images tell nothing
+    squared: float = 0.0  # its length in its own sigmas, squared: by how much the cost falls without the pose
 
     @property
     def sigmas(self) -> float:
@@ -46,20 +47,21 @@ def residuals(
     Where `problem.given` holds a camera, its residual is against all others; where not, against the images alone.
     """
     held = np.zeros(len(given.sigmas), bool) if problem.given is None else problem.given.is_held
-    blocks, found = covariance.cameras, {}
+    blocks, found, priors = covariance.cameras, {}, given.covariance
     for camera in np.flatnonzero(given.is_held).tolist():
         if not np.isfinite(blocks[camera]).all() or not blocks[camera].any():
             continue
         turn, shift, by_pose = deviation(problem, given, camera)
-        whiten = np.repeat(1.0 / given.sigmas[camera], 3)
-        error = whiten * np.concatenate([turn, shift])
-        known = (whiten[:, None] * by_pose) @ blocks[camera] @ (whiten[:, None] * by_pose).T
+        own = slice(6 * camera, 6 * camera + 6)
+        whiten = np.linalg.inv(np.linalg.cholesky(priors[own, own]))
+        error = whiten @ np.concatenate([turn, shift])
+        known = whiten @ by_pose @ blocks[camera] @ by_pose.T @ whiten.T
         of_residual = np.eye(6) - known if held[camera] else np.eye(6) + known
         variances, directions = np.linalg.eigh((of_residual + of_residual.T) / 2.0)
         counts = variances > _TOLD
-        squared = (directions.T @ error)[counts] ** 2 / variances[counts]
-        probability = float(chi2.sf(squared.sum(), counts.sum())) if counts.any() else 1.0
-        found[camera] = Residual(turn, shift, probability)
+        squared = float(((directions.T @ error)[counts] ** 2 / variances[counts]).sum())
+        probability = float(chi2.sf(squared, counts.sum())) if counts.any() else 1.0
+        found[camera] = Residual(turn, shift, probability, squared)
     return found
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.geometry import compute_rms_radius
+from splatnode.recon.geometry import cross_matrix
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
@@ -19,6 +19,7 @@ from splatnode.recon.registration import (
     self_calibration,
 )
 from splatnode.recon.registration.bundle_adjustment import differentiate_by_pose
+from splatnode.recon.registration.drift import Drift
 from splatnode.recon.registration.known_poses import Given, GivenWorld, Offset
 from splatnode.recon.registration.posed_mapping import PosedMap
 from splatnode.recon.registration.registration import (
@@ -49,7 +50,8 @@ def register_posed(
     """
     order = sort_by_content(keyframes)
     ordered, rank = [keyframes[index] for index in order], np.argsort(order)
-    given = known_poses.collect_known_poses(ordered, offset)
+    drift = Drift(config.poses_drift, config.poses_drift_deg)
+    given = known_poses.collect_known_poses(ordered, offset, drift)
     if given is None:
         return None
     grouping = self_calibration.group(ordered, across_sizes=True)
@@ -94,19 +96,31 @@ def _world(
     # What is not known of the offset is not known of any camera.
     turn_sigma, shift_sigma = (0.0, 0.0) if offset is None else (offset.turn_sigma, offset.shift_sigma)
     of_turn, of_shift = turn_sigma**2 * np.eye(3), (shift_sigma * unit / given.metres) ** 2 * np.eye(3)
-    sigmas = given.poses.sigmas[np.argsort(order)][held, 1] * given.metres
-    centres = given.metres * bundle_adjustment.centres(estimate)[held]
     return GivenWorld(
         scale=given.metres / unit,
         rotation=to_first.T,
         translation=given.origin - given.metres * to_first.T @ from_first,
-        scale_sigma=float(np.median(sigmas) / (compute_rms_radius(centres) * np.sqrt(len(held)))),
+        scale_sigma=0.0 if estimate.given is None else compute_scale_sigma(estimate.given),
         deviations=tuple(replace(each, index=order[each.index]) for each in built.deviations),
         offset=offset,
         turn_covariances=np.stack([turn @ joint @ turn.T + of_turn for turn, _ in in_world]),
         centre_covariances=np.stack([move @ joint @ move.T + of_shift for _, move in in_world]),
         held=frozenset(held),
     )
+
+
+def compute_scale_sigma(given: bundle_adjustment.GivenPoses) -> float:
+    """Standard deviation of the logarithm of the scale at which cameras of a known shape fit given poses."""
+    held = np.flatnonzero(given.is_held)
+    middle = given.centres[held].mean(0)
+    by_similarity = np.zeros((6 * len(given.centres), 7))
+    for camera in held.tolist():
+        rotation, off = given.rotations[camera], given.centres[camera] - middle
+        own = slice(6 * camera, 6 * camera + 3), slice(6 * camera + 3, 6 * camera + 6)
+        by_similarity[own[0], :3], by_similarity[own[1], 3:6] = rotation, rotation
+        by_similarity[own[1], :3], by_similarity[own[1], 6] = -rotation @ cross_matrix(off[None])[0], rotation @ off
+    covariance = np.linalg.pinv(by_similarity.T @ given.information @ by_similarity)
+    return float(np.sqrt(covariance[6, 6]))
 
 
 def _unit(built: PosedMap, found: Registration) -> float:

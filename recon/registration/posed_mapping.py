@@ -7,7 +7,7 @@ pose is let go, the worst first; the images alone place its camera then, where t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -21,12 +21,20 @@ from splatnode.recon.registration.subpixel import PatchImage
 
 Array = npt.NDArray[np.float64]
 
-# Images count 2.5 times less sure than by themselves: what lenses and shutters do otherwise than the model is the same
-# in all images, and a given pose that is true must not be let go for it
+# First observations decide where cameras are, each as if it were one of its own: poses do not bend what images agree
+# on, and what is left of the errors is noise of the images
+_OWN_PX = 0.5  # of an observation, at REFERENCE_SIDE, before errors are known
+# Then poses and images are weighed against each other, as unsure as both are. Images count 2.5 times less sure than by
+# themselves: what lenses and shutters do otherwise than the model is the same in all images, and a given pose that is
+# true must not be let go for it
 _LESS_SURE = 2.5
-_NOISE_PX = 12.0  # of an observation before errors are known, at REFERENCE_SIDE: as many errors are alike as above
+# Of an observation, at REFERENCE_SIDE, at least: what is alike in all of an image does not fall as aligned patches do
+_LEAST_PX = 0.15
+_WIDE_PX = 12.0  # of the robust loss then: what poses do to all observations alike makes none of them an outlier
+# Twice the logarithm of the odds (100 to 1) by which a pose must be likelier false than another to be let go alone
+_DECIDED = 2.0 * math.log(100.0)
 _FIRST_ERRORS = 3.0  # sigmas of the given poses, in pixels, up to which observations are kept at first
-_MOST_TOLERANCE = 24.0  # times the largest error of an observation
+_MOST_TOLERANCE = 12.0  # times the largest error of an observation
 _LEAST_HELD = 2  # poses that must stay
 _DOUBTED_RATIO = 0.6  # share of a view's matches that fit, below which its pose is doubted
 _MORE, _MORE_POINTS = 1.5, 15  # factor and number by which more observations must fit another pose
@@ -56,13 +64,14 @@ def build_map(
 
     `focals` (one a lens) are in pixels.
     """
-    config = _less_sure(config)
-    partial = _adjust_until_settled(
-        problem, _start(problem, focals, given), _first_tolerance(problem, focals, given), config
-    )
+    config, alike = _count_each(config), _LESS_SURE * math.sqrt(config.finishing.correlated)
+    tolerance = _first_tolerance(problem, focals, given, config)
+    partial = _adjust_until_settled(problem, _start(problem, focals, given), tolerance, config)
+    pause()
+    partial = _release_single(problem, partial, given, config, alike)
     pause()
     partial = _release_undecided_pairs(problem, _let_go(problem, partial, config), config)
-    partial = _test_poses(problem, partial, given, config)
+    partial = _test_poses(problem, _count_as_given(problem, partial), given, config, alike)
     pause()
     if partial is None:
         return None
@@ -71,13 +80,13 @@ def build_map(
     finished = _finish_map(problem, partial, images, config)
     for _ in range(_ROUNDS):
         pause()
-        again = _test_poses(problem, finished.map, given, config, finished.loss)
+        again = _test_poses(problem, finished, given, config, alike)
         if again is None:
             return None
         if again is finished.map:
             break
         finished = _finish_map(problem, again, images, config)
-    finished = _remove_unseen_cameras(finished)
+    finished = _remove_unseen_cameras(_weigh(problem, finished, alike))
     return PosedMap(
         incremental_mapper.make_map(
             problem, finished, config.incremental.triangulation.max_error_px, len(problem.lenses)
@@ -86,9 +95,30 @@ def build_map(
     )
 
 
-def _less_sure(config: incremental_mapper.MapperConfig) -> incremental_mapper.MapperConfig:
-    correlated = _LESS_SURE**2 * config.finishing.correlated
-    return msgspec.structs.replace(config, finishing=msgspec.structs.replace(config.finishing, correlated=correlated))
+def _count_each(config: incremental_mapper.MapperConfig) -> incremental_mapper.MapperConfig:
+    """The configuration under which each observation counts as one of its own."""
+    return msgspec.structs.replace(config, finishing=msgspec.structs.replace(config.finishing, correlated=1.0))
+
+
+def _count_as_given(problem: MapperInput, partial: PartialMap) -> incremental_mapper.FinalMap:
+    """The map with the noise that observations have before errors are known."""
+    noise_px = _OWN_PX * float(np.median(problem.scale))
+    return incremental_mapper.FinalMap(partial, bundle_adjustment.BundleAdjustmentConfig(noise_px=noise_px), 0.0)
+
+
+def _weigh(problem: MapperInput, finished: incremental_mapper.FinalMap, alike: float) -> incremental_mapper.FinalMap:
+    """The map in which given poses and images count as they are unsure; the same points, by the same observations.
+
+    The noise of `finished` is that of an observation; what is alike in many makes each `alike` times less sure.
+    """
+    scale = float(np.median(problem.scale))
+    noise_px = alike * max(finished.loss.noise_px, _LEAST_PX * scale)
+    loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=_WIDE_PX * scale, noise_px=noise_px)
+    partial = finished.map
+    if len(partial.estimate.points):
+        estimate = bundle_adjustment.adjust(partial.estimate, partial.prior, loss, partial.registered[0])
+        partial = replace(partial, estimate=estimate)
+    return replace(finished, map=partial, loss=loss)
 
 
 def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> PartialMap:
@@ -107,13 +137,17 @@ def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> Parti
     return PartialMap(known, replace(estimate, given=poses), prior, np.zeros(0, np.int64))
 
 
-def _first_tolerance(problem: MapperInput, focals: Sequence[float], given: Given) -> float:
+def _first_tolerance(
+    problem: MapperInput, focals: Sequence[float], given: Given, config: incremental_mapper.MapperConfig
+) -> float:
     """Returns how far the poses' sigmas move points in the worst view, as a multiple of the largest error."""
     known = np.flatnonzero(given.poses.is_held)
     lenses = [problem.views[i].lens for i in known]
-    turns = given.poses.sigmas[known, 0] * np.array(focals)[lenses] / problem.scale[known]
-    # Positions that are known as well as orientations move points as much: how far the scene is is not known yet.
-    most = _FIRST_ERRORS * math.sqrt(2.0) * float(turns.max())
+    per_radian = np.array(focals)[lenses] / problem.scale[known]
+    # Absolute positions that are known as well as orientations move points as much, however far away the scene is
+    of_turns, of_both = math.sqrt(2.0) * given.poses.sigmas[known, 0], given.angle_sigmas[known]
+    angles = of_turns if given.poses.joint is None else np.maximum(of_turns, of_both)
+    most = _FIRST_ERRORS * float((angles * per_radian).max()) / config.incremental.triangulation.max_error_px
     return float(np.clip(most, incremental_mapper.SETTLED_TOLERANCE, _MOST_TOLERANCE))
 
 
@@ -124,7 +158,7 @@ def _adjust_until_settled(
     scale = float(np.median(problem.scale))
     while True:
         robust_px = max(config.incremental.robust_px, tolerance / incremental_mapper.SETTLED_TOLERANCE) * scale
-        loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=robust_px, noise_px=_NOISE_PX * scale)
+        loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=robust_px, noise_px=_OWN_PX * scale)
         settings = config.incremental.triangulation
         partial = incremental_mapper.adjust(problem, partial, problem.growing_tracks, loss, tolerance, settings)
         if tolerance <= incremental_mapper.SETTLED_TOLERANCE:
@@ -144,6 +178,65 @@ def _release_poses(partial: PartialMap, views: Sequence[int]) -> PartialMap:
     if given is None:
         raise AssertionError("given poses hold the map")
     return replace(partial, estimate=replace(partial.estimate, given=given.release(views)))
+
+
+def _release_single(
+    problem: MapperInput, partial: PartialMap, given: Given, config: incremental_mapper.MapperConfig, alike: float
+) -> PartialMap:
+    """The map without the one pose that explains by itself all that is contradicted; without all that may be it.
+
+    As it is where nothing is contradicted, or no single pose explains it.
+    """
+    doubted, _ = _find_contradictions(problem, partial, given, config, alike)
+    explained: dict[int, tuple[PartialMap, float]] = {}
+    for view in sorted(doubted):
+        freed = _free(problem, partial, view, config)
+        left, squared = _find_contradictions(problem, freed, given, config, alike)
+        if not left:
+            explained[view] = freed, squared
+    least = min((squared for _, squared in explained.values()), default=0.0)
+    possible = [view for view, (_, squared) in explained.items() if squared - least < _DECIDED]
+    if len(possible) == 1:
+        return explained[possible[0]][0]
+    if not possible or not _may_release(partial, possible):
+        return partial
+    rest = tuple(view for view in partial.registered if view not in possible)
+    rest = replace(_release_poses(partial, possible), registered=rest)
+    return _adjust_until_settled(problem, rest, incremental_mapper.SETTLED_TOLERANCE, config)
+
+
+def _find_contradictions(
+    problem: MapperInput, partial: PartialMap, given: Given, config: incremental_mapper.MapperConfig, alike: float
+) -> tuple[set[int], float]:
+    """The held views that a pair or all images together contradict; the square of the largest residual, in sigmas."""
+    refuted = {view for pair, said in _pairs_say(problem, partial, config).items() if said < 0 for view in pair}
+    if not len(partial.estimate.points):
+        return refuted, 0.0
+    held = set(_find_held_views(partial))
+    found = _residuals(_weigh(problem, _count_as_given(problem, partial), alike), given)
+    found = {view: residual for view, residual in found.items() if view in held}
+    beyond = {view for view, residual in found.items() if residual.probability < pose_test.LEAST_PROBABILITY}
+    return refuted | beyond, max((residual.squared for residual in found.values()), default=0.0)
+
+
+def _free(problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig) -> PartialMap:
+    """The map in which images alone place `view`; without it where they cannot."""
+    rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
+    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental_mapper.SETTLED_TOLERANCE, config)
+    if len(rest.estimate.points) < config.incremental.min_points:
+        return rest
+    found = resection.resect(problem, rest, view, config.incremental.resection)
+    if found is None:
+        return rest
+    estimate = bundle_adjustment.replace_pose(rest.estimate, view, found.rotation, found.translation)
+    freed = replace(rest, estimate=estimate, registered=partial.registered)
+    return _adjust_until_settled(problem, freed, 2.0 * incremental_mapper.SETTLED_TOLERANCE, config)
+
+
+def _may_release(partial: PartialMap, views: Sequence[int]) -> bool:
+    """Whether most poses, and enough, hold their cameras without these."""
+    num_held = len(_find_held_views(partial))
+    return num_held - len(views) >= max(_LEAST_HELD, num_held // 2 + 1)
 
 
 def _let_go(problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig) -> PartialMap:
@@ -179,16 +272,9 @@ def _place_by_matches(
     problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig
 ) -> PartialMap | None:
     """The map with `view` where its matches place it; None where no more of them fit then."""
-    rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
-    rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental_mapper.SETTLED_TOLERANCE, config)
-    if len(rest.estimate.points) < config.incremental.min_points:
+    freed = _free(problem, partial, view, config)
+    if view not in freed.registered:
         return None
-    found = resection.resect(problem, rest, view, config.incremental.resection)
-    if found is None:
-        return None
-    estimate = bundle_adjustment.replace_pose(rest.estimate, view, found.rotation, found.translation)
-    freed = replace(rest, estimate=estimate, registered=partial.registered)
-    freed = _adjust_until_settled(problem, freed, 2.0 * incremental_mapper.SETTLED_TOLERANCE, config)
     before, after = (_observations(each)[view] for each in (partial, freed))
     return freed if after > _MORE * before + _MORE_POINTS else None
 
@@ -289,37 +375,48 @@ def _observations(partial: PartialMap) -> npt.NDArray[np.int64]:
 
 def _test_poses(
     problem: MapperInput,
-    partial: PartialMap,
+    finished: incremental_mapper.FinalMap,
     given: Given,
     config: incremental_mapper.MapperConfig,
-    loss: bundle_adjustment.BundleAdjustmentConfig | None = None,
+    alike: float,
 ) -> PartialMap | None:
-    """The map without the given poses that it contradicts, and with those again that it does not; None: too few hold.
+    """The map without the given poses that it contradicts; None: too few hold. The map of `finished` if all hold.
 
-    What is returned is `partial` where nothing changes.
+    `alike`: see `_weigh`.
     """
-    loss = loss or bundle_adjustment.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+    partial = finished.map
     while len(partial.estimate.points):
-        found = _residuals(partial, given, loss)
-        held = set(_find_held_views(partial))
-        worst = min(held & found.keys(), key=lambda view: found[view].probability, default=None)
-        if worst is None or found[worst].probability >= pose_test.LEAST_PROBABILITY:
+        weighed = _weigh(problem, finished, alike)
+        held, found = set(_find_held_views(partial)), _residuals(weighed, given)
+        contradicted = _find_contradicted({view: found[view] for view in sorted(held & found.keys())})
+        released = contradicted if _may_release(partial, contradicted) else contradicted[:1]
+        if not released:
             break
         partial = _adjust_until_settled(
-            problem, _release_poses(partial, [worst]), 2.0 * incremental_mapper.SETTLED_TOLERANCE, config
+            problem, _release_poses(partial, released), 2.0 * incremental_mapper.SETTLED_TOLERANCE, config
         )
-        loss = bundle_adjustment.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
+        finished = _count_as_given(problem, partial)
     return partial if len(_find_held_views(partial)) >= _LEAST_HELD and _most_hold(partial, given) else None
+
+
+def _find_contradicted(found: Mapping[int, pose_test.Residual]) -> list[int]:
+    """The view whose pose is the most contradicted, and then others of which nothing tells that it is not they instead.
+
+    None where no pose is contradicted.
+    """
+    beyond = [view for view in found if found[view].probability < pose_test.LEAST_PROBABILITY]
+    beyond.sort(key=lambda view: (found[view].probability, -found[view].squared))
+    return [view for view in beyond if found[beyond[0]].squared - found[view].squared < _DECIDED]
 
 
 def _most_hold(partial: PartialMap, given: Given) -> bool:
     return 2 * len(_find_held_views(partial)) > int(given.poses.is_held.sum())
 
 
-def _residuals(
-    partial: PartialMap, given: Given, loss: bundle_adjustment.BundleAdjustmentConfig
-) -> dict[int, pose_test.Residual]:
-    covariance = bundle_adjustment.covariance(partial.estimate, partial.prior, loss, -1)
+def _residuals(finished: incremental_mapper.FinalMap, given: Given) -> dict[int, pose_test.Residual]:
+    """The residuals of the poses in a map in which these and images are weighed."""
+    partial = finished.map
+    covariance = bundle_adjustment.covariance(partial.estimate, partial.prior, finished.loss, -1)
     return pose_test.residuals(partial.estimate, given.poses, covariance)
 
 
@@ -335,8 +432,8 @@ def _finish_map(
     if finished is not None:
         return finished
     errors = bundle_adjustment.reprojection_errors(partial.estimate) / problem.scale[partial.estimate.camera_of]
-    loss = bundle_adjustment.BundleAdjustmentConfig(noise_px=_NOISE_PX * float(np.median(problem.scale)))
-    return incremental_mapper.FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0)
+    rms_px = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+    return replace(_count_as_given(problem, partial), rms_px=rms_px)
 
 
 def _remove_unseen_cameras(finished: incremental_mapper.FinalMap) -> incremental_mapper.FinalMap:
@@ -357,7 +454,7 @@ def _remove_unseen_cameras(finished: incremental_mapper.FinalMap) -> incremental
 def _deviations(finished: incremental_mapper.FinalMap, given: Given) -> tuple[Deviation, ...]:
     """Lists the given poses that do not hold their cameras."""
     held, found = set(_find_held_views(finished.map)), []
-    residuals = _residuals(finished.map, given, finished.loss) if len(finished.map.estimate.points) else {}
+    residuals = _residuals(finished, given) if len(finished.map.estimate.points) else {}
     for view in np.flatnonzero(given.poses.is_held).tolist():
         if view in held:
             continue

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
@@ -34,15 +35,18 @@ from splatnode.recon.registration.subpixel import PatchImage, patch_image
 class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The configuration of registration: the lenses, and the mapper."""
 
-    lenses: self_calibration.LensGroupingConfig = self_calibration.LensGroupingConfig()
-    mapper: incremental_mapper.MapperConfig = incremental_mapper.MapperConfig()
+    lenses: Internal[self_calibration.LensGroupingConfig] = self_calibration.LensGroupingConfig()
+    mapper: Internal[incremental_mapper.MapperConfig] = incremental_mapper.MapperConfig()
     # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
     # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
     trust_poses: bool = False
-    # Cameras that are fixed to each other, as `--rig FILE` gives them; nothing: what their frame sets tell
-    rig: Rig | None = None
-    # Longest time between images that were taken together, seconds
-    rig_tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_S
+    # How fast trusted poses drift from the first photograph on, as odometry does: the standard deviation of a step's
+    # error in each direction, and of all lengths alike, as a share; 0: each pose is absolute. --poses-drift sets it
+    poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
+    # And of the turn about each axis that has grown after a metre, degrees; it grows with the root of the way
+    poses_drift_deg: Annotated[float, msgspec.Meta(ge=0, le=90)] = 0.0
+    # Cameras that are fixed to each other, as `--rig FILE` or a recording tells; None: what their frame sets tell
+    rig: Internal[Rig | None] = None
 
 
 Array = npt.NDArray[np.float64]
@@ -110,11 +114,13 @@ def register(
     pairs: Mapping[tuple[int, int], TwoView],
     config: RegistrationConfig,
     pause: Callable[[], None] = lambda: None,
+    tolerance_s: float = TOLERANCE_S,
 ) -> Registration | None:
     """The cameras of as many keyframes as can be registered together, or None when no two can.
 
     `pairs` holds the verified pairs by position (i < j). The result does not depend on the order of the keyframes.
-    `pause` is called between steps and may raise to abandon the work.
+    Images of different cameras are taken together where at most `tolerance_s` is between them. `pause` is called
+    between steps and may raise to abandon the work.
     """
     if not pairs:
         return None
@@ -128,7 +134,7 @@ def register(
     scales = [grouping.scales[i] for i in rank]
     alone = make_registration(found.relabel(order), keyframes, scales, config)
     pause()
-    on_rig = rigs.adjust_with_rig(found, ordered, config.rig, config.rig_tolerance_s)
+    on_rig = rigs.adjust_with_rig(found, ordered, config.rig, tolerance_s)
     if on_rig is None:
         return alone
     adjusted, rig = on_rig[0].relabel(order), on_rig[1].relabel(order)

@@ -27,7 +27,13 @@ from splatnode.capture.frame import (
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.wire import Amount, Count, Finite, Header, Message, Name, Sequential, Text, WireError
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, find_camera_problem
+from splatnode.recon.result.snapshot import (
+    CameraEstimate,
+    GaussianArrays,
+    GivenCameraPose,
+    Snapshot,
+    find_camera_problem,
+)
 from splatnode.recon.result.verdict import RELATIVE, Bounds, Code, Scale, Verdict
 
 THUMBNAIL_SIDE = 320  # pixels
@@ -64,6 +70,14 @@ class BoundsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"a bound must be 0 or at least {LEAST_BOUND:g}, got {number:g}")
 
 
+class GivenRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A GivenCameraPose."""
+
+    T_world_camera: Matrix4  # row by row
+    sigma_m: Amount
+    sigma_deg: Amount
+
+
 class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A CameraEstimate, which can be looked through: a rigid motion, and a lens with a picture."""
 
@@ -76,11 +90,16 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bounds: BoundsRecord | None
     captured_at: Stamp | None = None
     lens: Intrinsics | UnsetType = UNSET  # estimated, whose distortion was taken out; left out where nothing was
+    camera_id: Name | UnsetType = UNSET  # of several cameras; left out where there is one
+    frame_set: Count | UnsetType = UNSET  # the images that were taken together have one; left out where nothing tells
+    given: GivenRecord | UnsetType = UNSET  # left out where no pose was given
 
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where nothing can be seen through it."""
         T_world_camera, K = np.array(self.T_world_camera).reshape(4, 4), np.array(self.K).reshape(3, 3)
         why = find_camera_problem(T_world_camera, K, self.width, self.height)
+        if not why and not isinstance(self.given, UnsetType):
+            why = find_camera_problem(np.array(self.given.T_world_camera).reshape(4, 4), K, self.width, self.height)
         if not why and self.width * self.height > MAX_PIXELS:
             why = f"a picture of {self.width} x {self.height} pixels, more than {MAX_PIXELS}"
         if why:
@@ -229,6 +248,9 @@ def make_camera_record(camera: CameraEstimate) -> CameraRecord:
         bounds=make_bounds_record(camera.bounds),
         captured_at=camera.captured_at,
         lens=make_optional_field(camera.lens),
+        camera_id=camera.camera_id or UNSET,
+        frame_set=make_optional_field(camera.frame_set),
+        given=make_given_record(camera.given),
     )
 
 
@@ -243,7 +265,22 @@ def parse_camera(record: CameraRecord) -> CameraEstimate:
         bounds=parse_bounds(record.bounds),
         captured_at=record.captured_at,
         lens=read_optional_field(record.lens),
+        camera_id=read_optional_field(record.camera_id) or "",
+        frame_set=read_optional_field(record.frame_set),
+        given=parse_given(record.given),
     )
+
+
+def make_given_record(given: GivenCameraPose | None) -> GivenRecord | UnsetType:
+    if given is None:
+        return UNSET
+    return GivenRecord(tuple(given.T_world_camera.ravel().tolist()), given.sigma_m, given.sigma_deg)
+
+
+def parse_given(record: GivenRecord | UnsetType) -> GivenCameraPose | None:
+    if isinstance(record, UnsetType):
+        return None
+    return GivenCameraPose(np.array(record.T_world_camera).reshape(4, 4), record.sigma_m, record.sigma_deg)
 
 
 def _parse_gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.library_lines import ignore_file_warnings
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 from splatnode.recon.result.export.limits import MAX_CAMERAS, SceneFileError
@@ -35,7 +36,11 @@ def open_npz(data: bytes, most_bytes: int, name: str, what: str) -> Iterator[Map
         if size > most_bytes:
             raise SceneFileError(f"{name} holds {size} bytes; at most {most_bytes} are read")
         # Sides that no array has overflow when NumPy multiplies them, before it refuses them.
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays, np.errstate(all="ignore"):
+        with (
+            ignore_file_warnings(),
+            np.load(io.BytesIO(data), allow_pickle=False) as arrays,
+            np.errstate(all="ignore"),
+        ):
             yield arrays
     except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
         raise_shortage(error)

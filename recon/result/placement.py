@@ -46,7 +46,13 @@ class Placement:
         if bounds is not None:
             first, second, third = (tuple(row) for row in (np.array(bounds.axes) @ self.rotation.T).tolist())
             bounds = replace(bounds, axes=(first, second, third)).rescale(self.scale)
-        return replace(camera, T_world_camera=T, bounds=bounds)
+        given = camera.given
+        if given is not None:
+            T_given = np.eye(4)
+            T_given[:3, :3] = self.rotation @ given.T_world_camera[:3, :3]
+            T_given[:3, 3] = self.transform_points(given.T_world_camera[:3, 3])
+            given = replace(given, T_world_camera=T_given, sigma_m=self.scale * given.sigma_m)
+        return replace(camera, T_world_camera=T, bounds=bounds, given=given)
 
     def transform_gaussians(self, gaussians: GaussianArrays) -> GaussianArrays:
         """The Gaussians in the other world: means, extents, rotations, and colours that depend on the direction."""

@@ -64,6 +64,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "budget": [dict(hit) for hit in snapshot.budget],
         "served_by": dict(snapshot.served_by),
         "cameras": [make_camera_dict(camera) for camera in snapshot.cameras],
+        "given_poses": _list_given_poses(snapshot.cameras),
         "frames_used": [camera.name for camera in snapshot.cameras],
         "frames_dropped": [{"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped],
         "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
@@ -74,6 +75,24 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "preset": preset,
         "versions": collect_versions(),
     }
+
+
+def _list_given_poses(cameras: Iterable[CameraEstimate]) -> list[dict[str, object]]:
+    """The poses that were given, and how far they are from the estimated ones; the farthest first."""
+    known = [(camera, camera.given, camera.pose_residual) for camera in cameras]
+    rows = [
+        (residual, camera, given) for camera, given, residual in known if given is not None and residual is not None
+    ]
+    return [
+        {
+            "name": camera.name,
+            "residual_m": residual[0],
+            "residual_deg": residual[1],
+            "sigma_m": given.sigma_m,
+            "sigma_deg": given.sigma_deg,
+        }
+        for residual, camera, given in sorted(rows, key=lambda row: -row[0][0])
+    ]
 
 
 def collect_versions() -> dict[str, str | None]:

@@ -75,6 +75,15 @@ Array64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
+class GivenCameraPose:
+    """The pose that others gave for a camera, in the world of the scene, which is in metres then."""
+
+    T_world_camera: npt.NDArray[np.float64]  # (4, 4)
+    sigma_m: float  # standard deviation of its position in each direction
+    sigma_deg: float  # of its orientation about each axis
+
+
+@dataclass(frozen=True, eq=False)
 class CameraEstimate:
     """An estimated camera, for its image at modelled size (`width` x `height`)."""
 
@@ -92,6 +101,21 @@ class CameraEstimate:
     # Share of its pixels, 0 to 1, whose depth is multi-view consistent: a point of another view has it, too. None: not
     # known, as of a coarse preview
     consistent_depth: float | None = None
+    camera_id: str = ""  # of several cameras, which one; empty: there is one
+    frame_set: int | None = None  # which images were taken together with it: all that have its number. None: none
+    given: GivenCameraPose | None = None  # None: no pose was given, or nothing tells where its world lies
+    # As it was given, of the photograph in full size, whose distortion and other pixels than square ones were taken out
+    # of the image. None: none was given, or one of a pinhole with fx = fy
+    given_lens: Intrinsics | None = None
+
+    @property
+    def pose_residual(self) -> tuple[float, float] | None:
+        """How far the given pose is from the estimated one, metres and degrees; None where none was given."""
+        if self.given is None:
+            return None
+        between = np.linalg.inv(self.T_world_camera) @ self.given.T_world_camera
+        cosine = np.clip((np.trace(between[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+        return float(np.linalg.norm(between[:3, 3])), float(np.degrees(np.arccos(cosine)))
 
     @property
     def K_photographed(self) -> npt.NDArray[np.float64]:

@@ -14,6 +14,7 @@ import torch
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.geometry import project, quat_from_matrix, transform_to_camera
 from splatnode.recon.priors import pointmap as priors_pointmap
 from splatnode.recon.priors.pointmap import Pointmap
@@ -42,11 +43,11 @@ class BackgroundConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The far shell: Gaussians on a sphere around the scene, so that what no view has seen has the colours around
     it."""
 
-    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
-    margin: float = 2.0  # how far beyond the images' borders they are so near, in units of the images' size
-    elsewhere_deg: float = 10.0  # between those in all other directions; 0: there are none
-    distance: float = 1.3  # radius, in units of the farthest known depth
-    opacity: float = 0.95  # of the shell's Gaussians
+    spacing_deg: Internal[float] = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
+    margin: Internal[float] = 2.0  # how far beyond the images' borders they are so near, in units of the images' size
+    elsewhere_deg: Internal[float] = 10.0  # between those in all other directions; 0: there are none
+    distance: Internal[float] = 1.3  # radius, in units of the farthest known depth
+    opacity: Internal[float] = 0.95  # of the shell's Gaussians
 
 
 def far_shell(

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.priors import pointmap as priors_pointmap
 from splatnode.recon.priors.pointmap import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap
@@ -226,15 +227,16 @@ _NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 class ExposureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The light of photographs that were exposed differently: what brings each to that of the others."""
+    """Exposure compensation: a gain for each image, so that all have the brightness of the others."""
 
     enabled: bool = True  # bring photographs of different exposure or white balance to one light
     # Gains that differ by less, as a share, in each channel, from the median of all, or from those of the photograph
     # taken nearest, are left as they are
-    least: Annotated[float, Meta(ge=0)] = 0.3
-    most: Annotated[float, Meta(ge=0)] = 1.0  # share of the median above which they are not left, however they drift
+    least: Internal[Annotated[float, Meta(ge=0)]] = 0.3
+    # Share of the median above which they are not left, however they drift
+    most: Internal[Annotated[float, Meta(ge=0)]] = 1.0
     # A lens whose corners get more than exp(-least_falloff) of the light in the middle keeps its vignetting
-    least_falloff: Annotated[float, Meta(ge=0)] = 0.5
+    least_falloff: Internal[Annotated[float, Meta(ge=0)]] = 0.5
 
 
 def estimate_exposures(

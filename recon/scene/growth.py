@@ -59,7 +59,7 @@ def grow(
         scene_exposure.compensate_images(images, exposures),
         initialization.SceneInitializationConfig(
             completion=config.completion,
-            seeding=config.seeding,
+            initialization=config.initialization,
             background=msgspec.structs.replace(config.background, spacing_deg=0.0),
         ),
         {graph.keyframes[index].name: graph.keyframes[index].mask for index in shown},

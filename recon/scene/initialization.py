@@ -17,6 +17,7 @@ import torch
 from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Intrinsics
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.core import library
 from splatnode.recon.frames import screening
 from splatnode.recon.geometry import quat_from_matrix
@@ -106,7 +107,8 @@ def visibility(image: Float32, scale: float) -> Float32:
     return np.asarray(MASKING_STD / np.sqrt(variance + MASKING_STD**2), np.float32)
 
 
-# Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and depth.
+# Gaussian initialization: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour
+# and depth.
 #
 # A piece is as large as its error allows (`partition`), with the same visible error everywhere (contrast masking):
 # that is the best use of a number of Gaussians. Errors are measured in photographs of a fixed size, so that the number
@@ -126,21 +128,23 @@ ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
 
 
 class GaussianInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and
-    depth."""
+    """Gaussian initialization: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal
+    colour and depth."""
 
-    depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
-    max_footprint_ratio: float = 1.5  # a pixel is redundant only beside a point whose footprint is at most this larger
-    min_confidence: float = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
-    max_side_px: int = 64  # side of the squares of a grid that no piece reaches across
-    min_area_px: float = 3.0  # pieces of at most this area are not cut
+    depth_tolerance: Internal[float] = 0.02  # theta of equation 16, relative to the depth
+    # A pixel is redundant only beside a point whose footprint is at most this larger
+    max_footprint_ratio: Internal[float] = 1.5
+    min_confidence: Internal[float] = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
+    max_side_px: Internal[int] = 64  # side of the squares of a grid that no piece reaches across
+    min_area_px: Internal[float] = 3.0  # pieces of at most this area are not cut
     # Largest error of a piece: squared visible deviation of colours in [0, 1], over pixels and channels
     max_error: float = 0.0021
-    depth_weight: float = 1.0  # a relative difference of depth counts as this many times a difference of colour
-    noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
-    footprint: float = 1.2  # standard deviations of a new Gaussian across, over its piece's
-    thickness: float = 1.0  # its standard deviation along the normal, over the smaller one across
-    opacity: float = 0.5  # of a new Gaussian
+    # A relative difference of depth counts as this many times a difference of colour
+    depth_weight: Internal[float] = 1.0
+    noise: Internal[float] = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
+    footprint: Internal[float] = 1.2  # standard deviations of a new Gaussian across, over its piece's
+    thickness: Internal[float] = 1.0  # its standard deviation along the normal, over the smaller one across
+    opacity: Internal[float] = 0.5  # of a new Gaussian
 
 
 def find_redundant_pixels(pointmaps: Sequence[Pointmap], config: GaussianInitializationConfig) -> list[Mask]:
@@ -436,7 +440,7 @@ class SceneInitializationConfig(msgspec.Struct, frozen=True, forbid_unknown_fiel
     """Which Gaussians a scene begins with."""
 
     completion: scene_background.DepthCompletionConfig = scene_background.DepthCompletionConfig()
-    seeding: GaussianInitializationConfig = GaussianInitializationConfig()
+    initialization: GaussianInitializationConfig = GaussianInitializationConfig()
     background: scene_background.BackgroundConfig = scene_background.BackgroundConfig()
     pixelwise: PixelwiseConfig | None = None  # in place of seeding: a Gaussian a pixel that stereo knows
     max_gaussians: int | None = None  # None: as many as the photographs call for
@@ -477,10 +481,10 @@ def initialize_scene(
     if config.pixelwise is not None:
         surfaces = pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
         return Scene(_views(dense, shares, images, masks, exposures, lenses), concatenate([surfaces, *shells]))
-    surfaces = initialize_gaussians(dense, pictures, config.seeding)
+    surfaces = initialize_gaussians(dense, pictures, config.initialization)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
-        surfaces = initialize_gaussians(dense, pictures, config.seeding, limit)
+        surfaces = initialize_gaussians(dense, pictures, config.initialization, limit)
     return Scene(
         _views(pointmaps, shares, images, masks, exposures, lenses),
         concatenate([surfaces, *shells]),

@@ -169,7 +169,7 @@ def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
 
 def check_required_precision(case: EvidenceCase) -> Verdict | None:
     """The centres are known less well than the user requires."""
-    needed = case.config.require_percent
+    needed = case.config.max_position_error_percent
     if needed is None or case.widest_bounds.centre_percent <= needed:
         return None
     return refuse(rejections.ROUGHER, case.names, found=case.widest_bounds.centre_percent, needed=needed)
@@ -389,7 +389,7 @@ def make_overfit_verdict(names: Sequence[str], iterations: int, kept: int, befor
         Code.OVERFIT,
         f"The refinement overfitted the photographs: between them the scene misses what stereo shows by {after:.2g} "
         f"after {iterations} iterations, and by {before:.2g} after {kept}, which is the scene that is given.",
-        "Take smaller steps (optimize.rates) or fewer (optimize.iterations), or a preset as it is.",
+        "Take smaller steps (optimize.lr) or fewer (optimize.iterations), or a preset as it is.",
         tuple(names),
         publishable=True,
     )
@@ -459,12 +459,16 @@ def _refuse_contradictions(case: VerificationCase, against: str) -> Verdict:
 
 
 def _find_other_lens_frames(case: VerificationCase) -> list[str]:
-    """Frames whose size says that another lens took them than most; none where the camera was calibrated."""
+    """Frames whose size says that another lens took them than most; none where the camera was calibrated.
+
+    A camera with an id has its own lens anyhow, of which all of its images tell.
+    """
     keyframes = [case.graph.keyframes[camera.index] for camera in case.registration.cameras]
     sizes = [tuple(sorted((keyframe.frame.width, keyframe.frame.height))) for keyframe in keyframes]
     common = max(sorted(set(sizes)), key=sizes.count)
     others = [keyframe for keyframe, size in zip(keyframes, sizes, strict=True) if size != common]
-    return [keyframe.name for keyframe in others if keyframe.frame.intrinsics is None]
+    unknown = [keyframe for keyframe in others if keyframe.frame.intrinsics is None]
+    return [keyframe.name for keyframe in unknown if not keyframe.frame.camera_id]
 
 
 # The check of lenses that bend lines by more than two radial coefficients can tell, as a fisheye's do.

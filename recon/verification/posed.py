@@ -46,9 +46,9 @@ def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld
     worst = find_widest(bounds.values())
     if worst is None:
         raise ValueError("there must be a camera to be judged")
-    if config.require_percent is not None and worst.centre_percent > config.require_percent:
+    if config.max_position_error_percent is not None and worst.centre_percent > config.max_position_error_percent:
         found = worst.centre_percent
-        return refuse(rejections.ROUGHER, sorted(bounds), found=found, needed=config.require_percent)
+        return refuse(rejections.ROUGHER, sorted(bounds), found=found, needed=config.max_position_error_percent)
     placed = {camera.index for camera in registration.cameras}
     left_out = tuple(name for index, name in enumerate(graph.names) if index not in placed)
     count = f"{'All' if not left_out else f'{len(placed)} of'} {len(graph.names)} photographs were placed"

@@ -181,5 +181,5 @@ ROUGHER = Refusal(
 DIVERGED = Refusal(  # the losses over the photographs that the scene began with and that it ended with
     Code.DIVERGED,
     "The refinement ruined the scene: it misses the photographs by {after:.2g}, and began with {before:.2g}.",
-    "Take smaller steps (optimize.rates), or a preset as it is.",
+    "Take smaller steps (optimize.lr), or a preset as it is.",
 )

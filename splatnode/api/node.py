@@ -127,7 +127,7 @@ def connect(
 
     - `address`: None for the node of this user on this machine; the folder of its sockets (`network.directory`); its
       configuration file (.yaml); or, over a network, the machine's address such as "192.168.1.7".
-    - `keys`: over a network, the folder that `splatnode keys` made.
+    - `keys`: over a network, the folder that `splatnode keygen` made.
     - `first_port`: over a network, `network.first_port` of the node. None: its default, 47310.
 
     Raises ValueError where the address or the keys cannot be used, PermissionError where the folder is not private.
@@ -148,7 +148,7 @@ def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | No
             f"{address} is no folder and no .yaml file; give the node's network.directory or configuration"
         )
     if keys is None:
-        raise ValueError(f"keys must be the folder that `splatnode keys` made, to connect to {address}; got None")
+        raise ValueError(f"keys must be the folder that `splatnode keygen` made, to connect to {address}; got None")
     return Network(tcp=address, keys=Path(keys), first_port=first_port or FIRST_PORT)
 
 

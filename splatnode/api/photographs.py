@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -10,6 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.image_arguments import Lens, make_intrinsics
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
 from splatnode.capture.exif import exif_exposure, exif_intrinsics, exif_time, read_tags
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
@@ -25,7 +27,8 @@ from splatnode.capture.image_file import (
 from splatnode.capture.lens_file import ALL, Lenses, find_key
 from splatnode.capture.masks import Find, Mask, apply_mask, open_masks, parse_mask, read_mask
 from splatnode.capture.process.terminal import Tell
-from splatnode.recon.replay_source import Request, Source, apply_lenses, load_source, parse_paths, select_frames
+from splatnode.capture.rig import TOLERANCE_S
+from splatnode.recon.replay_source import Request, Source, apply_lenses, load_source, parse_sources, select_frames
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
 _EXIF = b"Exif\0\0"  # before the TIFF structure
@@ -33,17 +36,52 @@ _EXIF = b"Exif\0\0"  # before the TIFF structure
 # Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `make_rgb_image`.
 Picture: TypeAlias = Any
 Images: TypeAlias = "str | PathLike[str] | Picture | Sequence[str | PathLike[str]] | Sequence[Picture]"
-Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 LensChoice: TypeAlias = "Lens | Sequence[Lens | None] | Mapping[str, Lens]"
 
 
-def load_frames(images: Images, views: int | None, every_frame: bool, tell: Tell) -> Source:
+@dataclass(frozen=True)
+class SeveralCameras:
+    """The words of a program about several cameras: which are used, or which took which image and when."""
+
+    cameras: str | Sequence[str] | None = None  # as `--cameras`
+    camera_ids: Sequence[str | None] | None = None  # of each listed image
+    captured_at: Sequence[Stamp | None] | None = None  # likewise
+    tolerance_s: float = TOLERANCE_S  # between images of a frame set
+
+    def describe_images(self, names: Sequence[str]) -> dict[str, tuple[str, Stamp | None]]:
+        """The camera id and the time of each listed image by its name. Raises TypeError, ValueError."""
+        for what, told in (("camera_ids", self.camera_ids), ("captured_at", self.captured_at)):
+            if told is not None and (isinstance(told, str) or len(told) != len(names)):
+                count = "a text" if isinstance(told, str) else len(told)
+                raise ValueError(f"{what} must be one for each of the {len(names)} images, got {count}")
+        ids, stamps = self.camera_ids or [None] * len(names), self.captured_at or [None] * len(names)
+        return {name: (camera or "", stamp) for name, camera, stamp in zip(names, ids, stamps, strict=True)}
+
+    def apply(self, each: Frame | DroppedFrame, told: Mapping[str, tuple[str, Stamp | None]]) -> Frame | DroppedFrame:
+        """The frame with its camera id and its time, where they were told."""
+        if not isinstance(each, Frame) or each.name not in told:
+            return each
+        camera_id, stamp = told[each.name]
+        return replace(each, camera_id=camera_id or each.camera_id, captured_at=stamp or each.captured_at)
+
+
+def load_frames(
+    images: Images, views: int | None, every_frame: bool, tell: Tell, several: SeveralCameras | None = None
+) -> Source:
     """The frames of a folder, of files, of a video, or of pictures. Raises TypeError, ValueError, FileNotFoundError."""
-    given = list_images(images)
+    given, several = list_images(images), several or SeveralCameras()
     paths = [isinstance(each, (str, PathLike)) for each in given]
+    listing = several.camera_ids is not None or several.captured_at is not None
+    if listing and several.cameras is not None:
+        raise TypeError(
+            "cameras are those of a folder or a film, camera_ids those of a list of images: give one of them"
+        )
+    told = several.describe_images(names_of(images)) if listing else {}
     if all(paths):
-        path, listed = parse_paths([Path(each) for each in given])
-        return load_source(Request(path, listed, views, every_frame=every_frame), tell)
+        wanted = (several.cameras,) if isinstance(several.cameras, str) else several.cameras
+        path, listed, cameras = parse_sources([Path(each) for each in given], wanted, several.tolerance_s)
+        found = load_source(Request(path, listed, views, every_frame=every_frame, cameras=cameras), tell)
+        return replace(found, frames=tuple(several.apply(each, told) for each in found.frames))
     if any(paths):
         raise TypeError("images must be all paths or all pictures, got both. Read the files, or write the pictures")
     used = find_range([extent for extent in map(_extent, given) if extent is not None])
@@ -52,7 +90,8 @@ def load_frames(images: Images, views: int | None, every_frame: bool, tell: Tell
     frames = [
         make_frame(each, index, picture_name(index), index * STEP_NS, used=used) for index, each in enumerate(given)
     ]
-    return select_frames(frames, views, every_frame, tell)
+    framed = [each for each in (several.apply(frame, told) for frame in frames) if isinstance(each, Frame)]
+    return select_frames(framed, views, every_frame, tell, several.tolerance_s)
 
 
 def picture_name(index: int) -> str:
@@ -134,9 +173,9 @@ def apply_lens(given: Source, lens: LensChoice | None, images: Images) -> Source
     known = _key_lenses(lens, images)
     by_key: dict[str, Intrinsics] = {}
     for key, each in known.items():
-        of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera) == key)
+        of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera, frame.camera_id) == key)
         first = next(of_lens, frames[0])
-        by_key[key] = intrinsics_of(each, first.width, first.height)
+        by_key[key] = make_intrinsics(each, first.width, first.height)
     return apply_lenses(given, Lenses(by_key))
 
 
@@ -153,18 +192,6 @@ def _key_lenses(lens: Any, images: Images) -> Mapping[str, Lens]:
     if len(lens) != len(names):
         raise ValueError(f"intrinsics must be one lens, or as many as there are images, {len(names)}; got {len(lens)}")
     return {name: each for name, each in zip(names, lens, strict=True) if each is not None}
-
-
-def intrinsics_of(lens: Lens, width: int, height: int) -> Intrinsics:
-    """A lens as it may be given, for photographs of this size. Raises TypeError, ValueError."""
-    if isinstance(lens, Intrinsics):
-        return lens
-    K = np.asarray(lens, np.float64) if isinstance(lens, (np.ndarray, list, tuple)) else None
-    if K is None or K.shape != (3, 3):
-        shape = type(lens).__name__ if K is None else str(K.shape)
-        raise TypeError(f"intrinsics must be splatnode.Intrinsics or a matrix K (3, 3), got {shape}")
-    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Intrinsics(width, height, fx, fy, cx, cy, source="given")
 
 
 def lenses(frames: Iterable[Any]) -> dict[str, Intrinsics]:

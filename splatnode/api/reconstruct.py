@@ -8,14 +8,15 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.image_arguments import Sigmas, parse_sigmas
 from splatnode.api.photographs import (
     Images,
     LensChoice,
     Masks,
+    SeveralCameras,
     apply_lens,
     lenses,
     list_images,
@@ -27,118 +28,97 @@ from splatnode.api.photographs import (
 from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Baseline as Apart
-from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.odometry import GRAVITY_SIGMA_DEG, GivenPose, Gravity, Motion, make_given_pose
-from splatnode.capture.pose_files import create_trajectory, poses_of, read_poses
+from splatnode.capture.frame import DroppedFrame, Frame, Stamp
+from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress
-from splatnode.capture.rig_file import read_rig
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
-from splatnode.recon.replay_source import add_poses, apply_masks
+from splatnode.recon.replay_source import Source, add_poses, apply_masks
+from splatnode.recon.rig_choice import apply_rig
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
 
-LEAST_STEP_SIGMA_M = 0.001  # standard deviation of a motion, however short it is
-
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
+PosesSigma: TypeAlias = "Sigmas | Mapping[str, Sigmas] | Sequence[Sigmas | None]"
 Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
 
 
-def sigmas_of(poses_sigma: tuple[float, float] | None) -> dict[str, float] | None:
-    """Returns the settings of `metric` that the standard deviations change. Raises TypeError."""
-    if poses_sigma is None:
+def sigmas_of(poses_sigma: PosesSigma | None) -> dict[str, float] | None:
+    """Returns the settings of `metric` that the standard deviations of all poses change. Raises TypeError."""
+    if poses_sigma is None or not _is_of_all(poses_sigma):
         return None
-    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), _parse_sigmas(poses_sigma, "poses_sigma"), strict=True))
-
-
-def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: MetricConfig) -> GivenPose | None:
-    """The pose of one photograph, T_world_camera (4, 4), metres; `sigma` None: as `config` has it.
-
-    Raises TypeError, ValueError.
-    """
-    if pose is None:
-        if sigma is not None:
-            raise ValueError("pose_sigma says how unsure a pose is: give pose, too")
-        return None
-    usual = config.poses_sigma_m, config.poses_sigma_deg
-    return make_given_pose(_matrix(pose), *(usual if sigma is None else _parse_sigmas(sigma, "pose_sigma")))
-
-
-def next_motion(
-    before: Motion | None,
-    name: str,
-    step: npt.ArrayLike | None,
-    sigma: tuple[float, float] | None,
-    config: MetricConfig,
-) -> Motion:
-    """The motions up to photograph `name`: with one `step` more, T_previous_current (4, 4), metres.
-
-    Without a step, or a photograph before it, a chain begins with it. `sigma` None: as `config` has it.
-    Raises TypeError, ValueError.
-    """
-    if step is None and sigma is not None:
-        raise ValueError("motion_sigma says how unsure a motion is: give motion, too")
-    if step is None:
-        return Motion(name)
-    if before is None:
-        raise ValueError("motion is that since the photograph before: the first one has none")
-    moved = _matrix(step)
-    length = float(np.linalg.norm(moved[:3, 3]))
-    usual = max(config.motions_drift * length, LEAST_STEP_SIGMA_M), config.motions_sigma_deg
-    return before.append_step(moved, *(usual if sigma is None else _parse_sigmas(sigma, "motion_sigma")))
-
-
-def gravity_of(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravity | None:
-    """The direction of down in the camera's frame (3,). Raises TypeError, ValueError."""
-    if gravity is None:
-        if sigma_deg is not None:
-            raise ValueError("gravity_sigma says how unsure gravity is: give gravity, too")
-        return None
-    down = np.asarray(gravity, np.float64)
-    if down.shape != (3,):
-        raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
-    x, y, z = down.tolist()
-    return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))
+    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), parse_sigmas(poses_sigma, "poses_sigma"), strict=True))
 
 
 def poses_given(
     poses: Poses | None, images: Images, frames: Sequence[Frame | DroppedFrame]
 ) -> dict[str, npt.NDArray[np.float64]] | None:
     """The poses of the frames that have one, by their names. Raises TypeError, ValueError, FileNotFoundError."""
+    trajectory = load_trajectory(poses, images)
+    where = fspath(poses) if isinstance(poses, (str, PathLike)) else "poses"
+    return None if trajectory is None else poses_of(trajectory, frames, where)
+
+
+def load_trajectory(poses: Poses | None, images: Images) -> Trajectory | None:
+    """The poses as they are given, by name or time. Raises TypeError, ValueError, FileNotFoundError."""
     if poses is None:
         return None
     if isinstance(poses, (str, PathLike)):
-        return poses_of(read_poses(Path(poses)), frames, fspath(poses))
-    return poses_of(create_trajectory(_list_named_poses(poses, images)), frames, "poses")
+        return read_poses(Path(poses))
+    return create_trajectory(_list_named_poses(poses, images))
+
+
+def own_sigmas_of(
+    poses: Poses | None, sigma: PosesSigma | None, images: Images, frames: Sequence[Frame | DroppedFrame]
+) -> dict[str, Sigmas]:
+    """The standard deviations of single poses, by the frames' names: as given, else as their file tells them.
+
+    Raises TypeError, ValueError.
+    """
+    if sigma is not None and not _is_of_all(sigma):
+        return _list_named_sigmas(sigma, images)
+    trajectory = load_trajectory(poses, images) if isinstance(poses, (str, PathLike)) else None
+    return {} if trajectory is None else trajectory.find_sigmas(frames)
+
+
+def _is_of_all(sigma: PosesSigma) -> bool:
+    """Whether these are two numbers, of all poses, or else no mapping or list of such."""
+    return not isinstance(sigma, Mapping) and not (
+        isinstance(sigma, Sequence) and any(isinstance(each, (Sequence, type(None))) for each in sigma)
+    )
+
+
+def _list_named_sigmas(sigma: Any, images: Images) -> dict[str, Sigmas]:
+    if isinstance(sigma, Mapping):
+        return {frame_name(Path(name)): parse_sigmas(each, "poses_sigma") for name, each in sigma.items()}
+    names = names_of(images)
+    if len(sigma) != len(names):
+        raise ValueError(f"poses_sigma must be one for each of the {len(names)} photographs, got {len(sigma)}")
+    told = zip(names, sigma, strict=True)
+    return {name: parse_sigmas(each, "poses_sigma") for name, each in told if each is not None}
 
 
 def _list_named_poses(
     poses: Mapping[str, Matrix] | Sequence[Matrix | None], images: Images
 ) -> list[tuple[str, npt.NDArray[np.float64]]]:
     if isinstance(poses, Mapping):
-        return [(frame_name(Path(name)), _matrix(T)) for name, T in poses.items()]
+        return [(str(Path(name).parent / frame_name(Path(name))), parse_matrix(T)) for name, T in poses.items()]
     names = names_of(images)
     if len(poses) != len(names):
         raise ValueError(f"poses must be one for each of the {len(names)} photographs, got {len(poses)}")
-    return [(name, _matrix(T)) for name, T in zip(names, poses, strict=True) if T is not None]
+    return [(name, parse_matrix(T)) for name, T in zip(names, poses, strict=True) if T is not None]
 
 
-def _matrix(T: Any) -> npt.NDArray[np.float64]:
+def parse_matrix(T: Any) -> npt.NDArray[np.float64]:
+    """Returns a pose as a matrix (4, 4). Raises TypeError where it is none."""
     matrix = np.asarray(T, np.float64)
     if matrix.shape != (4, 4):
         raise TypeError(f"a pose must be T_world_camera (4, 4) or None, got shape {matrix.shape}")
     return matrix
-
-
-def _parse_sigmas(sigmas: Any, what: str) -> tuple[float, float]:
-    if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
-        raise TypeError(f"{what} must be metres and degrees, (0.01, 2.0), got {sigmas!r}")
-    return float(sigmas[0]), float(sigmas[1])
 
 
 # What a program knows of a scene's size: measured distances, printed markers, stereo pairs.
@@ -184,7 +164,7 @@ def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
         if isinstance(each, Marker):
             changes |= _make_marker_settings(each)
         elif isinstance(each, Stereo):
-            changes |= {"stereo_m": each.baseline_m, "stereo_sigma_m": each.sigma_m}
+            changes |= {"stereo_baseline_m": each.baseline_m, "stereo_baseline_sigma_m": each.sigma_m}
         else:
             baselines.append(_baseline(each, of_pictures))
     if baselines:
@@ -233,8 +213,8 @@ def _list_scale_sources(scale: object) -> Sequence[object]:
 
 def _make_marker_settings(marker: Marker) -> dict[str, Any]:
     return {
-        "marker_m": marker.side_m,
-        "marker_sigma_m": marker.sigma_m,
+        "marker_size_m": marker.side_m,
+        "marker_size_sigma_m": marker.sigma_m,
         "marker_dictionary": marker.dictionary,
     }
 
@@ -264,9 +244,12 @@ Changes = Mapping[str, Any] | str | PathLike[str]
 def reconstruct(
     images: Images,
     *,
+    cameras: str | Sequence[str] | None = None,
+    camera_ids: Sequence[str | None] | None = None,
+    captured_at: Sequence[Stamp | None] | None = None,
     intrinsics: LensChoice | None = None,
     poses: Poses | None = None,
-    poses_sigma: tuple[float, float] | None = None,
+    poses_sigma: PosesSigma | None = None,
     poses_only_check: bool = False,
     rig: str | PathLike[str] | None = None,
     masks: Masks | None = None,
@@ -289,17 +272,22 @@ def reconstruct(
       `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
       uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
       than 30 photographs, keyframes are chosen.
+    - `cameras`: which cameras of one robot are used together, as `--cameras`: `"all"`, or a list of names: folders of
+      a folder, topics of an MCAP file, keys of an episode `"pusht#3"`; of listed folders or films, a name for each.
+      Frames are called `left/0001.jpg` then, and each camera has its own lens.
+    - `camera_ids`, `captured_at`: of listed images which camera took each (None: not known), and when, a `Stamp`. What
+      different cameras took together, to `frame_set_tolerance_s` of `config`, is used, or left out, as one.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion; or a list of these, one of each photograph (None: not known); or a mapping of
-      them by photograph, by camera with which names begin, or by pattern: `{"left": a, "right": b}`. None: what EXIF
-      tells, else it is estimated.
+      them by photograph, by camera id, by camera with which names begin, or by pattern: `{"left": a, "right": b}`.
+      None: what EXIF tells, else it is estimated.
     - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
       (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
-      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees: with
-      `intrinsics` the poses then hold the cameras, also where photographs share nothing. `poses_only_check`: they do
-      not even then, but are compared with the cameras that the photographs alone tell.
-    - `rig`: a file that tells where the cameras of one robot stand to each other, as `--rig` reads it. None: the images
-      that they took together tell.
+      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees, of
+      all poses, or a mapping or list of such as `poses` is: with `intrinsics` the poses then hold the cameras, also
+      where photographs share nothing. So do poses whose file tells their sigmas. `poses_only_check`: they do not even
+      then, but are compared with the cameras that the photographs alone tell.
+    - `rig`: a file with where the cameras stand to each other, as for `--rig`. None: a log tells, else the images do.
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
@@ -309,33 +297,49 @@ def reconstruct(
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
     - `views`: so many photographs or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
-    - `only_seen`: leaves out what no two photographs confirm, and the far background.
-    - `seed`: of what is drawn by chance. None: the configuration's, 0.
-    - `threads`: of this call at most, of torch and of the compiled core. None: as many as there are processors.
-    - `tell`: hears what is being done, in the calling thread: a step with `doing`, `done`, `of`, or a line of text.
-      What it raises ends the work.
+      `only_seen`: leaves out what no two photographs confirm, and the far background.
+    - `seed`: of what is drawn by chance. None: the configuration's, 0. `threads`: of this call at most, of torch and of
+      the compiled core. None: as many as there are processors.
+    - `tell`: hears what is done, in the calling thread: a step with `doing`, `done`, `of`, or a text; may raise to end.
 
     Raises TypeError and ValueError where an argument is not what it must be, and FileNotFoundError.
     """
     telling = tell or ignore_progress
-    check_count("views", views)
-    check_count("threads", threads)
-    source = load_frames(images, views, every_frame, telling)
-    source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
-    source = apply_lens(source, intrinsics, images)
-    trusted = poses is not None and poses_sigma is not None and not poses_only_check
-    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
-    on_rig = {} if rig is None else {"rig": msgspec.to_builtins(read_rig(Path(rig)))}
-    flags["registration"] = (on_rig | ({"trust_poses": True} if trusted else {})) or None
+    check_counts(views=views, threads=threads)
+    several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
+    loaded = load_frames(images, views, every_frame, telling, several)
+    source = _apply_given(loaded, masks, intrinsics, images, telling)
+    own = own_sigmas_of(poses, poses_sigma, images, source.frames)
+    trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
+    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
+    source, chosen = apply_rig(source, chosen, rig, telling)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
     if trusted and known is not None:
-        source = add_poses(source, known, chosen.metric.poses_sigma_m, chosen.metric.poses_sigma_deg)
-        known = None  # they are the photographs' own now
+        source, known = _hold_cameras(source, known, poses_sigma, chosen, own), None  # they are the photographs' own
     given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
+
+
+def _apply_given(
+    source: Source, masks: Masks | None, intrinsics: LensChoice | None, images: Images, tell: Tell
+) -> Source:
+    """The frames with their masks and lenses."""
+    masked = source if masks is None else apply_masks(source, make_mask_finder(masks, images), tell)
+    return apply_lens(masked, intrinsics, images)
+
+
+def _hold_cameras(
+    source: Source,
+    known: Mapping[str, npt.NDArray[np.float64]],
+    sigma: PosesSigma | None,
+    config: ReconstructionConfig,
+    own: Mapping[str, Sigmas],
+) -> Source:
+    """The frames with the poses that hold their cameras."""
+    return add_poses(source, known, None if sigmas_of(sigma) is None else config.metric.poses_sigmas, own)
 
 
 def build_config(
@@ -354,7 +358,18 @@ def build_config(
     return apply_changes(config, {name: value for name, value in flags.items() if value is not None})
 
 
-def check_count(name: str, value: int | None) -> None:
-    """Raises ValueError for an argument that is neither a number of things nor None."""
-    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
-        raise ValueError(f"{name} must be a whole number of 1 or more, or None, got {value!r}")
+def tolerance_of(preset: str, changes: Changes | None) -> float:
+    """The seconds between images of a frame set, by the preset and what differs from it."""
+    return build_config(preset, changes, {}, None, of_pictures=False).frame_set_tolerance_s
+
+
+def hold_poses(trusted: bool) -> Mapping[str, bool] | None:
+    """Returns what makes given poses hold the cameras; None: nothing."""
+    return {"trust_poses": True} if trusted else None
+
+
+def check_counts(**values: int | None) -> None:
+    """Raises ValueError for an argument, by its name, that is neither a number of things nor None."""
+    for name, value in values.items():
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+            raise ValueError(f"{name} must be a whole number of 1 or more, or None, got {value!r}")

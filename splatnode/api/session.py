@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
-from splatnode.api.photographs import Lens, Picture, intrinsics_of, lenses, make_frame
+from splatnode.api.image_arguments import append_motion, make_gravity, make_intrinsics, make_pose
+from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
     Changes,
     Scale,
     build_config,
-    check_count,
-    gravity_of,
+    check_counts,
     is_stereo,
-    next_motion,
-    pose_of,
+    parse_matrix,
+    sigmas_of,
 )
 from splatnode.api.result import Result, result_of
 from splatnode.capture.frame import Baseline, Frame, RightImage, Stamp, grey
@@ -29,6 +29,7 @@ from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.quality import Limits
 from splatnode.recon import threads as limits
+from splatnode.recon.config import apply_changes
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric.evidence import NOTHING, gather_evidence
 from splatnode.recon.metric.metres import apply_metric_scale
@@ -61,6 +62,8 @@ class Session:
         self,
         *,
         intrinsics: Lens | None = None,
+        poses_sigma: tuple[float, float] | None = None,
+        poses_only_check: bool = False,
         scale: Scale | None = None,
         preset: str = "balanced",
         config: Changes | None = None,
@@ -71,18 +74,25 @@ class Session:
     ) -> None:
         """The arguments are those of `reconstruct`; `every_frame` takes all photographs that are sharp and no copies.
 
+        `poses_sigma` is of all poses that `add` gets without their own. With it, or from the first pose with its own
+        on, poses hold the cameras of photographs whose lens is told, unless `poses_only_check`.
+
         Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given. There is no
         limit on the seconds (`budget_s`).
         """
-        check_count("threads", threads)
+        check_counts(threads=threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
-        self._config = build_config(preset, config, {"seed": seed}, scale, of_pictures=True)
+        flags = {"seed": seed, "metric": sigmas_of(poses_sigma)}
+        self._config = build_config(preset, config, flags, scale, of_pictures=True)
+        self._only_checks = poses_only_check
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress
-        self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH, patience_s=0.0), Limits())
+        self._selection = Selection(every_frame=every_frame, max_fps=_EACH, patience_s=0.0)
+        self._selectors: dict[str, Selector] = {}  # by camera id
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
+        self._trust_poses(poses_sigma)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()
         self._sizes: list[tuple[int, int]] = []  # (width, height) of those that were given, each once
@@ -110,10 +120,11 @@ class Session:
     ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
-        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the name of the camera that
-        took it: photographs of different cameras share no lens. `pose` is where odometry or a tracker says that its
-        camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that is, metres and
-        degrees; default: what `config` says. Two poses or more give the scene metres and their axes. `motion` is how
+        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the id of the camera that
+        took it, of several: photographs of different cameras share no lens. `pose` is where odometry or a tracker
+        says that its camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that
+        is, metres and degrees; default: what the session's `poses_sigma` or `config` says. Two poses or more give the
+        scene metres and their axes, and hold the cameras where their sigmas are told and the lens is. `motion` is how
         wheels or an IMU say that the camera has moved since the photograph that was given before, whether that was
         taken or not: T_previous_current (4, 4), metres; `motion_sigma`, metres and degrees, is of this motion alone.
         One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
@@ -132,14 +143,18 @@ class Session:
             frame = self._make_frame(image, number, name or f"{number:04d}.png", captured_at, intrinsics, camera)
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
-            given = pose_of(pose, pose_sigma, self._config.metric)
-            moved = next_motion(self._motion, frame.name, motion, motion_sigma, self._config.metric)
-            came = {"given_pose": given, "motion": moved, "gravity": gravity_of(gravity, gravity_sigma)}
+            metric = self._config.metric
+            given = make_pose(None if pose is None else parse_matrix(pose), pose_sigma, metric.poses_sigmas)
+            self._trust_poses(pose_sigma)
+            usual = metric.odometry_drift, metric.odometry_sigma_deg
+            moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
+            came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
             frame = replace(frame, **came, right=_make_right_image(right, baseline_m))
             self._motion = moved
             self._given.add(frame.name)
             self._sizes += {(frame.width, frame.height)}.difference(self._sizes)
-            decision = self._selector.decide(frame)
+            selector = self._selectors.setdefault(frame.camera_id, Selector(self._selection, Limits()))
+            decision = selector.decide(frame)
             if decision.take:
                 self._frames[frame.name] = frame
                 self._evidence = self._evidence.merge(gather_evidence((frame,), self._config.metric))
@@ -187,6 +202,13 @@ class Session:
             raise RuntimeError("the session is closed: begin another one")
         return self._work
 
+    def _trust_poses(self, sigma: tuple[float, float] | None) -> None:
+        """Lets poses hold cameras from now on, where their standard deviations are told."""
+        if sigma is None or self._only_checks:
+            return
+        work = self._open()
+        work.config = self._config = apply_changes(self._config, {"registration": {"trust_poses": True}})
+
     def _nothing_yet(self) -> Snapshot:
         work = self._open()
         work.estimate_soon()
@@ -196,15 +218,15 @@ class Session:
         self, image: Picture, number: int, name: str, captured_at: Stamp | None, lens: Lens | None, camera: str | None
     ) -> Frame:
         made = make_frame(image, number, name, time.monotonic_ns(), captured_at)
-        made = made if camera is None else replace(made, camera=sanitize_text(camera, LONGEST_NAME))
+        made = made if camera is None else replace(made, camera_id=sanitize_text(camera, LONGEST_NAME))
         if lens is not None:
-            known = intrinsics_of(lens, made.width, made.height)
+            known = make_intrinsics(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])
             return assign_lens(made, known)
         if self._lens is None:
             return made
         sizes = [*self._sizes, (made.width, made.height)]
-        known = intrinsics_of(self._lens, *sizes[0])
+        known = make_intrinsics(self._lens, *sizes[0])
         check_fits(known, sizes)
         return assign_lens(made, known)
 

@@ -80,7 +80,7 @@ def test_who_iterates_ends_when_another_thread_closes(node):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("192.168.1.7",), "keys must be the folder that `splatnode keys` made, to connect to 192.168.1.7; got None"),
+        (("192.168.1.7",), "keys must be the folder that `splatnode keygen` made, to connect to 192.168.1.7; got None"),
         (("/nowhere/at/all",), "is no folder and no .yaml file"),
         (("nowhere.yaml",), "nowhere.yaml: No such file"),
     ],

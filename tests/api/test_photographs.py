@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.api.photographs import load_frames, make_frame, make_rgb_image
-from splatnode.capture.frame import ExposureSettings, Frame
-from splatnode.capture.image_file import decode_image
+from splatnode.api.photographs import SeveralCameras, load_frames, make_frame, make_rgb_image
+from splatnode.capture.frame import Clock, ExposureSettings, Frame, Stamp
+from splatnode.capture.image_file import decode_image, encode_png
+from splatnode.capture.process.terminal import ignore_progress
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 4)).astype(np.uint8)
 DEEP = np.random.default_rng(1).integers(0, 65536, (24, 32)).astype(np.uint16)
@@ -93,3 +94,37 @@ def test_a_pil_image_is_upright_and_tells_its_lens_time_and_exposure(orientation
     assert made.intrinsics == expected.intrinsics is not None
     assert made.captured_at == expected.captured_at is not None
     assert made.exposure == expected.exposure == ExposureSettings(0.008, 400.0)
+
+
+def test_listed_pictures_of_several_cameras_are_frame_sets():
+    pictures = [np.full((48, 64, 3), 40 * number, np.uint8) for number in range(4)]
+    stamps = [Stamp(ns, Clock.UTC) for ns in (0, 10**9, 10**9 + 5 * 10**6, 3 * 10**6)]
+    told = SeveralCameras(camera_ids=["left", "left", "right", "right"], captured_at=stamps)
+    frames = load_frames(pictures, None, False, ignore_progress, told).frames
+    assert [(frame.name, frame.camera_id) for frame in frames if isinstance(frame, Frame)] == [
+        ("0000.png", "left"),
+        ("0003.png", "right"),
+        ("0001.png", "left"),
+        ("0002.png", "right"),
+    ]
+    few = load_frames(pictures, 3, False, ignore_progress, told).frames  # whole sets, and at most so many images
+    assert [frame.name for frame in few] == ["0000.png", "0003.png"]
+    with pytest.raises(ValueError, match="camera_ids must be one for each of the 4 images, got 1"):
+        load_frames(pictures, None, False, ignore_progress, SeveralCameras(camera_ids=["left"]))
+    with pytest.raises(TypeError, match="give one of"):
+        load_frames(pictures, None, False, ignore_progress, SeveralCameras("all", camera_ids=["a"] * 4))
+
+
+def test_cameras_are_named_as_on_the_command_line(tmp_path):
+    for camera in ("left", "right"):
+        (tmp_path / camera).mkdir()
+        (tmp_path / camera / "1.png").write_bytes(encode_png(np.zeros((48, 64, 3), np.uint8)))
+    source = load_frames(tmp_path, None, False, ignore_progress, SeveralCameras("all"))
+    assert [frame.name for frame in source.frames] == ["left/1.png", "right/1.png"]
+    assert source.photographs == tmp_path
+    both = load_frames(
+        [tmp_path / "right", tmp_path / "left"], None, False, ignore_progress, SeveralCameras(["r", "l"])
+    )
+    found = [frame.camera_id for frame in both.frames if isinstance(frame, Frame)]
+    assert found == ["l", "r"] and both.photographs is None
+    assert sorted(both.files()) == ["images/l/1.png", "images/r/1.png"]

@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import splatnode
 from splatnode.api.photographs import make_frame as frame_of
-from splatnode.api.reconstruct import poses_given, sigmas_of
+from splatnode.api.reconstruct import own_sigmas_of, poses_given, sigmas_of
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.recon.replay_source import Source, add_poses
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import photographs
 
@@ -42,3 +46,27 @@ def test_poses_may_be_in_the_order_of_a_list(arrays):
 def test_a_list_of_poses_does_not_go_with_a_folder(folder):
     with pytest.raises(TypeError, match="one for each; of a folder or a video, give names"):
         poses_given(TRUE, folder, photographs(SMALL))
+
+
+def test_each_pose_may_have_its_own_sigmas(arrays, tmp_path):
+    frames = [replace(frame, name=f"{index:04d}.png") for index, frame in enumerate(photographs(SMALL))]
+    sigmas = [(0.01, 1.0), None, *([(0.02, 2.0)] * (len(arrays) - 2))]
+    assert own_sigmas_of(TRUE, sigmas, arrays, frames)["0000.png"] == (0.01, 1.0)
+    assert "0001.png" not in own_sigmas_of(TRUE, sigmas, arrays, frames)
+    assert own_sigmas_of(TRUE, {"0003.png": (0.5, 5)}, arrays, frames) == {"0003.png": (0.5, 5.0)}
+    assert own_sigmas_of(TRUE, (0.01, 1.0), arrays, frames) == {} == own_sigmas_of(TRUE, None, arrays, frames)
+    file = tmp_path / "arm.tum"
+    file.write_text("0000.png 0 0 0 0 0 0 1 0.001 0.1\n")
+    assert own_sigmas_of(file, None, arrays, frames) == {"0000.png": (0.001, 0.1)}
+    with pytest.raises(ValueError, match="one for each of the"):
+        own_sigmas_of(TRUE, [(0.01, 1.0)], arrays, frames)
+
+
+def test_a_pose_whose_sigmas_nobody_tells_is_named():
+    source = Source(tuple(photographs(SMALL)), None, None)
+    first, second = (frame.name for frame in source.frames[:2])
+    told = add_poses(source, {first: TRUE[0], second: TRUE[1]}, (0.01, 1.0), {second: (0.5, 5.0)})
+    poses = [frame.given_pose for frame in told.frames[:2] if isinstance(frame, Frame)]
+    assert [pose.sigma_m for pose in poses if pose is not None] == [0.01, 0.5]
+    with pytest.raises(ValueError, match=f"that of {first} does not: tell it"):
+        add_poses(source, {first: TRUE[0], second: TRUE[1]}, None, {second: (0.5, 5.0)})

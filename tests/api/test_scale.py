@@ -12,8 +12,8 @@ def test_what_is_known_of_the_size_becomes_the_configuration():
     known = [("a.jpg", "b.jpg", 0.5), splatnode.Marker(0.08, sigma_m=0.0002), (0, 2, 1)]
     metric = apply_changes(ReconstructionConfig(), {"metric": metric_changes(known, of_pictures=True)}).metric
     assert metric.baselines == (("a.jpg", "b.jpg", 0.5), ("0000.png", "0002.png", 1.0))
-    assert (metric.marker_m, metric.marker_sigma_m, metric.marker_dictionary) == (0.08, 0.0002, "4X4_50")
-    assert metric_changes(splatnode.Marker(0.1), False)["marker_m"] == 0.1
+    assert (metric.marker_size_m, metric.marker_size_sigma_m, metric.marker_dictionary) == (0.08, 0.0002, "4X4_50")
+    assert metric_changes(splatnode.Marker(0.1), False)["marker_size_m"] == 0.1
     assert metric_changes(("a.jpg", "b.jpg", 2), False) == {
         "baseline": ["a.jpg", "b.jpg", 2.0],
         "further_baselines": [],
@@ -28,7 +28,7 @@ def test_what_is_no_scale_is_refused(wrong):
 
 def test_pairs_are_a_folder_or_one_picture_for_each(folder, arrays):
     stereo = splatnode.Stereo(folder, 0.075)
-    assert metric_changes([stereo, ("a", "b", 1)], False)["stereo_m"] == 0.075 and is_stereo(stereo)
+    assert metric_changes([stereo, ("a", "b", 1)], False)["stereo_baseline_m"] == 0.075 and is_stereo(stereo)
     taken = load_frames(folder, None, False, lambda _: None).frames
     assert len(pairs_given(stereo, folder, taken)) == len(taken)  # each is its own partner
     listed = load_frames(arrays, None, False, lambda _: None).frames

@@ -130,6 +130,19 @@ def test_poses_give_a_session_metres_and_their_axes(arrays):
     assert np.linalg.norm(first.centre - true[0][:3, 3]) < 0.1
 
 
+@pytest.mark.parametrize("only_checked", [False, True])
+def test_poses_with_sigmas_hold_the_cameras_of_a_session(arrays, only_checked):
+    true = synthetic.scene_cameras(SMALL)
+    chosen = {"intrinsics": true[0][1], "poses_only_check": only_checked, "seed": 0}
+    with splatnode.Session(config=QUICK, **chosen) as session:
+        for image, (T, _) in zip(arrays[:2], true, strict=False):
+            result = session.add(image, pose=T, pose_sigma=(0.002, 0.1)).result
+    assert result.metric and ("by given poses" in result.verdict.message) is not only_checked
+    if not only_checked:
+        for camera, (T, _) in zip(result.cameras, true, strict=False):
+            assert np.linalg.norm(camera.centre - T[:3, 3]) < 0.006
+
+
 def test_what_is_no_pose_is_said_and_the_photograph_can_come_again(arrays):
     with splatnode.Session(config=QUICK) as session:
         for bad, kind, why in (
@@ -253,4 +266,4 @@ def test_a_photograph_may_have_its_own_lens_and_camera(arrays):
         with pytest.raises(ValueError, match="got those of 100 x 100 for 320 x 240"):
             session.add(arrays[2], intrinsics=splatnode.Intrinsics(100, 100, 90, 90, 50, 50, "given"))
         frames = [session._frames[name] for name in ("a.png", "b.png")]
-    assert [(each.intrinsics.fx, each.camera) for each in frames] == [(300, ""), (200, "gripper")]
+    assert [(each.intrinsics.fx, each.camera_id) for each in frames] == [(300, ""), (200, "gripper")]

@@ -22,6 +22,7 @@ BENCHMARKS = {
         "soak",
         "siege",
         "capture",
+        "publisher",
     ),
     "quality": (
         "poses",
@@ -53,6 +54,7 @@ BENCHMARKS = {
         "lens_assumptions",
         "registrations",
         "known_poses",
+        "several_cameras",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

@@ -24,7 +24,7 @@ def test_capture_minds_no_jump_of_the_wall_clock(tmp_path):
     clock, images = tmp_path / "clock", tmp_path / "images"
     clock.write_text("0")
     images.mkdir()
-    camera = {"camera": {"kind": "watched", "folder": str(images), "poll_s": 0.02, "settle_s": 0.05}}
+    camera = {"camera": {"kind": "watched", "folder": str(images), "poll_s": 0.02, "stable_s": 0.05}}
     node = Node(tmp_path / "node", camera | {"selection": {"every_frame": True}})
     preloaded = {"LD_PRELOAD": str(compiled(tmp_path, SOURCE.with_name("wall_clock.c"))), "WALL_CLOCK": str(clock)}
     with running(node), KeyframeClient(node.network) as client:

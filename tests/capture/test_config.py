@@ -70,8 +70,8 @@ def test_the_commented_calibration_can_be_used(tmp_path):
 @pytest.mark.parametrize("rate", [0, 1e-300, float("inf")])
 @pytest.mark.parametrize("kind", ["building", "depthai", "synthetic", "v4l2"])
 def test_a_rate_that_no_camera_has_is_refused(kind, rate):
-    with pytest.raises(ConfigError, match="camera.frames_per_second: expected float"):
-        parse_config({"camera": {"kind": kind, "frames_per_second": rate}}, CaptureConfig)
+    with pytest.raises(ConfigError, match="camera.fps: expected float"):
+        parse_config({"camera": {"kind": kind, "fps": rate}}, CaptureConfig)
 
 
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)

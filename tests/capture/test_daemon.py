@@ -21,7 +21,7 @@ import pytest
 from splatnode.capture import keyframe_selection
 from splatnode.capture.cameras import folder
 from splatnode.capture.config import Camera, CaptureConfig, PreviewHeader, decode_preview
-from splatnode.capture.daemon import _Session, capture, last_run
+from splatnode.capture.daemon import CaptureSession, capture, last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.messages import FrameHeader
@@ -63,7 +63,7 @@ def start(tmp_path, photographs):
     def run(camera="", spool="", **environment):
         config = tmp_path / "capture.yaml"
         config.write_text(
-            f"camera: {{kind: folder, folder: {photographs}, frames_per_second: 8, pace: recorded{camera}}}\n"
+            f"camera: {{kind: folder, folder: {photographs}, fps: 8, pace: recorded{camera}}}\n"
             "selection: {every_frame: true}\n"
             f"spool: {{{spool}directory: {tmp_path / 'state'}}}\n"
             f"network: {{directory: {tmp_path / 'run'}}}\n"
@@ -215,7 +215,7 @@ def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
     assert [each["name"] for each in status["newest_set_aside"]] == ["old2.png", "old1.png", "old0.png"]
     assert "3 keyframes were set aside, the last: old2.png: refused by recon" in status["problem"]
     command = [sys.executable, "-m", "splatnode", "status", "--config", str(tmp_path / "capture.yaml")]
-    told = subprocess.run([*command, "--seen"], cwd=ROOT, capture_output=True, text=True)
+    told = subprocess.run([*command, "--acknowledge"], cwd=ROOT, capture_output=True, text=True)
     assert "old0.png: refused by recon" in told.stdout and "not told again" in told.stdout
     process.terminate()
     assert process.wait(60) == 0
@@ -325,5 +325,5 @@ def test_what_the_camera_could_not_give_takes_no_room_of_keyframes(live, waiting
         _deliver=offered.append,
     )
     damaged = DroppedFrame("3.jpg", "the driver says that it is damaged")
-    _Session.drop(session, damaged)
+    CaptureSession.drop(session, damaged)
     assert session.dropped == 1 and offered == ([damaged] if told else [])

@@ -98,7 +98,7 @@ def test_without_the_package_the_message_names_it(tmp_path, monkeypatch):
 
 def test_a_watched_folder_waits_until_one_is_whole(tmp_path):
     (tmp_path / "a.heic").write_bytes(TURNED[:-100])
-    frames = watched.stream(watched.Config(tmp_path, poll_s=0.01, settle_s=0.0, give_up_s=0.2))
+    frames = watched.stream(watched.Config(tmp_path, poll_s=0.01, stable_s=0.0, file_timeout_s=0.2))
     given_up = next(frames)
     assert isinstance(given_up, DroppedFrame) and "truncated" in given_up.reason
     (tmp_path / "b.heic").write_bytes(TURNED)

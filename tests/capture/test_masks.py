@@ -126,6 +126,13 @@ def test_a_mask_that_is_no_image_is_refused(tmp_path):
         open_masks(tmp_path)(frame())
 
 
+def test_a_mask_far_larger_than_its_photograph_is_not_decoded(tmp_path):
+    path = tmp_path / "a.png"
+    assert cv2.imwrite(str(path), np.zeros((4000, 4000), np.uint8))
+    with pytest.raises(UnusableMask, match=r"a\.png cannot be read: .*pixels"):
+        read_mask(path, Frame(0, "a.png", 0, np.zeros((40, 50, 3), np.uint8), None))
+
+
 @pytest.mark.parametrize("orientation", [3, 6, 8])
 def test_a_mask_turns_with_its_photograph(tmp_path, orientation):
     jpeg = cv2.imencode(".jpg", NOISE)[1].tobytes()

@@ -81,6 +81,23 @@ def test_a_trajectory_may_name_photographs(tmp_path):
     assert list(found) == ["b.jpg"] and found["b.jpg"][:3, 3].tolist() == [4.0, 5.0, 6.0]
 
 
+def test_a_line_may_tell_how_unsure_its_pose_is(tmp_path):
+    file = tmp_path / "poses.tum"
+    file.write_text("a.jpg 1 2 3 0 0 0 1 0.002 0.3\nb.jpg 4 5 6 0 0 0 1\n")
+    assert read_poses(file).find_sigmas([frame("a.jpg"), frame("b.jpg"), frame("c.jpg")]) == {"a.jpg": (0.002, 0.3)}
+    file.write_text("100.0 0 0 0 0 0 0 1 0.1 1\n100.5 1 0 0 0 0 0 1 0.2 0.5\n101.0 2 0 0 0 0 0 1\n")
+    timed = [frame("a.png", 0, 100.0), frame("b.png", 1, 100.25), frame("c.png", 2, 100.75), frame("d.png", 3, 105.0)]
+    assert read_poses(file).find_sigmas(timed) == {"a.png": (0.1, 1.0), "b.png": (0.2, 1.0)}
+
+
+def test_transforms_may_tell_how_unsure_a_pose_is(tmp_path):
+    file = tmp_path / "transforms.json"
+    row = {"transform_matrix": np.eye(4).tolist()}
+    told = {"file_path": "images/a.png", "sigma_m": 0.001, "sigma_deg": 0.1}
+    file.write_text(json.dumps({"frames": [{**row, **told}, {**row, "file_path": "b.png"}]}))
+    assert read_poses(file).find_sigmas([frame("a.png"), frame("b.png")]) == {"a.png": (0.001, 0.1)}
+
+
 def test_no_photograph_with_a_pose_is_told(tmp_path):
     with pytest.raises(PosesFileError, match=r"it has photographs such as a\.png, and the first photograph is z\.png"):
         poses_of(Trajectory({"a.png": TRUE[0]}), [frame("z.png")], "poses.json")
@@ -100,6 +117,15 @@ def transforms(T: np.ndarray, times: int) -> str:
         ("a.tum", "", "eight values"),
         ("a.tum", "1 0 0 0 0 0 0 0\n", "rigid motion|finite"),
         ("a.tum", "nan 0 0 0 0 0 0 1\n", "times must be finite"),
+        ("a.tum", "1 0 0 0 0 0 0 1 0.1\n", "ten with the sigmas"),
+        ("a.tum", "1 0 0 0 0 0 0 1 0 1\n", "the pose of 1 must be metres and degrees above 0"),
+        ("a.tum", "a.png 0 0 0 0 0 0 1 0.1 nan\n", "the pose of a.png must be metres .* got 0.1 and nothing"),
+        (
+            "a.json",
+            '{"frames": [{"file_path": "a", "sigma_m": 1, "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], '
+            "[0, 0, 1, 0], [0, 0, 0, 1]]}]}",
+            "the pose of a must be metres .* got 1 and nothing",
+        ),
         ("a.json", "{}", "frames"),
         (
             "a.json",
@@ -202,3 +228,16 @@ def test_many_matrices_are_judged_as_one_is(seed):
     for matrix, is_rigid in zip(matrices, are_rigid(matrices), strict=True):
         assert not (is_rigid and rigid_problem(matrix.ravel().tolist()))
     assert are_rigid(np.stack(TRUE)).all()
+
+
+def test_poses_of_several_cameras_are_found_with_the_cameras_folder(tmp_path):
+    """Photographs of two cameras have one name: their folders tell them apart, and none gets the other one's pose."""
+    left, right = np.eye(4), np.eye(4)
+    right[0, 3] = 0.5
+    frames = {"rig/left/1.png": left, "rig/right/1.png": right, "rig/left/2.png": right}
+    content = {"frames": [{"file_path": name, "transform_matrix": T.tolist()} for name, T in frames.items()]}
+    file = tmp_path / "transforms.json"
+    file.write_text(json.dumps(content))
+    found = read_poses(file).find_poses([frame(name) for name in ("left/1.png", "right/1.png", "right/2.png")])
+    assert sorted(found) == ["left/1.png", "right/1.png"]
+    assert (found["left/1.png"][0, 3], found["right/1.png"][0, 3]) == (0.0, 0.5)

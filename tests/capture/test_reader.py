@@ -16,7 +16,7 @@ from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, Keep
 from splatnode.capture.reader import Config, Reader, ReaderState
 from tests.capture.messaging.test_sockets import wait_for
 
-QUICK = Config(silence_s=0.2, first_pause_s=0.01, longest_pause_s=0.05, give_up_s=1.0)
+QUICK = Config(frame_timeout_s=0.2, first_pause_s=0.01, longest_pause_s=0.05, reconnect_timeout_s=1.0)
 
 
 def frame(index, stamp_ns=None):
@@ -92,7 +92,7 @@ def test_a_lost_camera_comes_back_under_new_numbers():
         if len(openings) < 5:
             raise CameraUnavailable("unplugged")
 
-    with Reader(camera, live=False, config=msgspec.structs.replace(QUICK, give_up_s=60.0)) as reader:
+    with Reader(camera, live=False, config=msgspec.structs.replace(QUICK, reconnect_timeout_s=60.0)) as reader:
         items = read_all(reader)
     assert [item.frame_id for item in items] == [0, 1, 2, 3, 4, 5]
     assert len(openings) == 5 and reader.why == ""

@@ -11,6 +11,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
 from splatnode.capture.keyframe_selection import (
+    LUCAS_KANADE,
     REMEMBERED_BLURS,
     REMEMBERED_VIEWS,
     Config,
@@ -23,7 +24,7 @@ from splatnode.capture.keyframe_selection import (
 from splatnode.capture.quality import Limits
 from tests.support import synthetic
 
-EVERY = Config(per_second=1000.0, patience_s=0.0)
+EVERY = Config(max_fps=1000.0, patience_s=0.0)
 WALL = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (600, 1200, 3)).astype(np.uint8), (0, 0), 2)
 WALL = cv2.normalize(WALL, None, 0, 255, cv2.NORM_MINMAX)
 
@@ -93,7 +94,7 @@ def test_blurred_candidates_are_waited_out():
 
 
 def test_not_every_frame_is_examined():
-    decisions = taken([replace(view(0, index), stamp_ns=index * 10**7) for index in range(101)], Config(per_second=10))
+    decisions = taken([replace(view(0, index), stamp_ns=index * 10**7) for index in range(101)], Config(max_fps=10))
     assert sum(decision.reason != "between two examinations" for decision in decisions) == 11
 
 
@@ -141,6 +142,17 @@ def test_corners_are_tracked_to_where_they_went():
     assert not tracked[corners[:, 0, 0] < 10].any()  # these have left the image
 
 
+def test_a_corner_that_has_just_left_the_image_is_lost_though_its_surroundings_are_seen():
+    """Lucas and Kanade follow it beside the border, where half of its window still is in the image."""
+    start, now = (cv2.cvtColor(view(left).image, cv2.COLOR_RGB2GRAY) for left in (20, 23))
+    corners = np.array([[[x, y]] for x in (0.5, 1.0, 1.5, 2.0) for y in range(20, 220, 8)], np.float32)
+    guess = corners - np.array([3, 0], np.float32)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **LUCAS_KANADE)
+    assert found.mean() > 0.3 and (there[..., 0] < 0).mean() > 0.8
+    positions, tracked = track(start, now, corners, guess)
+    assert not (tracked & (there[:, 0, 0] < 0)).any() and (positions[tracked] >= 0).all()
+
+
 def test_parallax_is_what_no_homography_explains():
     rng = np.random.default_rng(0)
     corners = rng.uniform(20, 300, (60, 1, 2)).astype(np.float32)
@@ -176,7 +188,7 @@ def test_the_built_in_capture_is_taken_whole():
 
 @pytest.mark.parametrize("scene", ["fox", "llff_flower", "tum_fr3_office"])
 def test_real_photographs_of_a_walk_are_taken(shared, scene):
-    frames = folder.stream(folder.Config(shared / "scenes" / scene / "images", frames_per_second=2))
+    frames = folder.stream(folder.Config(shared / "scenes" / scene / "images", fps=2))
     decisions = taken([frame for frame in frames if isinstance(frame, Frame)][:12])
     assert sum(decision.take for decision in decisions) >= 5
     assert not [decision.reason for decision in decisions if decision.candidate and not decision.take]

@@ -299,7 +299,7 @@ def _frames_of(folder: Path) -> list[Frame | DroppedFrame]:
     return frames
 
 
-# Keys: a pair that belongs together, or none; the next `splatnode keys` needs no hand.
+# Keys: a pair that belongs together, or none; the next `splatnode keygen` needs no hand.
 
 
 def _making_keys(disk: Path, _: Tell) -> None:

@@ -126,9 +126,9 @@ def _node(place: Path, force: Force) -> Node:
         cv2.imwrite(str(pictures / f"{index:03d}.png"), image)
     create_keys(place / "keys")
     network = {"tcp": "127.0.0.1", "keys": str(place / "keys"), "first_port": free_ports(12)}
-    folder = {"kind": "folder", "folder": str(pictures), "frames_per_second": 8.0, "pace": "recorded", "loops": LOOPS}
+    folder = {"kind": "folder", "folder": str(pictures), "fps": 8.0, "pace": "recorded", "loops": LOOPS}
     camera = {"camera": folder, "selection": {"every_frame": True}}
-    return Node(place / "node", camera, {"tracking": {"every_s": 0}}, network)
+    return Node(place / "node", camera, {"tracking": {"interval_s": 0}}, network)
 
 
 def _served(node: Node, found: _Found, until: float) -> None:

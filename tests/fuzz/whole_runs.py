@@ -27,7 +27,7 @@ from tests.fuzz.pieces import no_leftovers, whole
 from tests.support.synthetic import photographs
 
 VIEWS = 3
-RECIPE = RECON["reconstruction"] | {"seed": 0, "quick": True}
+RECIPE = RECON["reconstruction"] | {"seed": 0, "no_fallbacks": True}
 
 
 def _images(disk: Path) -> None:
@@ -73,7 +73,7 @@ def _network(disk: Path) -> Network:
 def _growing(disk: Path, tell: Tell) -> None:
     """A node, until its scene has all keyframes, is finished and exported."""
     _silent(disk)
-    recon = {"checkpoint": str(disk / "checkpoint"), "out": str(disk / "out"), "status_every_s": 0.1}
+    recon = {"checkpoint": str(disk / "checkpoint"), "out": str(disk / "out"), "status_interval_s": 0.1}
     config = parse_config(RECON | {"reconstruction": RECIPE} | recon, DaemonConfig)
     config = msgspec.structs.replace(config, network=_network(disk))
     stopping = threading.Event()

@@ -41,7 +41,7 @@ def photographs(tmp_path):
         (["--out", "new", "--stereo", "gone", "--stereo-baseline", "75mm"], 2, "'gone' is not there"),
         (["--out", "new", "--poses", "gone.tum"], 2, "gone.tum is not there; give a TUM"),
         (["--out", "new", "--poses-sigma", "0.1,5"], 2, "--poses-sigma is of --poses"),
-        (["--out", "new", "--poses-only-check"], 2, "--poses-only-check is of --poses"),
+        (["--out", "new", "--check-poses"], 2, "--check-poses is of --poses"),
         (["--out", "new", "--poses", "photographs"], 2, "must hold images.txt or images.bin"),
         (["--out", "new", "--poses", "photographs/a.png"], 2, "must be a TUM trajectory"),
         (["--out", "new", "--map", "--marker", "100mm"], 2, "does not go with what is about one: --marker"),

@@ -36,8 +36,8 @@ def test_a_file_changes_a_control_or_leaves_it_out():
 
 
 def test_seconds_of_the_ladder_are_no_option_any_more():
-    with pytest.raises(ConfigError, match=r"ladder\.seconds: unknown key; allowed here: work, most_s"):
-        apply_changes(ReconstructionConfig(), {"ladder": {"seconds": 60.0}})
+    with pytest.raises(ConfigError, match=r"fallbacks\.seconds: unknown key; allowed here: budget, timeout_s"):
+        apply_changes(ReconstructionConfig(), {"fallbacks": {"seconds": 60.0}})
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_seconds_of_the_ladder_are_no_option_any_more():
         {"prior": "mast3r"},
         {"prior": None},
         {"optimize": {"iterations": -1}},
-        {"optimize": {"dssim": 1.5}},
+        {"optimize": {"ssim_lambda": 1.5}},
     ],
 )
 def test_what_no_scene_can_have_is_refused_by_name(changes):

@@ -31,7 +31,7 @@ def exposed(frame: Frame) -> Frame:
 
 @lru_cache(maxsize=3)
 def snapshot_of(differing: bool, enabled: bool = True) -> Snapshot:
-    config = apply_changes(CONFIG, {"light": {"enabled": enabled}})
+    config = apply_changes(CONFIG, {"exposure_compensation": {"enabled": enabled}})
     return run([exposed(each) if differing else each for each in photographs()], config)
 
 
@@ -112,7 +112,7 @@ LATER = (1.0, 1.0, 1.0, 0.6, 0.5, 1.0)  # the camera closes its iris on the way
 
 def grown(enabled: bool) -> IncrementalReconstruction:
     """A scene that took its photographs one at a time, and was begun with those of one exposure."""
-    work = IncrementalReconstruction(apply_changes(CONFIG, {"light": {"enabled": enabled}}))
+    work = IncrementalReconstruction(apply_changes(CONFIG, {"exposure_compensation": {"enabled": enabled}}))
     for frame in photographs():
         dimmed = np.rint(frame.image * LATER[frame.frame_id]).astype(np.uint8)
         work.add_frame(replace(frame, image=dimmed, encoded=None))

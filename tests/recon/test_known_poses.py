@@ -56,7 +56,7 @@ def noisy(seed: int = 0) -> dict[int, Array]:
 
 @lru_cache(maxsize=1)
 def matched() -> ViewGraph:
-    alone = apply_changes(TRUSTING, {"registration": {"trust_poses": False}, "quick": True})
+    alone = apply_changes(TRUSTING, {"registration": {"trust_poses": False}, "no_fallbacks": True})
     return estimate_frame_cameras(told({}), load_prior(alone), alone, Clock())[0].graph
 
 
@@ -118,6 +118,22 @@ def test_a_false_pose_is_named_with_its_residual_and_its_image_placed_by_the_oth
     assert_bounds_hold(estimate, but=deviation.index)
 
 
+@pytest.mark.parametrize(("turned", "named"), [(None, []), (0, [0, 1]), (2, [2, 3])])
+def test_of_a_pair_beside_the_others_both_are_named_as_nothing_tells_which_is_false(
+    turned: int | None, named: list[int]
+) -> None:
+    Ts, graph = noisy(2), matched()
+    if turned is not None:
+        Ts[turned][:3, :3] = Ts[turned][:3, :3] @ Rotation.from_euler("x", 3.0, degrees=True).as_matrix()
+    pairs = {pair: graph.pairs[pair] for pair in ((0, 1), (2, 3), (4, 5))}
+    estimate = estimated(Ts, graph=replace(graph, pairs=pairs))
+    assert estimate.prior_world is not None
+    found = [estimate.graph.keyframes[each.index].frame.frame_id for each in estimate.prior_world.deviations]
+    assert sorted(found) == named
+    held = {estimate.graph.keyframes[index].frame.frame_id for index in estimate.prior_world.held}
+    assert held == set(range(6)) - set(named)
+
+
 def test_images_without_matches_are_where_their_poses_say() -> None:
     names = [frame.name for frame in photographs()]
     graph = matched().remove_keyframes(names[2:]).forget_pairs(names)
@@ -168,6 +184,35 @@ def test_poses_of_a_part_place_the_others() -> None:
         true = TRUE[estimate.graph.keyframes[camera.index].frame.frame_id][0]
         centre = estimate.prior_world.scale * estimate.prior_world.rotation @ camera.T_world_camera[:3, 3]
         assert np.linalg.norm(centre + estimate.prior_world.translation - true[:3, 3]) < 0.02
+
+
+def drifted(seed: int, share: float, degrees: float) -> dict[int, Array]:
+    """Odometry from the first true pose on: each step is off, and all of them by a scale."""
+    generator, told = np.random.default_rng(seed), TRUE[0][0].copy()
+    scale, found = 1.0 + share * generator.normal(), {0: told}
+    for index in range(1, len(TRUE)):
+        step = np.linalg.inv(TRUE[index - 1][0]) @ TRUE[index][0]
+        length = np.linalg.norm(step[:3, 3])
+        step[:3, 3] = scale * step[:3, 3] + share * length * generator.normal(size=3)
+        turn = np.radians(degrees) * np.sqrt(length) * generator.normal(size=3)
+        step[:3, :3] = step[:3, :3] @ Rotation.from_rotvec(turn).as_matrix()
+        found[index] = told = told @ step
+    return found
+
+
+@pytest.mark.parametrize(("seed", "matches"), [(0, True), (1, True), (0, False), (1, False)])
+def test_odometry_that_drifts_holds_cameras_within_bounds_that_grow_with_the_way(seed: int, matches: bool) -> None:
+    drifts = {"poses_drift": 0.02, "poses_drift_deg": 0.3}
+    config = apply_changes(TRUSTING, {"registration": drifts})
+    graph = matched() if matches else replace(matched(), pairs={})
+    estimate = estimated(drifted(seed, 0.02, 0.3), config, graph)
+    assert estimate.publishable and estimate.prior_world is not None, estimate.verdict.message
+    assert len(estimate.publishable_camera_names) == len(TRUE) and not estimate.prior_world.deviations
+    assert_bounds_hold(estimate, as_given=False)
+    assert estimate.prior_world.scale_sigma > 0.015 and estimate.registration is not None
+    by_id = {estimate.graph.keyframes[camera.index].frame.frame_id: camera for camera in estimate.registration.cameras}
+    names = {index: estimate.graph.names[camera.index] for index, camera in by_id.items()}
+    assert estimate.bounds[names[5]].centre > 2.0 * estimate.bounds[names[0]].centre
 
 
 def test_an_offset_of_all_poses_is_reported_as_one_and_taken_out() -> None:

@@ -18,7 +18,7 @@ from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import SMALL, places
 
 CONFIG = ReconstructionConfig(
-    size=160, ladder=FallbackConfig(work=1.0), optimize=training.RefinementConfig(iterations=10, checkpoints=())
+    size=160, fallbacks=FallbackConfig(budget=1.0), optimize=training.RefinementConfig(iterations=10, checkpoints=())
 )
 A_DAY_S = 86400.0
 

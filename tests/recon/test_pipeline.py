@@ -226,15 +226,15 @@ def test_a_bound_on_gaussians_and_a_budget_of_seconds_are_kept(quick):
 
 
 def test_a_scene_that_its_refinement_ruined_is_no_result():
-    wild = replace(QUICK.optimize.rates, means=1.0, means_unit="depth", log_scales=1.0)
-    final = last(three(), replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
+    wild = replace(QUICK.optimize.lr, means=1.0, means_unit="depth", log_scales=1.0)
+    final = last(three(), replace(QUICK, optimize=replace(QUICK.optimize, lr=wild)))
     assert final.verdict.code is Code.DIVERGED and not final.verdict.publishable
     assert final.final and not final.cameras and not len(final.gaussians)
 
 
 def test_a_new_estimate_is_shown_after_a_ruined_scene():
-    wild = replace(QUICK.optimize.rates, means=1.0, means_unit="depth", log_scales=1.0)
-    work = IncrementalReconstruction(replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
+    wild = replace(QUICK.optimize.lr, means=1.0, means_unit="depth", log_scales=1.0)
+    work = IncrementalReconstruction(replace(QUICK, optimize=replace(QUICK.optimize, lr=wild)))
     for frame in three():
         work.add_frame(frame)
     work.rebuild()

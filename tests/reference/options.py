@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from splatnode.capture.process.config import Plugin
+from splatnode.capture.process.config_keys import has_fields, is_internal, list_field_types
 from tests.reference.comments import field_comments, summary
 
 REQUIRED = object()  # in place of a default where there is none
@@ -37,16 +38,18 @@ class Section:
 
 
 def sections(
-    schema: type, default: Any = REQUIRED, name: str = "", text: str = "", kind: str = ""
+    schema: type, default: Any = REQUIRED, name: str = "", text: str = "", kind: str = "", internal: bool = False
 ) -> Iterator[Section]:
-    """The section of a Struct or dataclass, then those of what is nested in it.
+    """The section of a Struct or dataclass, then those of what is nested in it; with `internal`, of internal keys, too.
 
     `default` is an instance that the defaults are of; without it they are those of the class. `text` says what the
     section is for; without it the docstring of the class or of its module does.
     """
     comments, defaults = field_comments(schema), _defaults(schema, default)
     options, nested = [], []
-    for field, annotation in typing.get_type_hints(schema, include_extras=True).items():
+    for field, annotation in list_field_types(schema).items():
+        if is_internal(annotation) and not internal:
+            continue
         path, said, value = _join(name, field), comments.get(field, ""), defaults[field]
         inner = _inner(annotation)
         if inner is None:
@@ -55,14 +58,14 @@ def sections(
             many = typing.get_origin(_bare(annotation)) is Mapping
             path = _join(path, "NAME") if many else path
             options.append(Option(path, value, _kinds(inner, annotation), said or summary(inner)))
-            nested += [section for each in inner.kinds() for section in _plugin(path, inner, each, value)]
+            nested += [section for each in inner.kinds() for section in _plugin(path, inner, each, value, internal)]
         elif _is_list(annotation):
             options.append(Option(path, value, "list, its entries below", said or summary(inner)))
-            nested += sections(inner, name=f"{path}[]")
+            nested += sections(inner, name=f"{path}[]", internal=internal)
         else:
             if value is None:
                 options.append(Option(path, value, "its options below or null", said or summary(inner)))
-            nested += sections(inner, value, path, "" if value is None else said)
+            nested += sections(inner, value, path, "" if value is None else said, internal=internal)
     yield Section(name, kind, text or summary(schema), tuple(options))
     yield from nested
 
@@ -111,12 +114,13 @@ def _kinds(plugin: type[Plugin], annotation: Any) -> str:
     return f"{kinds}; or null" if type(None) in typing.get_args(annotation) else kinds
 
 
-def _plugin(path: str, plugin: type[Plugin], kind: str, value: Any) -> Iterator[Section]:
+def _plugin(path: str, plugin: type[Plugin], kind: str, value: Any, internal: bool) -> Iterator[Section]:
     """The sections of one kind; the defaults are those of the plug-in that is the default, where it is of this kind."""
     module = import_module(f"{plugin.package}.{kind}")
     chosen = isinstance(value, Plugin) and value.kind == kind
     text = (module.__doc__ or "").split("\n\n")[0]
-    return sections(module.Config, value.config if chosen else REQUIRED, path, " ".join(text.split()), kind)
+    default = value.config if chosen else REQUIRED
+    return sections(module.Config, default, path, " ".join(text.split()), kind, internal)
 
 
 def _defaults(schema: type, instance: Any) -> dict[str, Any]:
@@ -135,7 +139,9 @@ def _defaults(schema: type, instance: Any) -> dict[str, Any]:
 
 
 def _bare(annotation: Any) -> Any:
-    """The annotation without None and without limits."""
+    """The annotation without None, and without limits and marks."""
+    if typing.get_origin(annotation) is Annotated:
+        annotation = typing.get_args(annotation)[0]
     if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is typing.Union:
         annotation = next(each for each in typing.get_args(annotation) if each is not type(None))
     return typing.get_args(annotation)[0] if typing.get_origin(annotation) is Annotated else annotation
@@ -150,11 +156,6 @@ def _inner(annotation: Any) -> type | None:
 
 def _is_list(annotation: Any) -> bool:
     return typing.get_origin(_bare(annotation)) is tuple
-
-
-def has_fields(schema: type) -> bool:
-    """Whether it is a Struct or a dataclass."""
-    return issubclass(schema, msgspec.Struct) or dataclasses.is_dataclass(schema)
 
 
 def _join(name: str, field: str) -> str:

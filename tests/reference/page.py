@@ -10,16 +10,18 @@ from typing import Any
 
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.process.config import Plugin
+from splatnode.capture.process.config_keys import has_fields
 from splatnode.recon.config import PRESETS
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.config import DaemonConfig as Daemon
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
-from tests.reference.options import REQUIRED, Option, Section, has_fields, sections
+from tests.reference.options import REQUIRED, Option, Section, sections
 
 _INTRODUCTION = f"""# Configuration
 
 A configuration is a YAML file that holds only what differs from the defaults. A key that does not exist is refused; the
-message lists the keys that do. The dots in a name stand for levels of the file: `selection.coverage` is
+message lists the keys that do, and the nearest one. A key of the release before is read in this release, and told. The
+dots in a name stand for levels of the file: `selection.coverage` is
 
 ```yaml
 selection:
@@ -33,8 +35,9 @@ no options of its own: from the node's file, `splatnode view FILE` takes how to 
 The options that are changed most often:
 
 - `camera`: which camera, or which folder or video in its place
-- `selection.every_frame`, `selection.coverage`, `selection.per_second`: how many keyframes are taken
-- `max_views`, `settle_s`, `lost_after`: when the node goes on with a next scene, makes it anew, begins another place
+- `selection.every_frame`, `selection.coverage`, `selection.max_fps`: how many keyframes are taken
+- `max_views`, `idle_finalize_s`, `new_submap_after`: when the node goes on with a next submap, finalizes it, begins
+  another
 - `reconstruction.size`, `reconstruction.max_gaussians`: how fine and how large a scene is
 
 In the tables, `None` stands for `null` in a file. An option whose unit is – is a count, a factor, a choice or a text.
@@ -46,7 +49,7 @@ This page is made from the code and its comments by `python -m tests.reference`;
 _CAPTURE = "The camera's process: `splatnode capture FILE` and `splatnode record FILE`."
 _DAEMON = (
     "The node's process that makes scenes: `splatnode recon FILE`. It also has all options of the next part, "
-    "with `reconstruction.` before their names: `reconstruction.size`, `reconstruction.metric.marker_m` (which "
+    "with `reconstruction.` before their names: `reconstruction.size`, `reconstruction.metric.marker_size_m` (which "
     "`--marker 100mm` sets, too). Poses come with the keyframes (`given_pose`, [Metres](metres.md#live))."
 )
 _RECONSTRUCTION = (
@@ -73,7 +76,7 @@ def page() -> str:
 def unit(option: Option) -> str:
     """By the end of the option's name, else by what stands between two commas or colons of the description."""
     name = option.name.rpartition(".")[2]
-    if name.endswith("per_second"):
+    if name.endswith("fps"):
         return _PER_SECOND
     if suffix := next((suffix for suffix in _SUFFIXES if name.endswith(suffix)), None):
         return _SUFFIXES[suffix]
@@ -131,20 +134,22 @@ def _as_in_files(value: Any) -> str:
 
 
 def _presets() -> str:
-    """What each preset changes, as a list."""
-    usual = _values_of(Reconstruction())
+    """What each preset changes of the keys that are listed, as a list; that it sets constants, too, is only said."""
+    documented, usual = _values_of(Reconstruction()), _values_of(Reconstruction(), internal=True)
     lines = []
     for name, preset in PRESETS.items():
-        changed = [
-            f"`{key[1]}: {_as_in_files(value)}`"
-            for key, value in _values_of(preset).items()
+        changed = {
+            key: f"`{key[1]}: {_as_in_files(value)}`"
+            for key, value in _values_of(preset, internal=True).items()
             if value != usual[key] and _as_in_files(value) != _as_in_files(usual[key])
-        ]
-        lines.append(f"- `{name}`: {', '.join(changed) or 'the defaults'}")
+        }
+        shown = [text for key, text in changed.items() if key in documented]
+        shown += ["constants that no file sets"] if len(shown) < len(changed) else []
+        lines.append(f"- `{name}`: {', '.join(shown) or 'the defaults'}")
     return "\n".join(lines)
 
 
-def _values_of(config: Reconstruction) -> dict[tuple[str, str], Any]:
+def _values_of(config: Reconstruction, internal: bool = False) -> dict[tuple[str, str], Any]:
     """By the kind of plug-in and the name of an option."""
-    found = sections(Reconstruction, config)
+    found = sections(Reconstruction, config, internal=internal)
     return {(each.kind, option.name): option.default for each in found for option in each.options}

@@ -55,18 +55,21 @@ def test_the_page_is_what_the_code_says_now():
 
 @pytest.mark.parametrize("schema", [CaptureConfig, Daemon], ids=["capture", "recon"])
 def test_every_option_is_described(schema):
-    assert undescribed(sections(schema)) == [], "say in a comment at the field what it does, with its unit"
+    assert undescribed(sections(schema, internal=True)) == [], (
+        "say in a comment at the field what it does, with its unit"
+    )
 
 
 def test_what_newcomers_asked_for_is_there():
     names = {option.name for schema in (CaptureConfig, Daemon) for each in sections(schema) for option in each.options}
-    assert {"max_views", "settle_s", "lost_after", "selection.coverage", "camera.device", "camera.folder"} <= names
+    assert {"max_views", "idle_finalize_s", "new_submap_after"} <= names
+    assert {"selection.coverage", "camera.device", "camera.folder"} <= names
     assert {
         "reconstruction.prior",
         "reconstruction.optimize.control.at",
-        "reconstruction.decision.require_percent",
+        "reconstruction.decision.max_position_error_percent",
     } <= names
-    assert {f"reconstruction.optimize.regularise.losses.NAME.{each}" for each in ("weight", "patch")} <= names
+    assert {f"reconstruction.optimize.regularizers.losses.NAME.{each}" for each in ("weight", "patch")} <= names
 
 
 def test_a_comment_is_beside_its_field_or_directly_above():
@@ -116,8 +119,8 @@ def test_values_are_told_with_their_range(annotation, words):
 @pytest.mark.parametrize(
     "name, text, expected",
     [
-        ("settle_s", "until then", "s"),
-        ("camera.frames_per_second", "", "1/s"),
+        ("stable_s", "until then", "s"),
+        ("camera.fps", "", "1/s"),
         ("size", "longer side of the modelled images, pixels", "px"),
         ("max_views", "photographs of many pixels", "–"),
         ("selection.coverage", "this share of the corners", "share"),

@@ -52,8 +52,11 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
         "splatnode.capture.calibration.verb",
+        "splatnode.capture.former_names",
         "splatnode.capture.process.arguments",
         "splatnode.capture.process.config_text",
+        "splatnode.capture.process.files",
+        "splatnode.capture.process.library_lines",
         "splatnode.capture.process.logs",
         "splatnode.capture.process.system",
         "splatnode.capture.process.terminal",
@@ -62,11 +65,13 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.command_line",
         "splatnode.recon.batch.verb",
         "splatnode.recon.evaluate.verbs",
+        "splatnode.recon.former_names",
         "splatnode.recon.jobs.arguments",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.replay_verb",
         "splatnode.recon.shared_arguments",
         "splatnode.recon.verbs",
+        "splatnode.viewer.former_names",
         "splatnode.viewer.verbs",
     ]
     assert heavy == "[]"
@@ -311,9 +316,9 @@ def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):
 
 
 def test_a_box_may_begin_with_a_minus():
-    argv = ["export", "scene.ply", "--to", "ply", "--crop", "-1,-.5,0,1,2.5,3", "--only-seen"]
+    argv = ["export", "scene.ply", "--to", "ply", "--crop", "-1,-.5,0,1,2.5,3", "--multi-view-only"]
     args = command_line.build_parser().parse_args(argv)
-    assert args.crop == (-1, -0.5, 0, 1, 2.5, 3) and args.only_seen and args.scene.name == "scene.ply"
+    assert args.crop == (-1, -0.5, 0, 1, 2.5, 3) and args.multi_view_only and args.scene.name == "scene.ply"
 
 
 def test_doctor_finds_the_core_and_what_it_needs(capsys):

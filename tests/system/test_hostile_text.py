@@ -41,7 +41,7 @@ def photograph(folder: Path, text: str) -> list[list[str]]:
     (place / as_file(text, ".jpg")).write_bytes(b"\xff\xd8 no photograph")
     (place / as_file(text, ".heic")).write_bytes(b"")
     (place / as_file(f"good{text}", ".png")).write_bytes(cv2.imencode(".png", PICTURE)[1].tobytes())
-    replay = ["replay", str(place), "--quick", "--out"]
+    replay = ["replay", str(place), "--no-fallbacks", "--out"]
     asked = ["--frames", as_file(text), "--baseline", text, text, "1"]
     return [[*replay, str(folder / "out")], [*replay, str(folder / "out2"), *asked], [*replay, "x", "--views", "9"]]
 
@@ -77,7 +77,7 @@ def output(folder: Path, text: str) -> list[list[str]]:
     place.mkdir()
     (place / "a.png").write_bytes(cv2.imencode(".png", PICTURE)[1].tobytes())
     (folder / "file").write_bytes(b"")
-    replay = ["replay", str(place), "--quick", "--out"]
+    replay = ["replay", str(place), "--no-fallbacks", "--out"]
     return [[*replay, str(folder / as_file(text))], [*replay, str(folder / "file" / as_file(text))]]
 
 
@@ -93,11 +93,11 @@ def argument(folder: Path, text: str) -> list[list[str]]:
         ["replay", named, "--out", "x", "--size", text],
         ["weights", "fetch", text],
         ["weights", "verify", text],
-        ["keys", str(folder / "keys"), "--allow", text, KEY],
-        ["keys", str(folder / "keys"), "--allow", "laptop", text],
-        ["keys", str(folder / "keys"), "--server", text],
+        ["keygen", str(folder / "keys"), "--allow", text, KEY],
+        ["keygen", str(folder / "keys"), "--allow", "laptop", text],
+        ["keygen", str(folder / "keys"), "--server", text],
         ["bench", "--redraw", named, "--out", "x"],
-        ["stability", named, "--out", "x"],
+        ["robustness", named, "--out", "x"],
     ]
 
 
@@ -135,9 +135,9 @@ def test_what_a_process_says_of_itself_only_shows(monkeypatch, capsys, text):
     assert_only_shows(said_by(["status"], capsys))
     assert ascii(json.loads(said_by(["status", "--json"], capsys))["capture"]) == ascii(fields)
     monkeypatch.setattr(node, "ask", lambda *_: node.Answer(False, f"no keyframe {text}"))
-    assert_only_shows(said_by(["retract", text], capsys))
+    assert_only_shows(said_by(["remove-keyframe", text], capsys))
     monkeypatch.setattr(v4l2, "find", lambda: [{"device": text, "description": text}])
-    said = said_by(["find"], capsys)
+    said = said_by(["list-cameras"], capsys)
     assert_only_shows(said)
     (line,) = [line for line in said.split("\n") if "v4l2" in line]
     assert ascii(yaml.safe_load(line)["camera"]["device"]) == ascii(text)  # it can be copied into a configuration

@@ -42,6 +42,7 @@ PRINTED = {
     "A refusal is a value": r"TOO_FEW_VIEWS 1 usable photograph: .*\n0 0\n",
     "A camera's loop": r"(?s)0000\.png first view.* OK 3\n.*All \d photographs were placed\. .* True\n",
     "A running node": r"(?s)kitchen OK 2\nthe live camera: .*\nfree space: the node has said nothing of a map",
+    "Images of your own program": r"(?s)wrist_\d+\.\d+ keyframe first view.*\d+ wait .* answered: False\n",
     "Threads, and how far it is": r"<splatnode.Result OK: 4 .* <splatnode.Result OK: 4 .*\n.* \.\.\. .*\n",
     "Save and load": r"(<splatnode.Result OK: 4 cameras, \d+ Gaussians, 0 left out> ?){2}\n",
     "Into other tools": r"(?s)\['images/view_000\.png', .*PINHOLE 320 240",
@@ -81,6 +82,7 @@ def node(reader) -> Iterator[PretendNode]:
 
 def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "RUNTIME_DIRECTORY": str(folder / "run")}
+    environment |= {"STATE_DIRECTORY": str(folder / "state")}
     command = [sys.executable, "-c", program]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
 

@@ -557,6 +557,11 @@ def test_live():
     first, further = (", ".join(f"{row[key]:.1f}" for row in rows) for key in ("first_scene_s", "further_s_p95"))
     says(f"| {first} s | `live.json` |", f"same sets | {further} s | `live.json` |")
     says(f"besides decoding | {part(raw('capture')['besides_decoding'], 2)} of a core |")
+    pushed = raw("publisher")
+    each = pushed["median_ms_a_frame"]
+    assert pushed["publisher_over_camera"] <= 0.05
+    less = -100 * pushed["publisher_over_camera"]
+    says(f"{each['publisher']:.2f} ms of processor a frame against {each['camera']:.2f}: {less:.1f} % less")
     soak = raw("soak")
     assert soak["previews_lost"] == 0 and max(soak["memory_change"].values()) < 0.01
     says(f"previews within {soak['preview_latency_ms']['p99']:.0f} ms (99th percentile) | `soak.json` |")
@@ -584,7 +589,8 @@ def test_live():
     fuzz = raw("fuzz")["campaigns"]["boundaries"]
     attacked, defects = len(fuzz["rows"]), fuzz["defects"]
     assert sum(row["cases"] for row in fuzz["rows"].values()) == fuzz["cases"]
-    says(f"| {fuzz['cases'] / 1e6:.1f} million structured cases on {attacked} boundaries | {defects} defects")
+    told = f"{defects} defect{'s' * (defects != 1)}"
+    says(f"| {fuzz['cases'] / 1e6:.1f} million structured cases on {attacked} boundaries | {told}")
 
 
 def test_viewer():
@@ -1142,6 +1148,15 @@ def test_a_simulated_batch():
         f"after a tenth and {memory[1]:.0f} MB at the end",
         on="docs/batch.md",
     )
+
+
+def test_faults_that_the_tests_find():
+    mutants = raw("mutants")["mutants"]
+    for room in {each["room"] for each in mutants}:
+        own = [each for each in mutants if each["room"] == room]
+        says(f"| {room} | {len(own)} | {sum(each['killed'] for each in own)} |")
+    killed = sum(each["killed"] for each in mutants)
+    says(f"{killed} of {len(mutants)}", *(f"\u201c{each['name']}\u201d" for each in mutants if not each["killed"]))
 
 
 def test_what_a_thousand_recordings_take():

@@ -41,7 +41,7 @@ HARMLESS = {
         "capture/process/system.py:make_sure_of_room",
         "capture/reader.py:_run",
         "recon/batch/write_back.py:write_back",
-        "recon/daemon/node.py:_answer",
+        "recon/daemon/node.py:_remove_keyframe",
         "recon/daemon/node.py:run_and_record_error",
         "recon/daemon/output.py:save",
         "recon/daemon/output.py:save_fallbacks",
@@ -53,6 +53,9 @@ HARMLESS = {
     "what is left out is no frame, no keyframe and no result: a name, a reason, a picture, a figure": {
         "capture/daemon.py:last_run",
         "capture/messaging/keyframe_queue.py:_quarantine_frame",
+        "capture/process/library_lines.py:_create_file",
+        "capture/process/library_lines.py:_find_memory",
+        "capture/process/library_lines.py:tell_last_words",
         "capture/messaging/spool.py:mark_seen",
         "capture/messaging/spool.py:take",
         "recon/batch/report.py:make_data_url",

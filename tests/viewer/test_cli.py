@@ -153,10 +153,10 @@ def test_what_is_no_result_is_named(tmp_path):
 
 def test_pictures_without_a_display(result, tmp_path, capsys):
     out = tmp_path / "pictures"
-    arguments = ["view", str(result), "--headless", "--size", "160x120", "--pictures", "2", "--out", str(out)]
+    arguments = ["view", str(result), "--headless", "--size", "160x120", "--num-frames", "2", "--out", str(out)]
     assert command_line.main(arguments) == 0
     assert sorted(path.name for path in out.iterdir()) == [
-        "camera_000.png", "camera_001.png", "overview.png", "turntable_000.png", "turntable_001.png",
+        "camera_000.png", "camera_001.png", "exports.json", "overview.png", "turntable_000.png", "turntable_001.png",
     ]  # fmt: skip
     pair, alone = (cv2.imread(str(out / f"camera_00{number}.png")) for number in (0, 1))
     assert pair is not None and alone is not None
@@ -167,7 +167,9 @@ def test_pictures_without_a_display(result, tmp_path, capsys):
 
 def test_a_movie_without_a_display(result, tmp_path):
     path = tmp_path / "turntable.mp4"
-    assert command_line.main(["view", str(result), "--export", str(path), "--size", "161x121", "--pictures", "5"]) == 0
+    assert (
+        command_line.main(["view", str(result), "--export", str(path), "--size", "161x121", "--num-frames", "5"]) == 0
+    )
     movie = cv2.VideoCapture(str(path))
     frames = [movie.read()[1] for _ in range(int(movie.get(cv2.CAP_PROP_FRAME_COUNT)))]
     assert len(frames) == 5 and frames[0].shape == (120, 160, 3)
@@ -176,7 +178,7 @@ def test_a_movie_without_a_display(result, tmp_path):
 
 def test_a_movie_that_does_not_fit_is_not_kept(result, tmp_path):
     path = tmp_path / "movie.mp4"
-    command = [sys.executable, "-B", "-m", "splatnode", "view", str(result), "--export", str(path), "--pictures", "5"]
+    command = [sys.executable, "-B", "-m", "splatnode", "view", str(result), "--export", str(path), "--num-frames", "5"]
     limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (1000, 1000))  # bytes a file, as on a full disk
     done = subprocess.run(command, cwd=ROOT, preexec_fn=limit, capture_output=True, text=True, timeout=120)
     assert done.returncode == 74 and "the movie does not fit into" in done.stderr
@@ -187,7 +189,7 @@ def test_no_window_is_no_failure(result, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(cli, "open3d_installed", lambda: True)
     monkeypatch.setattr(cli, "probe_window", lambda: Probe(False, False, "there is no display"))
     out = tmp_path / "pictures"
-    arguments = ["view", str(result), "--size", "64x48", "--pictures", "1", "--out", str(out)]
+    arguments = ["view", str(result), "--size", "64x48", "--num-frames", "1", "--out", str(out)]
     assert command_line.main(arguments) == 0
     assert (out / "overview.png").is_file() and "no window: there is no display" in capsys.readouterr().err
 
@@ -204,7 +206,7 @@ def test_a_missing_open3d_is_told_with_its_remedy_and_a_missing_file_before_it(r
     ("arguments", "said"),
     [
         (["nowhere"], "is not there"),
-        (["node.yaml", "--photographs", "nowhere"], "--photographs must be the folder"),
+        (["node.yaml", "--images", "nowhere"], "--images must be the folder"),
         (["--export", "x.mp4"], "needs a finished result"),
         (["node.yaml", "--headless"], "network"),
     ],
@@ -353,7 +355,9 @@ def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys
     config.write_text(f"network: {{directory: {network.directory}}}\n")
     out = tmp_path / "pictures"
     assert (
-        command_line.main(["view", str(config), "--headless", "--until-final", "--size", "160x120", "--out", str(out)])
+        command_line.main(
+            ["view", str(config), "--headless", "--exit-when-final", "--size", "160x120", "--out", str(out)]
+        )
         == 0
     )
     assert (out / "live.png").is_file() and "live.png: OK: All is well." in capsys.readouterr().out
@@ -377,7 +381,7 @@ def test_a_viewer_that_waits_says_for_what(node, tmp_path, monkeypatch, capsys):
         "view",
         str(config),
         "--headless",
-        "--until-final",
+        "--exit-when-final",
         "--size",
         "160x120",
         "--out",
@@ -390,7 +394,7 @@ def test_a_viewer_that_waits_says_for_what(node, tmp_path, monkeypatch, capsys):
 def test_the_viewer_starts_without_torch_and_without_open3d(result, tmp_path):
     code = (
         "import sys; sys.modules['torch'] = sys.modules['open3d'] = None; from splatnode import command_line; "
-        f"sys.exit(command_line.main(['view', {str(result)!r}, '--headless', '--size', '32x24', '--pictures', '1']))"
+        f"sys.exit(command_line.main(['view', {str(result)!r}, '--headless', '--size', '32x24', '--num-frames', '1']))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -213,6 +213,6 @@ def test_a_folder_without_any_scene_is_told(tmp_path):
 
 def test_pictures_of_a_map_need_no_window(out):
     assert (
-        main(["view", str(out), "--headless", "--size", "160x120", "--pictures", "1", "--max-gaussians", "3000"]) == 0
+        main(["view", str(out), "--headless", "--size", "160x120", "--num-frames", "1", "--max-gaussians", "3000"]) == 0
     )
     assert {path.name for path in (out / "view").iterdir()} >= {"overview.png", "camera_005.png", "turntable_000.png"}

@@ -109,6 +109,14 @@ def test_a_short_baseline_asks_for_a_step_aside():
     assert "100% of it is seen under less than 12°" in advice.sentence and advice.gain > 0.3
 
 
+def test_no_step_is_advised_for_surfaces_that_it_would_not_show():
+    """The same wall, turned away: from no place on this side is it seen."""
+    cameras = camera(-0.01, frame_id=0), camera(0.01, frame_id=1)
+    points = plane_points(cameras)
+    advice = next_view(cameras, replace(points, normals=-points.normals))
+    assert advice.arrow is None and advice.gain == 0
+
+
 def test_the_arrow_goes_where_views_are_missing():
     """Both cameras stand to the left of a corner whose right wall only one of them sees, under a flat angle."""
     left = np.array([[x, y, 1.0] for x in np.linspace(-0.4, 0, 15) for y in np.linspace(-0.2, 0.2, 9)])

@@ -37,7 +37,7 @@ def main() -> int:
     threading.Thread(target=show, args=(f"/dev/video{number + 1}", pictures), daemon=True).start()
     Path("/mnt/camera.yaml").write_text(
         f"camera: {{kind: v4l2, device: '{camera['device']}', width: {WIDTH}, height: {HEIGHT}, pixels: YUYV, "
-        "lock: false, settle_s: 0}"
+        "lock_exposure: false, warmup_s: 0}"
     )
     arguments = ["/mnt/camera.yaml", "--out", "/mnt/lens.yaml", "--model", "pinhole", "--seconds", str(SECONDS)]
     return command_line.main(["calibrate", *arguments])

@@ -23,7 +23,7 @@ DISCONNECT = 0x00F0F000 + 65  # vivid's control of that name
 def main() -> None:
     result = {"found": find()}
     (camera,) = result["found"]
-    config = Config(device=camera["device"], width=640, height=480, pixels="YUYV", settle_s=0.2)
+    config = Config(device=camera["device"], width=640, height=480, fourcc="YUYV", warmup_s=0.2)
     result["frames"] = [described(frame) for frame in itertools.islice(stream(config), 8)]
     result["busy"] = second_reader(config)
     with Device(camera["device"]) as device:

@@ -192,6 +192,7 @@ _SWITCHES = (
     ("uncertainty", "uncertainty (7)"),
     ("graph", "graph of a map (8)"),
     ("ground", "ground, axes (9)"),
+    ("given", "given poses (0)"),
 )
 
 

@@ -41,7 +41,7 @@ from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Code
 from splatnode.viewer import text as viewer_text
 from splatnode.viewer.analysis import Advice
-from splatnode.viewer.colours import source_colour
+from splatnode.viewer.colours import camera_colours
 from splatnode.viewer.session import Session
 from splatnode.viewer.shapes import Lines, frustum_depth, ground, ground_lines, image_corners, shapes
 from splatnode.viewer.state import Moment, ViewerState
@@ -152,10 +152,17 @@ def _is_loopback(host: str) -> bool:
 THUMBNAIL_SIDE = 256  # pixels, at least where the photograph has as many
 _QUALITY = 85  # of JPEG
 _NOTHING = ViewerState(
-    cameras=False, photographs=False, path=False, tracked=False, advice=False, uncertainty=False, graph=False
+    cameras=False,
+    photographs=False,
+    path=False,
+    tracked=False,
+    advice=False,
+    uncertainty=False,
+    graph=False,
+    given=False,
 )
 # Groups of lines that the page shows or hides; the names are fields of State. "ground" is one more.
-_GROUPS = ("cameras", "path", "advice", "uncertainty", "graph")
+_GROUPS = ("cameras", "path", "advice", "uncertainty", "graph", "given")
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,14 +239,14 @@ def _describe_scene(content: Content) -> dict[str, Any]:
         "cameras": [
             {
                 "name": sanitize_text(camera.name),
-                "colour": source_colour(index),
+                "colour": colour,
                 "T_world_camera": camera.T_world_camera.ravel().tolist(),
                 "K": camera.K.ravel().tolist(),
                 "size": [camera.width, camera.height],
                 "corners": image_corners(camera, camera.T_world_camera, depth).tolist(),
                 "photograph": camera.name in snapshot.images,
             }
-            for index, camera in enumerate(snapshot.cameras)
+            for camera, colour in zip(snapshot.cameras, camera_colours(snapshot.cameras), strict=True)
         ],
     }
 

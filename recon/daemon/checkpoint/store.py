@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.files import (
@@ -45,6 +45,7 @@ from splatnode.capture.process.files import (
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
+from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.daemon.checkpoint import records
 from splatnode.recon.daemon.checkpoint.records import (
     FRAME_FILE,
@@ -102,6 +103,7 @@ class Store:
         records.remove_incomplete(directory, self.ledger.place)
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
+        self._taken: dict[str, tuple[str, Stamp]] = {}  # camera id and time of the frames that have both
         self._next = self.ledger.next
         self._writing = threading.RLock()
         self._found = deque(self._read_frames())
@@ -127,6 +129,13 @@ class Store:
         """Returns the names of the stored frames that came before frame `number`."""
         names = self._names.copy()  # at once: another thread may store a frame meanwhile
         return {name for name, each in names.items() if each < number}
+
+    def find_frame_set(self, name: str, tolerance_s: float) -> list[str]:
+        """The names of the stored frames that several cameras took together with this one, which is among them."""
+        with self._writing:
+            timed = [(each, *self._taken[each]) for each in self._names if each in self._taken]
+        sets = (list(each.names.values()) for each in form_frame_sets(timed, tolerance_s))
+        return next((names for names in sets if name in names), [name])
 
     def holds(self, frame: Frame) -> bool:
         """Whether this very frame, and no other of its name, is stored."""
@@ -302,6 +311,8 @@ class Store:
     def _remember(self, stored: StoredFrame) -> None:
         self._names[stored.frame.name] = stored.number
         self._keys[stored.number] = stored.key
+        if stored.frame.camera_id and stored.frame.captured_at is not None:
+            self._taken[stored.frame.name] = stored.frame.camera_id, stored.frame.captured_at
 
     def _make_unique_name(self, name: str, number: int) -> str:
         """The name, or one made of it that no other frame has."""
@@ -491,6 +502,7 @@ def make_reconstruction_message(
     registration, evidence = estimate.registration, estimate.evidence
     if registration is None or evidence is None:
         raise ValueError("only an estimate with cameras and evidence is kept")
+    registration = registration.image_part  # a rig places its cameras again when all are registered anew
     cameras = [flatten_dataclass(camera) for camera in registration.cameras]
     kept = {field.name: getattr(registration, field.name) for field in fields(registration)}
     record = ReconstructionRecord(

@@ -44,10 +44,10 @@ RATES = training.LearningRates(
 OPTIMIZE = training.RefinementConfig(
     iterations=1500,
     checkpoints=(250, 900),
-    dssim=0.2,
+    ssim_lambda=0.2,
     dropout=ensemble.DropoutConfig(share=0.0),
     refine_poses=False,
-    rates=RATES,
+    lr=RATES,
     control=ControlChoice("adaptive", adaptive.Config()),
 )
 # The shorter one of the publication's two runs: what the longer one of 30 000 iterations has after 7000
@@ -56,7 +56,7 @@ PUBLISHED = msgspec.structs.replace(
     OPTIMIZE,
     iterations=7_000,
     checkpoints=(),
-    rates=msgspec.structs.replace(RATES, final_means=RATES.final_means**_SHORTER),
+    lr=msgspec.structs.replace(RATES, final_means=RATES.final_means**_SHORTER),
     control=ControlChoice(
         "adaptive",
         adaptive.Config(every=100, start=500 / 7_000, end=1.0, reset_every=3_000 / 7_000, max_gaussians=10_000_000),
@@ -119,5 +119,5 @@ def make_training_view(registered: RegisteredFrame) -> TrainingView:
 
 def scale_rates_to_extent(config: training.RefinementConfig, scene: Scene) -> training.RefinementConfig:
     """The configuration with the means' step size in parts of the extent of the scene."""
-    means = config.rates.means * adaptive.extent([view.T_world_camera for view in scene.views])
-    return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, means=means))
+    means = config.lr.means * adaptive.extent([view.T_world_camera for view in scene.views])
+    return msgspec.structs.replace(config, lr=msgspec.structs.replace(config.lr, means=means))

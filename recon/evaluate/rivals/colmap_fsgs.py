@@ -33,7 +33,7 @@ _DEPTH = regularizers.RegularizerConfig(
 )
 _ADAPTIVE = adaptive.Config(min_gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER)
 OPTIMIZE = msgspec.structs.replace(
-    colmap_3dgs.OPTIMIZE, regularise=_DEPTH, control=ControlChoice("proximity", proximity.Config(_ADAPTIVE))
+    colmap_3dgs.OPTIMIZE, regularizers=_DEPTH, control=ControlChoice("proximity", proximity.Config(_ADAPTIVE))
 )
 _EVERY_100 = msgspec.structs.replace(_ADAPTIVE, every=100)
 PUBLISHED = msgspec.structs.replace(  # as long as in the publication

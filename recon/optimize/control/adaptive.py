@@ -18,6 +18,7 @@ import msgspec
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.rasterize.reference import compute_rotations
 from splatnode.recon.scene.scene import Gaussians, concatenate, logit
@@ -28,18 +29,21 @@ _PARTS = 2  # into which a large Gaussian is split
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    min_gradient: float = 2e-4  # mean length of the gradient, from which on a Gaussian is cloned or split
-    every: int = 50  # iterations between rounds
-    start: float = 500 / 30_000  # share of the iterations at which the first round is
-    end: float = 0.5  # share of the iterations at which the last round is
-    reset_every: float = 0.2  # share of the iterations between resets
-    reset_opacity: float = 0.01  # largest opacity after a reset
-    min_opacity: float = 0.005  # a Gaussian below this opacity is pruned
-    clone_scale: float = 0.01  # largest scale of a Gaussian that is cloned and not split, in extents of the scene
-    max_scale: float = 0.1  # after the first reset, a Gaussian with a larger scale is pruned, in extents of the scene
-    max_radius_px: float = 20.0  # likewise one whose three standard deviations are more in a training view, pixels
-    split_factor: float = 1.6  # scale of a Gaussian over that of its parts
-    max_gaussians: int = 100_000  # at so many no more are added
+    min_gradient: Internal[float] = 2e-4  # mean length of the gradient, from which on a Gaussian is cloned or split
+    every: Internal[int] = 50  # iterations between rounds
+    start: Internal[float] = 500 / 30_000  # share of the iterations at which the first round is
+    end: Internal[float] = 0.5  # share of the iterations at which the last round is
+    reset_every: Internal[float] = 0.2  # share of the iterations between resets
+    reset_opacity: Internal[float] = 0.01  # largest opacity after a reset
+    min_opacity: Internal[float] = 0.005  # a Gaussian below this opacity is pruned
+    # Largest scale of a Gaussian that is cloned and not split, in extents of the scene
+    clone_scale: Internal[float] = 0.01
+    # After the first reset, a Gaussian with a larger scale is pruned, in extents of the scene
+    max_scale: Internal[float] = 0.1
+    # Likewise one whose three standard deviations are more in a training view, pixels
+    max_radius_px: Internal[float] = 20.0
+    split_factor: Internal[float] = 1.6  # scale of a Gaussian over that of its parts
+    max_gaussians: Internal[int] = 100_000  # at so many no more are added
 
 
 def extent(Ts_world_camera: Sequence[Tensor]) -> float:

@@ -14,16 +14,17 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.scene.scene import Gaussians, concatenate
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    adaptive: adaptive.Config = adaptive.Config()
-    neighbours: int = 3  # nearest Gaussians to which a distance is measured
+    adaptive: Internal[adaptive.Config] = adaptive.Config()
+    neighbours: Internal[int] = 3  # nearest Gaussians to which a distance is measured
     # Mean distance to them, in extents of the scene, above which Gaussians are added; the paper gives no unit
-    min_distance: float = 0.05
+    min_distance: Internal[float] = 0.05
 
 
 def unpool(gaussians: Gaussians, min_distance: float, neighbours: int) -> Gaussians:

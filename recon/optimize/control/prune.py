@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
@@ -21,13 +22,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     at: tuple[float, ...] = (0.3,)  # shares of the refinement, rising, after which Gaussians are pruned
     # Less is not seen: squared difference of colours in [0, 1], over all pixels, channels, views
     least_change: float = 0.005
-    between: int = 1  # pseudo views for each photograph, which count as photographs do
-    off_path: float = 0.3  # largest distance of pseudo views from the path of the cameras, in its steps
-    probes: int = 2  # random images for each view, from which the differences are estimated
+    between: Internal[int] = 1  # pseudo views for each photograph, which count as photographs do
+    off_path: Internal[float] = 0.3  # largest distance of pseudo views from the path of the cameras, in its steps
+    probes: Internal[int] = 2  # random images for each view, from which the differences are estimated
     # With a deadline, nothing is pruned before: until then the Gaussians are not fitted.
-    min_iterations: int = 30
+    min_iterations: Internal[int] = 30
     # Nor with fewer left: pruning takes the time of 30, and closing the gaps takes as many again.
-    min_remaining_iterations: int = 60
+    min_remaining_iterations: Internal[int] = 60
 
 
 def load(config: Config, seed: int) -> Pruning:

@@ -14,6 +14,7 @@ import msgspec
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.rasterize.reference import compute_rotations
 from splatnode.recon.scene.scene import Gaussians
@@ -25,12 +26,12 @@ _ALMOST_OPAQUE = 1 - 1e-6  # largest opacity that is given: the logit of 1 is in
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    every: int = 100  # iterations between relocations
-    until: float = 0.83  # share of the refinement after which nothing is relocated: 25000 of 30000 iterations
-    dead: float = 0.005  # opacity up to which a Gaussian is relocated
-    noise: float = 5e5  # amplitude of the noise on positions, in learning rates of the means
-    rate: float = 1.6e-4  # that learning rate at the start
-    final: float = 0.01  # part of that rate that is left at the end, after an exponential fall
+    every: Internal[int] = 100  # iterations between relocations
+    until: Internal[float] = 0.83  # share of the refinement after which nothing is relocated: 25000 of 30000 iterations
+    dead: Internal[float] = 0.005  # opacity up to which a Gaussian is relocated
+    noise: Internal[float] = 5e5  # amplitude of the noise on positions, in learning rates of the means
+    rate: Internal[float] = 1.6e-4  # that learning rate at the start
+    final: Internal[float] = 0.01  # part of that rate that is left at the end, after an exponential fall
 
 
 def load(config: Config, seed: int) -> Relocation:

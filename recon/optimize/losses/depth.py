@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
 from splatnode.recon.optimize.regularizers import Supervision, SurfaceTarget, resample_target
 from splatnode.recon.rasterize.reference import Render
@@ -26,7 +27,7 @@ class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     """
 
     patch: int = 128  # side of a patch, pixels
-    share: float = 0.5  # share of the patches that is drawn, anew at each iteration
+    share: Internal[float] = 0.5  # share of the patches that is drawn, anew at each iteration
 
 
 def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:

@@ -1,7 +1,8 @@
 """The interface of losses beside the photometric one. A new loss is one new file in this folder.
 
 Its module has a `Config`, a subclass of Schedule with what is particular to it, and
-`prepare(config, supervision, seed) -> Loss`. A configuration names it by its module under `optimize.regularise.losses`.
+`prepare(config, supervision, seed) -> Loss`. A configuration names it by its module, under
+`optimize.regularizers.losses`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import msgspec
 from torch import Tensor
 
 from splatnode.capture.process.config import Plugin
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.rasterize.reference import Render
 
 
@@ -27,8 +29,8 @@ class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The weight of a loss, and the part of the refinement in which it counts."""
 
     weight: float = 0.0  # factor of the loss in the sum of all; 0: it does not count
-    start: float = 0.0  # share of the iterations after which it counts
-    end: float = 1.0  # share of the iterations after which it counts no more
+    start: Internal[float] = 0.0  # share of the iterations after which it counts
+    end: Internal[float] = 1.0  # share of the iterations after which it counts no more
 
     def weight_at(self, progress: float) -> float:
         """The weight at `progress` in [0, 1]."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.optimize.losses.loss import Loss, Schedule
 from splatnode.recon.optimize.losses.perceptual import load_perceptual
 from splatnode.recon.optimize.regularizers import Supervision
@@ -12,7 +13,8 @@ from splatnode.recon.rasterize.reference import Render
 
 
 class Config(Schedule, frozen=True, forbid_unknown_fields=True):
-    compare_unseen: bool = False  # pull pixels without a point towards white, as the paper writes; else leave them out
+    # Pull pixels without a point towards white, as the paper writes; else leave them out
+    compare_unseen: Internal[bool] = False
 
 
 def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:

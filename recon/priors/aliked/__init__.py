@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.aliked.matcher import AlikedMatcher
@@ -15,8 +16,8 @@ WEIGHTS = ("aliked/aliked-n16.pth",)
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # file of N16 or T16; None: N16's, where `splatnode weights` puts them
-    longer_side: int = 800  # of the network's images, pixels; none is enlarged
-    num_keypoints: int = 2000  # of an image, at most
+    longer_side: Internal[int] = 800  # of the network's images, pixels; none is enlarged
+    num_keypoints: Internal[int] = 2000  # of an image, at most
 
 
 def load(config: Config) -> ClassicalPrior:

@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching.features import describe
@@ -150,8 +151,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
     longer_side: int = 504  # of the network's images, pixels: what it was published with
-    views_at_once: int = 12  # photographs that look at each other: memory and time grow with their square
-    seed: int = 0  # every prior has one; this one draws no random numbers
+    views_at_once: Internal[int] = 12  # photographs that look at each other: memory and time grow with their square
+    seed: Internal[int] = 0  # every prior has one; this one draws no random numbers
 
 
 class Da3Prior(Prior):

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks.vit import Crop, crop, crop_image
@@ -111,8 +112,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
     longer_side: int = 512  # of the network's images, pixels: what it was trained with
-    max_neighbours: int = 6  # places in the circle of frames: of up to 13 frames every pair is asked about
-    seed: int = 0  # every prior has one; global alignment has a fixed one
+    max_neighbours: Internal[int] = 6  # places in the circle of frames: of up to 13 frames every pair is asked about
+    seed: Internal[int] = 0  # every prior has one; global alignment has a fixed one
 
 
 class Mast3rPrior(Prior):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.networks.weights import WeightsError, find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior
@@ -15,7 +16,7 @@ PACKAGE = "onnxruntime"
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
     features: Path | None = None  # ONNX file of XFeat; None: where `splatnode weights` puts it
     matcher: Path | None = None  # ONNX file of LighterGlue; None: the same
-    num_keypoints: int = 2000  # of an image, at most
+    num_keypoints: Internal[int] = 2000  # of an image, at most
 
 
 def load(config: Config) -> ClassicalPrior:

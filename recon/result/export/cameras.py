@@ -15,10 +15,10 @@ import numpy as np
 
 from splatnode.capture.frame import LARGEST_NS, Clock, Intrinsics, Stamp
 from splatnode.capture.process.records import record_in
-from splatnode.capture.process.text import LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
+from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
 from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES, SceneFileError
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.snapshot import MAX_COORDINATE, CameraEstimate, find_camera_problem
+from splatnode.recon.result.snapshot import MAX_COORDINATE, CameraEstimate, GivenCameraPose, find_camera_problem
 from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale
 
 Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
@@ -43,9 +43,25 @@ LENS_MEANING = (
     "picture that K, width and height are of; null: nothing estimated was"
 )
 
+GIVEN_LENS_MEANING = (
+    "as it was given, in pixels of the photograph in full size: its distortion, and the difference of fx and fy, were "
+    "taken out of the picture that K, width and height are of; null: none was given, or it was a pinhole with fx = fy"
+)
+
 CONSISTENT_DEPTH_MEANING = (
     "share of the photograph's pixels, 0 to 1, whose depth is multi-view consistent: a point of another view has it, "
     "too; null: not known"
+)
+
+
+FRAME_SET_MEANING = (
+    "camera_id says which of several cameras took the photograph, and photographs of one frame_set were taken "
+    "together; null: there is one camera, or nothing tells"
+)
+
+GIVEN_MEANING = (
+    "the pose that was given for the camera, with its standard deviations, and how far it is from the estimated one; "
+    "null: none was given, or nothing tells where its world lies"
 )
 
 
@@ -60,8 +76,26 @@ def make_camera_dict(camera: CameraEstimate) -> dict[str, object]:
         "width": camera.width,
         "height": camera.height,
         "lens": None if camera.lens is None else asdict(camera.lens),
+        "given_lens": None if camera.given_lens is None else asdict(camera.given_lens),
         "bounds": None if camera.bounds is None else asdict(camera.bounds),
         "consistent_depth": None if camera.consistent_depth is None else round(camera.consistent_depth, 4),
+        "camera_id": camera.camera_id or None,
+        "frame_set": camera.frame_set,
+        "given": make_given_dict(camera),
+    }
+
+
+def make_given_dict(camera: CameraEstimate) -> dict[str, object] | None:
+    """The pose that was given for a camera, beside the estimated one; None where none was."""
+    residual = camera.pose_residual
+    if camera.given is None or residual is None:
+        return None
+    return {
+        "T_world_camera": camera.given.T_world_camera.tolist(),
+        "sigma_m": camera.given.sigma_m,
+        "sigma_deg": camera.given.sigma_deg,
+        "residual_m": residual[0],
+        "residual_deg": residual[1],
     }
 
 
@@ -79,8 +113,11 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             "T_world_camera": "p_world = T_world_camera @ p_camera",
             "stamp_ns": STAMP_MEANING,
             "lens": LENS_MEANING,
+            "given_lens": GIVEN_LENS_MEANING,
             "bounds": BOUNDS_MEANING,
             "consistent_depth": CONSISTENT_DEPTH_MEANING,
+            "frame_set": FRAME_SET_MEANING,
+            "given": GIVEN_MEANING,
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
             "cameras": [make_camera_dict(camera) for camera in cameras],
         }
@@ -95,6 +132,12 @@ class _Bounds(msgspec.Struct, frozen=True):
     axes: tuple[Row3, Row3, Row3]
 
 
+class _Given(msgspec.Struct, frozen=True):
+    T_world_camera: tuple[Row4, Row4, Row4, Row4]
+    sigma_m: Annotated[float, msgspec.Meta(ge=0, le=MAX_COORDINATE)]
+    sigma_deg: Annotated[float, msgspec.Meta(ge=0, le=180)]
+
+
 class _Camera(msgspec.Struct, frozen=True):
     name: Text
     frame_id: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 31)]
@@ -107,6 +150,10 @@ class _Camera(msgspec.Struct, frozen=True):
     clock: Clock | None = None
     lens: Intrinsics | None = None
     consistent_depth: Share | None = None
+    camera_id: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)] | None = None
+    frame_set: Annotated[int, msgspec.Meta(ge=0, lt=1 << 31)] | None = None
+    given: _Given | None = None
+    given_lens: Intrinsics | None = None
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -155,16 +202,24 @@ def _numbers_of(bounds: _Bounds) -> tuple[float, ...]:
 def _make_camera(record: _Camera, name: str) -> CameraEstimate:
     T_world_camera, K = np.array(record.T_world_camera), np.array(record.K)
     problem = find_camera_problem(T_world_camera, K, record.width, record.height)
-    if not is_printable(record.name) or record.name in ("", ".", "..") or "/" in record.name:
-        problem = "a name must be that of a file, in printable letters"
+    if not is_printable(record.name) or any(part in ("", ".", "..") for part in record.name.split("/")):
+        problem = "a name must be that of a file, or of one in a folder of its camera, in printable letters"
     if (record.stamp_ns is None) != (record.clock is None):
         problem = "stamp_ns and clock must be there both, or none"
     if record.bounds is not None and min(_numbers_of(record.bounds)) < 0:
         problem = f"bounds must not be below 0, got {min(_numbers_of(record.bounds)):g}"
+    if record.given is not None:
+        problem = problem or find_camera_problem(np.array(record.given.T_world_camera), K, record.width, record.height)
     if problem:
         raise SceneFileError(f"{name}, camera {sanitize_text(record.name, 100)!r}: {problem}")
     bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))
     captured_at = None if record.stamp_ns is None or record.clock is None else Stamp(record.stamp_ns, record.clock)
     size = record.width, record.height
     known = bounds, captured_at, record.lens, record.consistent_depth
+    known = *known, sanitize_text(record.camera_id or ""), record.frame_set, _make_given(record.given)
+    known = *known, record.given_lens
     return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, *known)
+
+
+def _make_given(record: _Given | None) -> GivenCameraPose | None:
+    return record and GivenCameraPose(np.array(record.T_world_camera), record.sigma_m, record.sigma_deg)

@@ -61,7 +61,8 @@ def export_scene(source: Path, to: str, destination: Path | None = None, selecti
     format_ = load_format(to)
     if not selection.is_everything and not getattr(format_, "GAUSSIANS", True):
         raise ValueError(
-            f"{to} holds cameras and no Gaussians: --only-seen, --no-background and --crop have nothing to leave out"
+            f"{to} holds cameras and no Gaussians: --multi-view-only, --no-background and --crop have nothing to "
+            "leave out"
         )
     result = StoredResult.create_from_path(source, selection)
     if destination is None:

@@ -34,11 +34,11 @@ def sanitize_gaussians(gaussians: GaussianArrays) -> GaussianArrays:
     if not finite.any():
         return select_gaussians(gaussians, finite)
     middle = np.median(gaussians.means[finite], axis=0)
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):
         distance = np.linalg.norm((gaussians.means - middle).astype(np.float64), axis=1)
     reach = float(np.median(distance[finite])) or 1.0
     kept = select_gaussians(gaussians, finite & (distance <= _FARTHEST * reach))
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):
         length = np.linalg.norm(kept.quats, axis=1, keepdims=True)
     is_rotation = (length > 1e-12) & np.isfinite(length)
     identity = np.array([1.0, 0.0, 0.0, 0.0], np.float32)

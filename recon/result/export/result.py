@@ -134,20 +134,28 @@ def write_beside(path: Path, contents: Mapping[str, bytes], of: Path) -> None:
     """Writes what was made of the result `of`, a folder or its scene file: `contents`, by path relative to `path`.
 
     The name "" is that of the file `path` itself. What lies inside of the result's folder is listed in its
-    `exports.json`: the next result that is written there removes it, unless somebody has changed it meanwhile.
-    Raises ResultWriteError.
+    `exports.json`: the next result that is written there removes it, unless somebody has changed it meanwhile. So does
+    the next export to the same place with what it does not write itself; elsewhere, a folder of several files has such
+    a list of its own. Raises ResultWriteError.
     """
     folder = Path(os.path.realpath(of if of.is_dir() else of.parent))
     if path.is_dir():
         path = Path(os.path.realpath(path))  # the user's own link
     target = Path(os.path.realpath(path.parent)) / path.name
     if not (target.is_relative_to(folder) and read_digests(folder / MANIFEST)):
-        write_files(path.parent, {os.path.normpath(f"{path.name}/{name}"): data for name, data in contents.items()})
+        files = {os.path.normpath(f"{path.name}/{name}"): data for name, data in contents.items()}
+        listed = read_digests(path / EXPORTS)
+        gone = {f"{path.name}/{name}": digest for name, digest in listed.items() if name not in contents}
+        if len(contents) > 1:
+            files[f"{path.name}/{EXPORTS}"] = json_bytes({"files": make_entries(contents)})
+        write_files(path.parent, files, gone)
         return
     place = target.relative_to(folder)
     files = {os.path.normpath(place / name): data for name, data in contents.items()}
-    known = {name: {"sha256": digest} for name, digest in read_digests(folder / EXPORTS).items()}
-    write_files(folder, files | {EXPORTS: json_bytes({"files": known | make_entries(files)})})
+    listed = read_digests(folder / EXPORTS)
+    gone = {name: digest for name, digest in listed.items() if name.startswith(f"{place}/") and name not in files}
+    known = {name: {"sha256": digest} for name, digest in listed.items() if name not in gone}
+    write_files(folder, files | {EXPORTS: json_bytes({"files": known | make_entries(files)})}, gone)
 
 
 def remove_result(out_dir: Path) -> None:

@@ -94,7 +94,8 @@ def read_gaussians(path: Path, sources: Path | None = None) -> GaussianArrays:
     decode = _load_decoders().get(path.suffix.lower())
     if decode is None:
         raise SceneFileError(f"{path.name} must end with {', '.join(_load_decoders())}")
-    with guard_untrusted(SceneFileError, path.name):
+    # NumPy warns of a NaN that signals, and of what is too large, before it is looked for and left out.
+    with guard_untrusted(SceneFileError, path.name), np.errstate(all="ignore"):
         gaussians = decode(read_scene_file(path), path.name)
         if sources is not None:
             source_frame = decode_sources(read_scene_file(sources), len(gaussians))

@@ -56,7 +56,7 @@ def main() -> None:
     args = parser.parse_args()
     config = building.Config(
         keyframes=args.keyframes, width=args.size, height=args.size * 3 // 4, seed=args.seed, kidnap_at=args.kidnap_at,
-        frames_per_second=args.per_second, pace="recorded",
+        fps=args.per_second, pace="recorded",
     )  # fmt: skip
     recon = {} if args.max_views is None else {"max_views": args.max_views}
     told = (Path(each).name if each.startswith("/") else each for each in sys.argv[1:])  # no path of this machine
@@ -95,7 +95,7 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
         node.start("capture")
         began, samples = time.monotonic(), []
         taken_s, finished_s, resting = None, None, 0
-        last_s = config.keyframes / config.frames_per_second
+        last_s = config.keyframes / config.fps
         while finished_s is None and time.monotonic() - began < last_s + patience_s:
             time.sleep(LOOK_S)
             if node.processes["recon"].poll() is not None:
@@ -113,7 +113,7 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
         row = {
-            "keyframes": config.keyframes, "per_second": config.frames_per_second, "width": config.width,
+            "keyframes": config.keyframes, "per_second": config.fps, "width": config.width,
             "taken_s": taken_s, "all_finished_s": finished_s, "exit_codes": codes, "cost": cost_row(samples),
             "load_average": os.getloadavg()[0],
         }  # fmt: skip

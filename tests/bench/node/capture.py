@@ -65,7 +65,7 @@ def write_walk(folder: Path) -> list[Path]:
 def measure(folder: Path, photographs: list[Path], seconds: float) -> dict[str, object]:
     config = folder / "capture.yaml"
     config.write_text(
-        f"camera: {{kind: folder, folder: {photographs[0].parent}, frames_per_second: {RATE}, pace: recorded, "
+        f"camera: {{kind: folder, folder: {photographs[0].parent}, fps: {RATE}, pace: recorded, "
         "loops: 999}\n"
         f"spool: {{directory: {folder / 'state'}}}\nnetwork: {{directory: {folder / 'run'}}}\n"
     )

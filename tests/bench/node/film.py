@@ -36,7 +36,7 @@ def main() -> None:
     args = parser.parse_args()
     walk = building.Config(
         keyframes=args.keyframes, width=args.size, height=args.size * 3 // 4, seed=args.seed, samples=1,
-        frames_per_second=args.per_second,
+        fps=args.per_second,
     )  # fmt: skip
     command = shlex.join(["python", "-m", "tests.bench", "film", *sys.argv[1:]])
     with tempfile.TemporaryDirectory() as folder:
@@ -55,7 +55,7 @@ def main() -> None:
 def filmed(walk: building.Config, path: Path) -> None:
     """The photographs of the walk as a video."""
     size = walk.width, walk.height
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), walk.frames_per_second, size)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), walk.fps, size)
     for number in range(walk.keyframes):
         writer.write(cv2.cvtColor(building.render_image(walk, number), cv2.COLOR_RGB2BGR))
     writer.release()
@@ -71,7 +71,7 @@ def live(film: Path, folder: Path, walk: building.Config, patience_s: float) -> 
         pid = node.start("recon").pid
         node.start("capture")
         began, resting, peak_mb, spent_s = time.monotonic(), 0, 0.0, 0.0
-        limit_s = walk.keyframes / walk.frames_per_second + patience_s
+        limit_s = walk.keyframes / walk.fps + patience_s
         while resting < RESTS and time.monotonic() - began < limit_s and node.processes["recon"].poll() is None:
             time.sleep(LOOK_S)
             found = heartbeats(node.network)

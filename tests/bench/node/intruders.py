@@ -69,7 +69,9 @@ def revoked_key(trial: Trial) -> None:
         connected = StateClient(RECON_SCENE, theirs, SceneHeader)
         wait_for(lambda: connected.poll(0.2) is not None, "scene for who is allowed")
         (Path(network["keys"]) / "allowed" / "stranger.key").unlink()
-        expect("does not let this machine in. Run there: splatnode keys" in _refusal(theirs), "no word to the revoked")
+        expect(
+            "does not let this machine in. Run there: splatnode keygen" in _refusal(theirs), "no word to the revoked"
+        )
         node.end("recon")
         node.start("recon")
         wait_for(lambda: _is_refused(connected), "refusal of who was connected")

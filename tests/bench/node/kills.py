@@ -78,9 +78,7 @@ class Walk:
     def __init__(self, folder: Path, seed: int) -> None:
         self.shown = 0
         self._folder = folder
-        self._config = building.Config(
-            keyframes=400, width=SIDE, height=SIDE * 3 // 4, seed=seed, samples=1, frames_per_second=2.0
-        )
+        self._config = building.Config(keyframes=400, width=SIDE, height=SIDE * 3 // 4, seed=seed, samples=1, fps=2.0)
 
     def node(self, name: str) -> Node:
         images = self._folder / f"{name}_images"

@@ -67,7 +67,7 @@ def replay(
             "kind": "folder",
             "folder": str(images.resolve()),
             "names": list(split.train),
-            "frames_per_second": per_second,
+            "fps": per_second,
             "pace": "recorded",
         },
         "selection": {"every_frame": True},

@@ -74,7 +74,7 @@ def viewer_stopped_for_a_minute(trial: Trial) -> None:
     pictures = trial.folder / "pictures"
     with running(trial.node()) as node:
         node.start("recon")
-        arguments = (str(node.folder / "recon.yaml"), "--headless", "--until-final", "--out", str(pictures))
+        arguments = (str(node.folder / "recon.yaml"), "--headless", "--exit-when-final", "--out", str(pictures))
         (node.folder / "view.yaml").write_text(f'{{"network": {{"directory": "{node.folder / "run"}"}}}}')
         node.run("view", node.command("view", str(node.folder / "view.yaml"), *arguments[1:]))
         node.start("capture")
@@ -94,7 +94,7 @@ def viewer_stopped_for_a_minute(trial: Trial) -> None:
 def recon_absent_for_an_hour(trial: Trial) -> None:
     """The spool is at its bound: the oldest keyframes are kept, and it is said that no more are taken."""
     spool = {"max_frames": 3}
-    live = {"kind": "folder", "folder": str(trial.images), "frames_per_second": 20.0, "pace": "recorded", "loops": 200}
+    live = {"kind": "folder", "folder": str(trial.images), "fps": 20.0, "pace": "recorded", "loops": 200}
     with running(trial.node(live, spool=spool)) as node:
         node.start("capture")
         wait_for(lambda: "event=spool_full" in node.log("capture"), "line that tells of the bound")

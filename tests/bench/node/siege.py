@@ -57,10 +57,10 @@ def main() -> None:
         network = over(args.over, place)
         photograph_walk(place / "walk", args.pictures)
         loops = 2 + int(args.minutes * 60 * PER_SECOND / args.pictures)
-        stream = {"kind": "folder", "folder": str(place / "walk"), "frames_per_second": PER_SECOND}
+        stream = {"kind": "folder", "folder": str(place / "walk"), "fps": PER_SECOND}
         camera = {"camera": {**stream, "pace": "recorded", "loops": loops}}
         with running(
-            Node(place / "node", camera, RECON | {"max_views": 8, "settle_s": 10.0, "out": "out"}, network)
+            Node(place / "node", camera, RECON | {"max_views": 8, "idle_finalize_s": 10.0, "out": "out"}, network)
         ) as node:
             for verb in ("recon", "capture"):
                 node.start(verb)

@@ -67,7 +67,7 @@ def camera(args: argparse.Namespace) -> dict[str, Any]:
         "camera": {
             "kind": "folder",
             "folder": str(args.images.resolve()),
-            "frames_per_second": args.per_second,
+            "fps": args.per_second,
             "pace": "recorded",
             "loops": 2 + int(args.minutes * 60 * args.per_second / max(1, count)),
         }

@@ -169,7 +169,7 @@ def _streamed(
         (images / name).symlink_to(scenes[scene].paths[photograph].resolve())
     camera = {
         "camera": {
-            "kind": "folder", "folder": str(images), "names": names, "frames_per_second": per_second,
+            "kind": "folder", "folder": str(images), "names": names, "fps": per_second,
             "pace": "recorded",
         },
         "selection": {"every_frame": True},

@@ -20,13 +20,13 @@ VIEWS = 6
 RECON = {
     "reconstruction": {
         "size": 160,
-        "matching": {"features": {"num_features": 1500, "min_longer_side": 320}},
+        "matching": {"features": {"max_num_features": 1500, "min_longer_side": 320}},
         "registration": {"mapper": {"max_attempts": 2}},
         "preview": {"iterations": 2, "half_resolution_share": 1.0},
         "optimize": {"iterations": 20, "checkpoints": [10]},
     },
-    "tracking": {"every_s": 0},
-    "settle_s": 0.5,
+    "tracking": {"interval_s": 0},
+    "idle_finalize_s": 0.5,
 }
 
 
@@ -54,7 +54,7 @@ class Trial:
         spool: dict[str, Any] | None = None,
         **recon: Any,
     ) -> Node:
-        replayed = {"kind": "folder", "folder": str(self.images), "frames_per_second": 4.0, "pace": "recorded"}
+        replayed = {"kind": "folder", "folder": str(self.images), "fps": 4.0, "pace": "recorded"}
         config: dict[str, Any] = {"camera": camera or replayed, "selection": {"every_frame": True}}
         config["spool"] = {"directory": str(self.folder / name)} | (spool or {})
         return Node(self.folder / name, config, RECON | recon, network)

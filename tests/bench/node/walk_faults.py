@@ -39,12 +39,12 @@ SIDE = 320  # of a photograph, pixels
 MOST_KEYFRAMES = 2000
 RECON = {
     "max_views": 12,
-    "export_every_s": 5.0,
-    "settle_s": 1.0,
-    "tracking": {"every_s": 0},
+    "export_interval_s": 5.0,
+    "idle_finalize_s": 1.0,
+    "tracking": {"interval_s": 0},
     "reconstruction": {
         "size": 256,
-        "matching": {"features": {"num_features": 4000, "min_longer_side": 640}},
+        "matching": {"features": {"max_num_features": 4000, "min_longer_side": 640}},
         "preview": {"iterations": 5, "half_resolution_share": 1.0},
         "optimize": {"iterations": 20, "checkpoints": [10]},
     },
@@ -60,7 +60,7 @@ def main() -> None:
     chance = random.Random(args.seed)
     faults = [fault for _ in range(args.times) for fault in chance.sample(on_the_way.FAULTS, len(on_the_way.FAULTS))]
     walk = building.Config(
-        keyframes=MOST_KEYFRAMES, width=SIDE, height=SIDE * 3 // 4, seed=args.seed, samples=1, frames_per_second=2.0
+        keyframes=MOST_KEYFRAMES, width=SIDE, height=SIDE * 3 // 4, seed=args.seed, samples=1, fps=2.0
     )
     rows: dict[str, dict[str, Any]] = {}
     with ExitStack() as stack:

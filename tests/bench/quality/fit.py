@@ -1,9 +1,9 @@
 """Fits the numbers of the verdict: `python -m tests.bench fit RESULT.json ... [--write] [--out DIR]`.
 
-The results are windows.json of `splatnode stability --windows` (also with `--counts 2`, for pairs) and stability.json
-of `splatnode stability`. What is printed, and kept in DIR/fit.json, is cross-validated: each scene is judged by numbers
-that were fitted without it. So are DIR/windows.json, with all methods of the results, and its charts. --write puts the
-numbers that all scenes together give into recon/verification/fitted.py.
+The results are windows.json of `splatnode robustness --windows` (also with `--counts 2`, for pairs) and stability.json
+of `splatnode robustness`. What is printed, and kept in DIR/fit.json, is cross-validated: each scene is judged by
+numbers that were fitted without it. So are DIR/windows.json, with all methods of the results, and its charts. --write
+puts the numbers that all scenes together give into recon/verification/fitted.py.
 """
 
 from __future__ import annotations

@@ -13,11 +13,12 @@ import json
 import time
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -173,22 +174,46 @@ def run_scene(
     return found
 
 
+class Answer(Protocol):
+    """Describes the outcome of a trial, of a scene, a number of images and a setting."""
+
+    @property
+    def scene(self) -> str: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def setting(self) -> str: ...
+    @property
+    def published(self) -> bool: ...
+    @property
+    def wrong(self) -> bool: ...
+
+
+def find_answered(trials: Iterable[Answer]) -> set[tuple[str, int, str]]:
+    """Returns scene, number of images and setting of the trials that are answered and not wrong."""
+    return {(t.scene, t.count, t.setting) for t in trials if t.published and not t.wrong}
+
+
+def format_answers(trials: Sequence[Answer], answerable: Collection[tuple[str, int, str]], reference: str) -> str:
+    """Returns how many trials are answered and wrong, and the share of those that `reference` answers."""
+    compared = [t for t in trials if (t.scene, t.count, t.setting) in answerable]
+    good = sum(t.published and not t.wrong for t in compared)
+    return (
+        f"trials {len(trials):3d}, answered {sum(t.published for t in trials):3d}, wrong "
+        f"{sum(t.wrong for t in trials):2d}; {reference} answered {len(compared):3d}, of these answered and not wrong "
+        f"{good:3d} ({100 * good / max(1, len(compared)):.0f} %)"
+    )
+
+
 def table(trials: Sequence[Trial]) -> Iterator[str]:
     """Each kind and setting: trials, answered and right, wrong, refused, and the share of those whose clean set is."""
-    clean = {(t.scene, t.count, t.setting) for t in trials if t.kind == "clean" and t.published and not t.wrong}
+    clean = find_answered([t for t in trials if t.kind == "clean"])
     groups: dict[tuple[str, str], list[Trial]] = defaultdict(list)
     for trial in trials:
         groups[trial.kind, trial.setting].append(trial)
     damaged = [t for t in trials if t.kind != "clean"]
     for (kind, setting), rows in [*groups.items(), (("all damaged", "any"), damaged)]:
-        answerable = [t for t in rows if (t.scene, t.count, t.setting) in clean]
-        good = sum(t.published and not t.wrong for t in answerable)
-        wrong = [t for t in rows if t.wrong]
-        yield (
-            f"{kind:24s} {setting:8s} trials {len(rows):3d}, answered {sum(t.published for t in rows):3d}, "
-            f"wrong {len(wrong):2d}; clean answered {len(answerable):3d}, of these answered and not wrong {good:3d} "
-            f"({100 * good / max(1, len(answerable)):.0f} %)"
-        )
+        yield f"{kind:24s} {setting:8s} {format_answers(rows, clean, 'clean')}"
 
 
 def main() -> None:

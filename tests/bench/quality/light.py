@@ -2,10 +2,10 @@
 
 The training photographs of each set get gains of .5 to 2, times .8 to 1.2 for each channel (clipped to
 8 bits, as a camera does), drawn with seed 0. `balanced` makes a scene of them as they were taken, with the gains, and
-with the gains while `light` is switched off. Held-out photographs are as they were taken; each render is brought to the
-exposure of its photograph (`--best-gain`) before it is scored. Live, the photographs come one at a time: scored are the
-scene that has grown with them, and the one that is made of all in the end. Errors of the gains are against those drawn,
-times what is found for the photographs as they were taken, and after the median.
+with the gains while `exposure_compensation` is switched off. Held-out photographs are as they were taken; each render
+is brought to the exposure of its photograph (`--color-correct`) before it is scored. Live, the photographs come one at
+a time: scored are the scene that has grown with them, and the one that is made of all in the end. Errors of the gains
+are against those drawn, times what is found for the photographs as they were taken, and after the median.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.bench.quality.real_sets import last, measure, timed
 SETS = ("fountain_p11:6", "llff_fern:6", "fox:12")
 LEAST, MOST, BALANCE = 0.5, 2.0, 0.2
 ON = preset("balanced")
-OFF = msgspec.structs.replace(ON, light=scene_exposure.ExposureConfig(enabled=False))
+OFF = msgspec.structs.replace(ON, exposure_compensation=scene_exposure.ExposureConfig(enabled=False))
 
 
 @dataclass(frozen=True)

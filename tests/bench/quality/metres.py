@@ -75,7 +75,7 @@ def of_marker(snapshot: Snapshot, sightings: Sequence[MarkerDetection], truth: f
         row = {"what": "marker", "photographs": [each.photograph for each in two], **measured(told, truth)}
         refused = []
         for factor in (1.0 - OFF, 1.0 + OFF):
-            asked = MetricConfig(marker_m=SIDE_M, baseline=Baseline(first, last, factor * apart))
+            asked = MetricConfig(marker_size_m=SIDE_M, baseline=Baseline(first, last, factor * apart))
             refused.append(not apply_metric_scale(snapshot, asked, Evidence(two)).scale.metric)
         yield {**row, "wrong_baselines": len(refused), "refused": sum(refused)}
 
@@ -122,7 +122,7 @@ def place(seed: int) -> list[Row]:
     centres = np.stack([views[names[index]].centre for index in used])
     Ts = [cameras[index][0] for index in used]
     truth = compute_rms_radius(np.stack(Ts)[:, :3, 3]) / compute_rms_radius(centres)
-    rows = list(of_marker(snapshot, gather_evidence(frames, MetricConfig(marker_m=SIDE_M)).sightings, truth))
+    rows = list(of_marker(snapshot, gather_evidence(frames, MetricConfig(marker_size_m=SIDE_M)).sightings, truth))
     off = 0.01 * (seed % 6)
     pairs = make_pairs(frames, right_photographs(config, BASELINE_M * (1.0 + off), markers))
     rows += of_stereo(snapshot, pairs, truth, off)

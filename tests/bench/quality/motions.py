@@ -83,7 +83,7 @@ def _sigmas(motion: Motion) -> tuple[float, float]:
 
 def _unit(views: Mapping[str, MetricView], motions: Mapping[str, Motion], truth: float) -> Row:
     """What the motions say, and which photographs the motions that were left out led to."""
-    said = estimate_scale_from_motions(views, motions, MetricConfig().motions_shared)
+    said = estimate_scale_from_motions(views, motions, MetricConfig().odometry_scale_sigma)
     sentences = [each for each in said if isinstance(each, str)]
     if isinstance(said[0], Measurement):
         return {**measured(said[0], truth), "left_out": [each.split()[5] for each in sentences]}

@@ -59,12 +59,12 @@ def configurations(chosen: int) -> dict[str, ReconstructionConfig]:
     """By method, with `chosen` the size that splatnode chose."""
     ours = preset("balanced")
     ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
-    fine = replace(ours.seeding, max_error=1e-4, min_area_px=1.0)
+    fine = replace(ours.initialization, max_error=1e-4, min_area_px=1.0)
     by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
     by_pixel = replace(ours, pixelwise=initialization.PixelwiseConfig(), optimize=replace(ours.optimize, control=None))
     relocating = replace(ours.optimize, control=ControlChoice("relocate", relocate.Config()))
     forced = {
-        f"x{factor:g}": replace(ours, seeding=fine, optimize=by_size, max_gaussians=round(factor * chosen))
+        f"x{factor:g}": replace(ours, initialization=fine, optimize=by_size, max_gaussians=round(factor * chosen))
         for factor in FACTORS
     }
     rival = replace(by_pixel, optimize=relocating, max_gaussians=chosen, surplus=1.0)

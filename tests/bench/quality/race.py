@@ -112,12 +112,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="seeds 0 to N-1")
     parser.add_argument("--methods", type=names, default=METHODS)
-    parser.add_argument("--interpolated-start", action="store_true", help="as `splatnode bench` has it")
+    parser.add_argument("--interpolate-start", action="store_true", help="as `splatnode bench` has it")
     parser.add_argument("--cores", type=positive, metavar="N", help="as `splatnode bench` has it")
     add_device(parser)
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     args = parser.parse_args()
-    settings = INTERPOLATED_START if args.interpolated_start else Settings()
+    settings = INTERPOLATED_START if args.interpolate_start else Settings()
     wanted: Device = args.device or "cpu"
     try:
         on = choose_device(wanted)

@@ -49,7 +49,7 @@ def words(gains: Mapping[str, float]) -> dict[str, dict[str, float]]:
 def is_left(start: Start, told: Mapping[str, float]) -> bool:
     maps = list(start.estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
-    return not exposure.estimate_exposures(maps, images, ON.light, told)
+    return not exposure.estimate_exposures(maps, images, ON.exposure_compensation, told)
 
 
 def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: PerceptualNetworks) -> list[Row]:

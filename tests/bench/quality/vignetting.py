@@ -29,7 +29,7 @@ from tests.bench.quality.real_sets import last, measure, timed
 SETS = ("fountain_p11:6", "llff_fern:6", "sceaux:6")
 LOSSES = (0.0, 0.45, 0.6)  # of the light in the corners
 ON = preset("balanced")
-OFF = msgspec.structs.replace(ON, light=exposure.ExposureConfig(enabled=False))
+OFF = msgspec.structs.replace(ON, exposure_compensation=exposure.ExposureConfig(enabled=False))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """How often windows of consecutive photographs are answered rightly: `python -m tests.bench windows --out DIR`.
 
-`splatnode stability --windows`, with its options; without scenes on all of ../shared/scenes that have true cameras.
+`splatnode robustness --windows`, with its options; without scenes on all of ../shared/scenes that have true cameras.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SCENES = Path("../shared/scenes")
 
 
 def main() -> None:
-    command = ["stability", "--windows", *sys.argv[1:]]
+    command = ["robustness", "--windows", *sys.argv[1:]]
     if not build_parser().parse_args(command).scenes:
         command[2:2] = [str(folder) for folder in known_scenes(SCENES)]
     sys.exit(splatnode(command))

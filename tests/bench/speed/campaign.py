@@ -1,6 +1,6 @@
 """Trials in a core-hour: `python -m tests.bench campaign [--rows 3,4,5,13] [--seeds 30]`.
 
-`splatnode stability` tries short rows of the matrix on the built-in places, one at a time on one core. The processor
+`splatnode robustness` tries short rows of the matrix on the built-in places, one at a time on one core. The processor
 time is that of the command with all that it starts: the photographs of each trial, the trials, the tables. So it is the
 same on a machine that has other work, where the command itself takes longer. The places are there before.
 """
@@ -34,7 +34,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         load_trial_scenes((), Path(folder))
         rest = ["--rows", args.rows, "--seeds", str(args.seeds), "--cores", "1", "--out", folder]
-        took_s, processor_s = campaign_s([sys.executable, "-m", "splatnode", "stability", *rest])
+        took_s, processor_s = campaign_s([sys.executable, "-m", "splatnode", "robustness", *rest])
         trials = json.loads(Path(folder, "stability.json").read_text())["trials"]
     own_s = [trial["processor_seconds"] or 0.0 for trial in trials]
     result = {

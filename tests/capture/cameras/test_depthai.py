@@ -187,7 +187,7 @@ def test_which_of_several_must_be_said(monkeypatch, device):
 
 def test_what_the_camera_is_asked_for(monkeypatch):
     fake = use(monkeypatch, FakeDepthai(["first", "second"], map(message, range(9))))
-    config = Config(device="second", settle_s=0, focus=120, frames_per_second=15, undistort=False)
+    config = Config(device="second", warmup_s=0, focus=120, fps=15, undistort=False)
     frames = list(itertools.islice(stream(config), 2))
     name, (size, how), queue, start, focus, hold = fake.told
     assert (name, size, start) == ("second", (1280, 720), "start")
@@ -199,7 +199,7 @@ def test_what_the_camera_is_asked_for(monkeypatch):
 
 def test_a_given_exposure_is_set(monkeypatch):
     fake = use(monkeypatch, FakeDepthai(["only"], map(message, range(9))))
-    next(stream(Config(settle_s=0, exposure_us=5000, iso=200)))
+    next(stream(Config(warmup_s=0, exposure_us=5000, iso=200)))
     assert fake.told[-1].calls == [("setManualExposure", 5000, 200), ("setAutoWhiteBalanceLock", True)]
 
 
@@ -213,7 +213,7 @@ def test_a_given_exposure_is_set(monkeypatch):
 )
 def test_a_lost_camera_says_why(monkeypatch, end, reason):
     use(monkeypatch, FakeDepthai(["only"], [message(0), message(1), end]))
-    frames = stream(Config(lock=False))
+    frames = stream(Config(lock_exposure=False))
     assert [next(frames).name, next(frames).name] == ["100000.000000", "100000.000001"]
     with pytest.raises(CameraUnavailable, match=reason):
         next(frames)
@@ -252,7 +252,7 @@ def test_depthais_own_replay(tmp_path, monkeypatch):
         pipeline.start()
         frames = []
         with pytest.raises(CameraUnavailable, match="ended its stream"):
-            for frame in read(dai, Source(queue, (), convert_frame), Config(lock=False), hold=lambda: None):
+            for frame in read(dai, Source(queue, (), convert_frame), Config(lock_exposure=False), hold=lambda: None):
                 frames.append(frame)
     assert len(frames) >= 10
     assert all(frame.image.shape == (120, 160, 3) and frame.intrinsics is None for frame in frames)
@@ -324,7 +324,7 @@ def pair(index=0, left=60, right=90, shape=(120, 160)):
 
 def test_stereo_cameras_give_pairs_with_the_baseline_of_their_calibration(monkeypatch):
     fake = use(monkeypatch, FakeStereo([pair(index) for index in range(4)]))
-    first, second = itertools.islice(stream(Config(stereo=True, settle_s=0, width=160, height=120)), 2)
+    first, second = itertools.islice(stream(Config(stereo=True, warmup_s=0, width=160, height=120)), 2)
     assert isinstance(first, Frame) and (first.frame_id, second.name) == (0, "100000.000002")
     assert first.image.shape == (120, 160, 3) and np.unique(first.image).tolist() == [60]
     assert first.right is not None and np.unique(first.right.image).tolist() == [90]

@@ -327,7 +327,7 @@ def test_given_intrinsics_are_scaled_to_images_of_their_shape(tmp_path):
 def test_natural_order_ids_stamps_and_choice(tmp_path):
     for name in ("img10.png", "img2.png", "IMG1.png", "img2b.png", "b.png"):
         (tmp_path / name).write_bytes(encoded(".png"))
-    frames = [frame for frame in stream(Config(tmp_path, frames_per_second=4)) if isinstance(frame, Frame)]
+    frames = [frame for frame in stream(Config(tmp_path, fps=4)) if isinstance(frame, Frame)]
     assert [frame.name for frame in frames] == ["b.png", "IMG1.png", "img2.png", "img2b.png", "img10.png"]
     assert [frame.frame_id for frame in frames] == [0, 1, 2, 3, 4]
     assert [frame.stamp_ns for frame in frames] == [0, 250_000_000, 500_000_000, 750_000_000, 1_000_000_000]

@@ -115,6 +115,24 @@ def test_a_chunk_is_decompressed_as_far_as_it_says_that_it_goes(name, compress):
         list(unpack_chunk(chunk(name, compress(SCHEMA), len(SCHEMA) + 1)))
 
 
+@pytest.mark.parametrize("indexed", [True, False])
+def test_chunks_that_together_hold_more_than_any_log_does_are_refused(tmp_path, monkeypatch, indexed):
+    seen = [as_json("/image", "CompressedImage", {"data": "0" * 100_000}) for _ in range(8)]
+    file = write(tmp_path / "a.mcap", seen, compression=CompressionType.ZSTD, chunk_size=150_000)
+    assert len(chunk_places(file)) == 4 and file.stat().st_size < 2500
+    if not indexed:
+        indexed_anew(file, [])
+    monkeypatch.setattr(mcap, "_MOST_BYTES", 250_000)
+    monkeypatch.setattr(mcap, "_MOST_TIMES", 100)
+    read = []
+    with pytest.raises(UnusableLog, match=r"may be decompressed to \d+, its chunks say that they hold \d+ or more"):
+        for each in mcap.messages(file, {"/image"}):
+            read.append(each)
+    assert 2 <= len(read) < 8  # those before it were given
+    monkeypatch.setattr(mcap, "_MOST_TIMES", 1000)
+    assert len(list(mcap.messages(file, {"/image"}))) == 8
+
+
 def test_an_index_that_leads_nowhere_is_told(tmp_path):
     file = write(tmp_path / "a.mcap", [compressed("/image", flat(1))])
     with file.open("rb") as opened:

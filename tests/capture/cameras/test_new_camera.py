@@ -57,7 +57,7 @@ def test_its_configuration_is_checked_and_it_is_named_among_the_kinds(config):
 
 
 def test_the_command_line_finds_and_records_it(config, tmp_path, capsys):
-    assert command_line.main(["find"]) == 0
+    assert command_line.main(["list-cameras"]) == 0
     assert 'camera: {kind: grey, device: "grey-1"}  # a camera for the test' in capsys.readouterr().out
     assert command_line.main(["record", str(config), "--out", str(tmp_path / "out"), "--set", "camera.count=1"]) == 0
     assert "1 frame in" in capsys.readouterr().out

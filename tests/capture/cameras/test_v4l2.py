@@ -127,7 +127,7 @@ class Driver:
 
 
 def frames(driver, count, **config) -> list[Any]:
-    config = {"device": "/dev/video0", "settle_s": 0.0, "lock": False, **config}
+    config = {"device": "/dev/video0", "warmup_s": 0.0, "lock_exposure": False, **config}
     return list(itertools.islice(stream(Config(**config), driver.system()), count))
 
 
@@ -166,7 +166,7 @@ def test_the_drivers_stamps_are_told_by_the_wall_clock():
 
 @pytest.mark.parametrize("padding", [0, 16])
 def test_raw_frames_are_decoded_line_by_line(padding):
-    (frame,) = frames(Driver(padding=padding), 1, pixels="YUYV")
+    (frame,) = frames(Driver(padding=padding), 1, fourcc="YUYV")
     assert np.abs(frame.image.astype(int) - IMAGE).mean() < 5 and frame.encoded is None
 
 
@@ -191,7 +191,7 @@ def test_a_lens_of_another_aspect_ratio_ends_the_camera_before_a_frame():
 @pytest.mark.parametrize(("event", "reason"), [("error", "driver says"), ("short", "truncated")])
 @pytest.mark.parametrize("pixels", ["MJPG", "YUYV"])
 def test_damaged_frames_are_left_out(event, reason, pixels):
-    before, damaged, after = frames(Driver(events={1: event}), 3, pixels=pixels)
+    before, damaged, after = frames(Driver(events={1: event}), 3, fourcc=pixels)
     assert isinstance(damaged, DroppedFrame) and reason in damaged.reason
     assert (before.frame_id, after.frame_id) == (0, 1)
 
@@ -200,7 +200,7 @@ def test_damaged_frames_are_left_out(event, reason, pixels):
     ("driver", "config", "message"),
     [
         (Driver(events={2: errno.ENODEV}), {}, "was unplugged"),
-        (Driver(events={2: "silence"}), {"silence_s": 0.5}, "gave no frame for 0.5 s"),
+        (Driver(events={2: "silence"}), {"frame_timeout_s": 0.5}, "gave no frame for 0.5 s"),
         (Driver(events={"busy": True}), {}, "used by another program"),
         (Driver(), {"device": "/dev/video9"}, "no camera at /dev/video9; none is connected"),
         (Driver(), {"device": ""}, "must say which camera; none is connected"),
@@ -220,14 +220,14 @@ def test_exposure_and_white_balance_are_held_at_what_the_camera_chose():
         v4l2_device.EXPOSURE_PRIORITY: 1,
     }
     driver = Driver(controls=controls)
-    frames(driver, 1, lock=True)
+    frames(driver, 1, lock_exposure=True)
     assert driver.controls == {
         v4l2_device.AUTO_EXPOSURE: v4l2_device.EXPOSURE_MANUAL,
         v4l2_device.EXPOSURE: 156,
         v4l2_device.AUTO_WHITE_BALANCE: 0,
         v4l2_device.EXPOSURE_PRIORITY: 0,
     }
-    frames(driver, 1, lock=True, exposure_us=5000)
+    frames(driver, 1, lock_exposure=True, exposure_us=5000)
     assert driver.controls[v4l2_device.EXPOSURE] == 50
 
 
@@ -239,7 +239,7 @@ def test_what_cannot_be_held_is_told():
 
 def test_closing_the_stream_closes_the_device():
     driver = Driver()
-    items: Any = stream(Config(device="/dev/video0", lock=False), driver.system())
+    items: Any = stream(Config(device="/dev/video0", lock_exposure=False), driver.system())
     next(items)
     items.close()
     assert driver.closed

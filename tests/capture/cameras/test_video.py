@@ -89,7 +89,7 @@ def test_sound_alone_says_so(tmp_path):
 
 
 def test_some_of_the_frames(walk):
-    frames: list[Any] = list(stream(Config(walk, every=5)))
+    frames: list[Any] = list(stream(Config(walk, stride=5)))
     assert [(frame.frame_id, frame.name) for frame in frames] == [
         (0, "walk_000000.png"),
         (1, "walk_000005.png"),
@@ -128,7 +128,7 @@ def test_a_folder_can_be_shown_again_and_again(tmp_path):
         image = np.random.default_rng(index).integers(0, 256, (48, 64, 3)).astype(np.uint8)
         cv2.imwrite(str(tmp_path / f"{index}.png"), image)
     (tmp_path / "9.jpg").write_bytes(b"")
-    items = list(folder.stream(folder.Config(tmp_path, loops=2, frames_per_second=4)))
+    items = list(folder.stream(folder.Config(tmp_path, loops=2, fps=4)))
     assert [item.name for item in items] == ["0.png", "1.png", "9.jpg", "loop1_0.png", "loop1_1.png", "loop1_9.jpg"]
     frames = [item for item in items if isinstance(item, Frame)]
     assert [item.frame_id for item in frames] == [0, 1, 2, 3]

@@ -32,7 +32,7 @@ from splatnode.capture.reader import Reader, ReaderState
 from tests.capture.cameras.test_folder import with_exif
 from tests.capture.messaging.test_sockets import wait_for
 
-QUICK = {"poll_s": 0.01, "settle_s": 0.05, "give_up_s": 0.4}
+QUICK = {"poll_s": 0.01, "stable_s": 0.05, "file_timeout_s": 0.4}
 
 
 def photograph(index=0, suffix=".jpg"):
@@ -91,7 +91,7 @@ def test_a_photograph_has_its_own_time_and_else_that_of_its_file(tmp_path):
 def test_a_file_that_is_being_written_is_waited_for(tmp_path, pause_s):
     data = photograph()
     writer = slowly(tmp_path / "slow.jpg", data, pause_s=pause_s)
-    frame = next(watch(tmp_path, give_up_s=10))
+    frame = next(watch(tmp_path, file_timeout_s=10))
     writer.join()
     assert isinstance(frame, Frame) and frame.encoded == data
 
@@ -157,7 +157,7 @@ def test_temporary_and_hidden_files_are_not_looked_at(tmp_path):
 
 def test_what_lies_there_can_be_left_out(tmp_path):
     (tmp_path / "old.jpg").write_bytes(photograph())
-    frames = watch(tmp_path, existing=False)
+    frames = watch(tmp_path, include_existing=False)
     (tmp_path / "new.jpg").write_bytes(photograph(1))
     assert next(frames).name == "new.jpg"
 

@@ -79,7 +79,7 @@ def test_where_the_directory_is(tmp_path, monkeypatch):
 
 
 def test_tcp_needs_keys(tmp_path):
-    with pytest.raises(NetworkError, match="splatnode keys"):
+    with pytest.raises(NetworkError, match="splatnode keygen"):
         Publisher(CAPTURE_PREVIEW, Network(directory=tmp_path / "run", tcp="127.0.0.1"))
     with pytest.raises(keys.KeyFileError, match="no key"):
         Subscriber(CAPTURE_PREVIEW, Network(directory=tmp_path, tcp="127.0.0.1", keys=tmp_path), Note)
@@ -150,14 +150,14 @@ def test_a_public_key_is_never_taken_for_an_option(tmp_path, monkeypatch):
 @pytest.mark.parametrize("option", [["--allow", "laptop"], ["--server"]], ids=" ".join)
 def test_an_older_key_that_begins_with_a_dash_is_given_after_a_space(tmp_path, option):
     keys.create_keys(tmp_path)
-    assert main(["keys", str(tmp_path), *option, " -" + "a" * 39]) == 0
+    assert main(["keygen", str(tmp_path), *option, " -" + "a" * 39]) == 0
 
 
 @pytest.mark.parametrize("left", [b"", b"\n", b"abc"])
 def test_a_secret_key_that_was_cut_short_is_replaced_and_said(tmp_path, caplog, left):
     keys.create_keys(tmp_path)
     (tmp_path / keys.SECRET).write_bytes(left)
-    with pytest.raises(keys.KeyFileError, match="splatnode keys"):
+    with pytest.raises(keys.KeyFileError, match="splatnode keygen"):
         keys.read_keys(tmp_path)
     public = keys.create_keys(tmp_path)
     assert "was cut short" in caplog.text and keys.read_keys(tmp_path).public == public

@@ -402,6 +402,18 @@ def test_the_spool_is_bounded(tmp_path):
         small.store(KEY, [bytes(1 << 20)])
 
 
+def test_what_a_killed_process_left_is_delivered_before_what_its_successor_adds(tmp_path):
+    left, added = KEY._replace(session="f" * 32), KEY
+    for key, sequences in ((left, (0, 1)), (added, (0, 1, 2))):
+        spool = open_spool(tmp_path)
+        for sequence in sequences:
+            spool.store(key._replace(sequence=sequence), [b"a"])
+        spool.close()
+    assert list(open_spool(tmp_path)) == [left._replace(sequence=i) for i in (0, 1)] + [
+        added._replace(sequence=i) for i in (0, 1, 2)
+    ]
+
+
 def test_a_full_disk_is_a_full_spool_and_leaves_nothing(tmp_path, monkeypatch):
     spool = open_spool(tmp_path)
 

@@ -246,6 +246,14 @@ def test_a_restarted_sender_is_followed_and_its_predecessor_is_not(tmp_path):
         assert not client._is_newer(Note(session=sessions[0], sequence=99, mono_ns=0))
 
 
+def test_of_one_session_each_state_is_newer_than_those_before_it(tmp_path):
+    with StateClient(RECON_SCENE, ipc(tmp_path), Note) as client:
+        one, other = "1" * 32, "2" * 32
+        told = [(one, 3), (one, 3), (one, 2), (one, 0), (one, 4), (other, 0), (other, 1), (one, 9), (other, 1)]
+        newer = [client._is_newer(Note(session=session, sequence=number, mono_ns=0)) for session, number in told]
+        assert newer == [True, False, False, False, True, True, True, False, False]
+
+
 class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="question"):
     number: int
 

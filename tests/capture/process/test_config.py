@@ -23,13 +23,13 @@ def test_kind_is_a_module_and_the_rest_its_config(tmp_path):
     assert config.camera.kind == "folder"
     assert config.camera.module is folder
     assert config.camera.config == folder.Config(Path("photos"))
-    assert load(tmp_path, SYNTHETIC + "\nquality: {blur_px: 5}").quality.blur_px == 5
+    assert load(tmp_path, SYNTHETIC + "\nquality: {max_blur_px: 5}").quality.max_blur_px == 5
 
 
 def test_changes_are_laid_over_the_file(tmp_path):
-    config = load(tmp_path, SYNTHETIC, "camera.views=3", "camera.frames-per-second=2e1", "quality.novelty=0")
-    assert config.camera.config == synthetic.Config(views=3, frames_per_second=20.0)
-    assert config.quality.novelty == 0
+    config = load(tmp_path, SYNTHETIC, "camera.views=3", "camera.fps=2e1", "quality.min_novelty=0")
+    assert config.camera.config == synthetic.Config(views=3, fps=20.0)
+    assert config.quality.min_novelty == 0
     other = load(tmp_path, SYNTHETIC, "camera={kind: folder, folder: x, names: [a, b]}", "camera.max-pixels=9")
     assert "seed" not in other.camera.config.__struct_fields__
     assert other.camera.config == folder.Config(Path("x"), ("a", "b"), max_pixels=9)
@@ -61,7 +61,7 @@ def test_nested_structures_are_typed(tmp_path):
             r"camera\.intrinsics: intrinsics must be finite, sizes and focal lengths above 0",
         ),
         ("camera: {kind: folder, folder: x, intrinsics: {wdth: 1}}", r"camera\.intrinsics\.wdth: unknown key"),
-        (SYNTHETIC + "\nquality: {blur_px: wide}", r"quality\.blur_px: expected float, got str"),
+        (SYNTHETIC + "\nquality: {max_blur_px: wide}", r"quality\.max_blur_px: expected float, got str"),
         ("- a", r"expected keys and values, got list"),
         ("a: [", r"is not YAML"),
     ],

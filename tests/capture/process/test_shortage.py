@@ -96,7 +96,7 @@ def test_a_folder_gives_every_photograph_though_no_file_can_be_opened_for_a_whil
 
 def test_a_watched_folder_gives_up_no_photograph_for_want_of_files(tmp_path):
     photographs(tmp_path)
-    config = watched.Config(tmp_path, poll_s=0.01, settle_s=0.02, give_up_s=0.05)
+    config = watched.Config(tmp_path, poll_s=0.01, stable_s=0.02, file_timeout_s=0.05)
     stream = watched.stream(config)
     with for_a_while():
         items = [next(stream) for _ in range(3)]
@@ -195,7 +195,7 @@ def capturing(place):
     config = CaptureConfig(camera, network=network, selection=keyframe_selection.Config(every_frame=True))
     with contextlib.ExitStack() as resources:
         server = resources.enter_context(KeyframeServer(network, Spool(SpoolConfig(directory=place))))
-        yield daemon._Session(config, server, resources)
+        yield daemon.CaptureSession(config, server, resources)
 
 
 def test_capture_keeps_a_frame_that_cannot_be_written_for_want_of_files(tmp_path):

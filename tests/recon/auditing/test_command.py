@@ -76,7 +76,7 @@ def test_a_lens_that_can_be_of_no_camera_is_told_before_the_work(result, recordi
     film.parent.mkdir()
     film.write_bytes(b"no video")
     visits = [str(film.parent), *map(str, recordings)]
-    assert main(["audit", str(result), *visits, "--calibration", str(lens)]) == 2
+    assert main(["audit", str(result), *visits, "--intrinsics", str(lens)]) == 2
     told = capsys.readouterr()
     assert "got those of 100 x 100 for 480 x 360" in told.err and not told.out
 

@@ -131,6 +131,17 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     assert [path.name for path in out.iterdir()] == ["a"]
 
 
+def test_a_batch_that_the_release_before_began_is_resumed(tmp_path):
+    former = ["splatnode", "replay", "--require", "2.5", "--quick", "--only-seen"]
+    present = ["splatnode", "replay", "--max-position-error", "2.5", "--no-fallbacks", "--multi-view-only"]
+    with Ledger(tmp_path, former):
+        pass
+    with Ledger(tmp_path, present):
+        pass
+    with pytest.raises(OtherBatch, match="other options"):
+        Ledger(tmp_path, [*present, "--size", "64"]).__enter__()
+
+
 def test_a_batch_is_not_begun_twice_nor_gone_on_with_otherwise(tmp_path):
     out = tmp_path / "out"
     ran(out, BatchRecording("a", GOOD))
@@ -154,12 +165,29 @@ def test_programs_get_the_counts(tmp_path, capsys):
 
 
 def test_each_replay_gets_the_options_that_were_given():
-    given = ["--preset", "preview", "--size", "320", "--require", "2.5", "--quick", "--only-seen", "--views", "6"]
+    given = [
+        "--preset",
+        "preview",
+        "--size",
+        "320",
+        "--max-position-error",
+        "2.5",
+        "--no-fallbacks",
+        "--multi-view-only",
+        "--views",
+        "6",
+    ]
     parser = command_line.build_parser()
     made = replay_options(parser.parse_args(["batch", "a", "--out", "b", *given]))
     assert sorted(made) == sorted(given)
     there = parser.parse_args(["replay", "a", "--out", "b", *made])
-    assert (there.preset, there.size, there.require, there.quick, there.views) == ("preview", 320, 2.5, True, 6)
+    assert (there.preset, there.size, there.max_position_error, there.no_fallbacks, there.views) == (
+        "preview",
+        320,
+        2.5,
+        True,
+        6,
+    )
     assert replay_options(parser.parse_args(["batch", "a", "--out", "b", "--resume", "--cores", "1"])) == []
 
 

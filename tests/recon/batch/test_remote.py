@@ -97,13 +97,15 @@ def test_what_is_sent_to_a_worker_can_be_pickled():
 def test_options_that_do_not_go_together_are_told(tmp_path, given, said):
     (tmp_path / "a.mp4").touch()
     args = argparse.Namespace(**{**vars(options(tmp_path / "out")), "sources": [tmp_path / "a.mp4"], **given})
-    args = argparse.Namespace(**{**dict.fromkeys(_OF_REPLAY), **vars(args), "quick": False, "only_seen": False})
+    args = argparse.Namespace(
+        **{**dict.fromkeys(_OF_REPLAY), **vars(args), "no_fallbacks": False, "multi_view_only": False}
+    )
     args.every_frame = False
     with pytest.raises(ValueError, match=said):
         command.batch(args)
 
 
 _OF_REPLAY = (
-    "config", "preset", "prior", "device", "size", "budget_s", "require", "max_gaussians", "max_mb", "seed", "views",
-    "marker",
+    "config", "preset", "prior", "device", "size", "budget_s", "max_position_error", "max_gaussians", "max_mb", "seed",
+    "views", "marker",
 )  # fmt: skip

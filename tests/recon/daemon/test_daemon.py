@@ -54,11 +54,11 @@ def config(tmp_path) -> DaemonConfig:
     return DaemonConfig(
         network=Network(directory=tmp_path / "run"),
         reconstruction=QUICK,
-        tracking=Tracking(every_s=0),
+        tracking=Tracking(interval_s=0),
         checkpoint=tmp_path / "checkpoint",
         out=tmp_path / "out",
-        settle_s=0.2,
-        status_every_s=0.2,
+        idle_finalize_s=0.2,
+        status_interval_s=0.2,
     )
 
 
@@ -200,7 +200,7 @@ def test_a_result_that_could_not_be_written_is_written_by_the_next_process(confi
 
 
 def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, peer):
-    wild = replace(QUICK.optimize, rates=training.LearningRates(means=1.0, means_unit="depth", log_scales=1.0))
+    wild = replace(QUICK.optimize, lr=training.LearningRates(means=1.0, means_unit="depth", log_scales=1.0))
     config = replace(config, reconstruction=replace(QUICK, optimize=wild))
     for frame in photographs()[:3]:
         peer.server.offer(frame)
@@ -259,7 +259,7 @@ def offer_when_three_are_shown(peer, frames) -> None:
 
 def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, peer):
     frames = places(seeds=(0, 1))
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, frames)
         other = peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
         assert {camera.name for camera in other.snapshot.cameras} <= {frame.name for frame in frames[3:]}
@@ -273,7 +273,7 @@ def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, 
 def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_together(config, peer, monkeypatch):
     monkeypatch.setattr("splatnode.recon.estimation.MIN_CONFIRMED_POINTS", 10**6)  # points: nothing fits at once
     frames = photographs()
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, frames)
         whole = peer.wait(lambda scene: len(scene.snapshot.cameras) == 6, "all cameras")
         assert whole.scene_id == "scene-0001" and not whole.snapshot.verdict.provisional

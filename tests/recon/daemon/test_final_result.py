@@ -103,9 +103,13 @@ def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
         inbox.enqueue(RemovedFrame(str(index)), threading.Event())
     daemon = SimpleNamespace(
         _worker=SimpleNamespace(find_inactive_scenes=lambda _: []),
-        _store=SimpleNamespace(names={"a.png"}, forget=lambda *what: forgotten.append(what)),
+        _store=SimpleNamespace(
+            names={"a.png"}, forget=lambda *what: forgotten.append(what), find_frame_set=lambda *_: ("a.png",)
+        ),
         _inbox=inbox,
         _stopping=threading.Event(),
+        _config=SimpleNamespace(frame_sets=SimpleNamespace(tolerance_s=0.02)),
+        _remove_keyframe=lambda name: Daemon._remove_keyframe(daemon, name),
     )
     answers: list[Answer] = []
     asking = threading.Thread(

@@ -1,4 +1,4 @@
-"""The live map of free space: of the scene that is shown, as `splatnode map` makes it; else it is taken back."""
+"""The live map of free space: of the scene that is shown, as `splatnode occupancy` makes it; else it is taken back."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ def same(one: OccupancyMap, other: OccupancyMap) -> bool:
 
 def test_the_map_is_sent_once_the_scene_is_final_and_goes_when_the_camera_is_lost(config, peer):  # noqa: F811
     frames = places(seeds=(0, 1))
-    with running(replace(config, map=LIVE, lost_after=3)), splatnode.connect(config.network.directory) as node:
+    with (
+        running(replace(config, occupancy=LIVE, new_submap_after=3)),
+        splatnode.connect(config.network.directory) as node,
+    ):
         assert node.wait_for_map(0.0).occupancy is None
         for frame in frames[:3]:
             peer.server.offer(frame)
@@ -72,7 +75,7 @@ def test_a_restarted_node_sends_the_map_again_and_none_where_it_is_not_configure
             first = peer.wait(finished(3), "a final scene")
             peer.wait_for_acknowledgements()
             assert "map.live" in node.wait_for_map(0.5).why
-        with running(replace(config, map=OccupancyConfig(live=True, voxel=0.05))):
+        with running(replace(config, occupancy=OccupancyConfig(live=True, voxel=0.05))):
             told = map_when(peer, node, lambda told: told.occupancy is not None)
             saved = splatnode.load(config.out / "scene-0001").map(voxel=0.05)
             assert told.scene_id == first.scene_id and np.array_equal(told.occupancy.states, saved.states)
@@ -82,7 +85,7 @@ def test_a_restarted_node_sends_the_map_again_and_none_where_it_is_not_configure
 
 
 def test_a_refusal_is_told_with_its_reason(config, peer):  # noqa: F811
-    with running(replace(config, map=LIVE)), splatnode.connect(config.network.directory) as node:
+    with running(replace(config, occupancy=LIVE)), splatnode.connect(config.network.directory) as node:
         peer.server.offer(photographs()[0])
         told = map_when(peer, node, lambda told: "TOO_FEW_VIEWS" in told.why)
         assert told.occupancy is None and told.why.startswith("there is no scene: TOO_FEW_VIEWS")

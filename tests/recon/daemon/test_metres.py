@@ -97,7 +97,7 @@ def test_a_marker_is_looked_for_once_in_a_keyframe(monkeypatch):
     frames = photographs()[:2]
     none = Features.__new__(Features)
     keyframes = [Keyframe(frame, frame.image, none) for frame in frames]
-    metres = MetricScaler(Metric(marker_m=0.1))
+    metres = MetricScaler(Metric(marker_size_m=0.1))
     for known in (keyframes[:1], keyframes, keyframes):
         metres.collect_evidence(known)
     assert asked == [frame.name for frame in frames]

@@ -35,7 +35,7 @@ def test_scenes_maps_and_heartbeats_are_each_numbered_without_gaps_in_one_sessio
 
     monkeypatch.setattr(StateServer, "publish", publish)
     monkeypatch.setattr(Publisher, "send", publish)
-    with Daemon(replace(config, map=FreeSpace(live=True)), threading.Event()) as daemon:
+    with Daemon(replace(config, occupancy=FreeSpace(live=True)), threading.Event()) as daemon:
         for fits[0] in (True, False, True):
             for _ in range(2):
                 daemon._heartbeat.send(daemon._make_status())

@@ -50,7 +50,7 @@ NEVER_S = 1e6
 @pytest.fixture
 def moving(config):
     """A camera that never rests."""
-    return replace(config, settle_s=NEVER_S)
+    return replace(config, idle_finalize_s=NEVER_S)
 
 
 def never(*_: object) -> bool:
@@ -73,7 +73,7 @@ def test_a_clean_stop_leaves_what_there_is_and_says_that_it_is_provisional(movin
     assert (place["state"], place["folder"], place["provisional"]) == ("here", folder.name, True)
     assert 0.1 < place["seconds"] < PATIENCE_S and place["rss_mb"] > 100
 
-    with running(replace(moving, settle_s=0.2)):
+    with running(replace(moving, idle_finalize_s=0.2)):
         peer.wait(finished(3), "three cameras, refined")
         wait_for((moving.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
     assert not report(moving.out / "scene-0001")["verdict"]["provisional"] and not folder.exists()
@@ -82,7 +82,7 @@ def test_a_clean_stop_leaves_what_there_is_and_says_that_it_is_provisional(movin
 
 
 def test_while_the_scene_grows_it_is_written_at_intervals(moving, peer):
-    with running(replace(moving, export_every_s=1e-3)):
+    with running(replace(moving, export_interval_s=1e-3)):
         for frame in photographs()[:3]:
             peer.server.offer(frame)
         wait_for(
@@ -93,7 +93,7 @@ def test_while_the_scene_grows_it_is_written_at_intervals(moving, peer):
 
 def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(config, peer):
     frames = places(seeds=(0, 1))
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, frames)
         peer.wait(lambda scene: scene.scene_id == "scene-0002" and scene.snapshot.final, "another place, finished")
         peer.wait_for_acknowledgements()
@@ -114,7 +114,7 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
 def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
     here, there = photographs(), photographs(msgspec.structs.replace(SMALL, seed=1))
     mirrored = [replace_image(frame, index) for index, frame in enumerate(there[:3])]
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         for frame in here[:4]:
             peer.server.offer(frame)
         peer.wait(finished(4), "four cameras, refined")
@@ -147,7 +147,7 @@ def replace_image(frame, index):
 
 def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, monkeypatch):
     frames = places(seeds=(0, 1))
-    with monkeypatch.context() as patch, running(replace(moving, lost_after=3)):
+    with monkeypatch.context() as patch, running(replace(moving, new_submap_after=3)):
         patch.setattr(InactiveSubmaps, "verify_next", never)
         patch.setattr(InactiveSubmaps, "finalize_next", never)
         offer_when_three_are_shown(peer, frames)
@@ -156,7 +156,7 @@ def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, mon
     assert report(moving.out / "scene-0001-provisional")["verdict"]["provisional"]
     assert index(moving)[0]["state"] == "left" and len(records.list_left_folders(moving.checkpoint)) == 1
 
-    with running(replace(moving, settle_s=0.2, lost_after=3)):
+    with running(replace(moving, idle_finalize_s=0.2, new_submap_after=3)):
         wait_for((moving.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
         wait_for(lambda: not records.list_left_folders(moving.checkpoint), PATIENCE_S)
     kept = read_cameras(moving.out / "scene-0001" / "cameras.json")
@@ -172,14 +172,14 @@ def test_a_place_whose_finishing_was_killed_is_finished_by_the_next_process(conf
     with (
         monkeypatch.context() as patch,
         pytest.raises(AssertionError, match="SystemExit"),
-        running(replace(config, lost_after=3)),
+        running(replace(config, new_submap_after=3)),
     ):
         patch.setattr(finalizer, "_refine_to_end", die)
         offer_when_three_are_shown(peer, frames)
         wait_for(lambda: peer.server.serve(0.02) or heartbeats(config.network, 0.5)["recon"] is None, PATIENCE_S)
     assert (config.out / "scene-0001-provisional").exists() and not (config.out / "scene-0001").exists()
 
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         wait_for(lambda: not records.list_left_folders(config.checkpoint), PATIENCE_S)
     assert [(place["state"], place["provisional"]) for place in index(config)] == [("finished", False), ("here", False)]
 
@@ -190,7 +190,7 @@ def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, mo
 
     frames = places(seeds=(0, 1))
     monkeypatch.setattr(finalizer, "_refine_to_end", fail)
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, frames)
         wait_for(
             lambda: peer.server.serve(0.02) or "for the test" in heartbeats(config.network)["recon"]["problem"],
@@ -214,7 +214,7 @@ def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer
 
     monkeypatch.setattr(finalizer, "_refine_to_end", slow)
     frames = places(msgspec.structs.replace(SMALL, views=8))
-    with running(replace(config, lost_after=3)):
+    with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, [*frames[:3], *frames[4:7]])
         wait_for(lambda: peer.server.serve(0.02) or begun.is_set(), PATIENCE_S)
         peer.server.offer(frames[7])
@@ -285,7 +285,7 @@ def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, pee
         "export_provisionally",
         lambda place: aside.append([each.name for each in place._work.keyframes_deferred]),
     )
-    with running(replace(moving, max_views=5, export_every_s=NEVER_S)):
+    with running(replace(moving, max_views=5, export_interval_s=NEVER_S)):
         for count, frame in enumerate(came, 1):
             peer.server.offer(frame)
             if frame.name == "stranger.png":

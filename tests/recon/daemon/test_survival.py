@@ -225,7 +225,7 @@ def test_a_preview_that_makes_tracking_fail_is_one_preview(tmp_path, monkeypatch
     monkeypatch.setattr(relocalization, "Tracker", Failing)
     camera = SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)
     finished = FinalScene(SimpleNamespace(cameras=[camera]), [])
-    watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems, stopping)
+    watching = Watcher(network, Tracking(interval_s=0.01), lambda: finished, problems, stopping)
     thread = threading.Thread(target=watching.run)
     thread.start()
     numbering = Numbering()

@@ -35,7 +35,7 @@ def known() -> list[KeyframeLandmarks]:
     found = []
     for index, (frame, camera) in enumerate(zip(photographs(PLACE), synthetic.scene_cameras(PLACE), strict=True)):
         T_world_camera, K = camera
-        feature = features.extract(frame.image, features.FeatureConfig(num_features=3000))
+        feature = features.extract(frame.image, features.FeatureConfig(max_num_features=3000))
         depth = synthetic.depth(PLACE, index)
         column, row = feature.points.astype(int).T
         z = depth[np.clip(row, 0, PLACE.height - 1), np.clip(column, 0, PLACE.width - 1)].astype(float)
@@ -134,7 +134,7 @@ def test_the_same_position_has_not_moved(known):
 def test_landmarks_lie_on_what_the_gaussians_show():
     """One large Gaussian, flat and opaque, 2 in front of the camera: every feature is there."""
     (frame,) = renumbered([photographs(SMALL)[0].image])
-    keyframe = Keyframe(frame, frame.image, features.extract(frame.image, features.FeatureConfig(num_features=500)))
+    keyframe = Keyframe(frame, frame.image, features.extract(frame.image, features.FeatureConfig(max_num_features=500)))
     wall = GaussianArrays(
         means=np.array([[0, 0, 2]], np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),

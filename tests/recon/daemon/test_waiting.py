@@ -161,7 +161,7 @@ def test_fallbacks_that_gained_nothing_are_not_repeated_for_the_same_keyframes_a
         assert forgetful(restored).estimate_thoroughly().verdict.message.endswith("Also tried: nothing.")
         assert len(rounds) == 2
         assert make_fallback_key(restored.graph, recipe) == make_fallback_key(again.graph, recipe)
-        longer = msgspec.structs.replace(recipe, ladder=msgspec.structs.replace(recipe.ladder, work=9.0))
+        longer = msgspec.structs.replace(recipe, fallbacks=msgspec.structs.replace(recipe.fallbacks, budget=9.0))
         assert make_fallback_key(restored.graph, longer) != make_fallback_key(restored.graph, recipe)
 
 
@@ -194,7 +194,7 @@ def test_making_a_scene_final_takes_no_more_fallbacks_than_its_budget(config, mo
 
     frames = photographs()[:3]
     with closing(Store(config.checkpoint)) as store:
-        node = Node(msgspec.structs.replace(config, fallback_s=0.3), store)
+        node = Node(msgspec.structs.replace(config, fallback_timeout_s=0.3), store)
         node.place.add_keyframes(node.keyframes(frames))
         for at in range(2):  # what does not belong to the scene, and is tried with it in several ways
             frame = replace(places(seeds=(0, 1))[3 + at], name=f"other{at}.png", frame_id=10 + at)
@@ -207,7 +207,7 @@ def test_making_a_scene_final_takes_no_more_fallbacks_than_its_budget(config, mo
 
 
 def test_a_pause_does_not_count_as_fallback_time(monkeypatch):
-    work = IncrementalReconstruction(Recipe(quick=False))
+    work = IncrementalReconstruction(Recipe(no_fallbacks=False))
     for frame in photographs()[:2]:
         work.add_keyframe(prepare(frame, work.config))
     done = []

@@ -42,7 +42,7 @@ def watching_a_scene(network, monkeypatch, tracker=Standing, problems=None):
     monkeypatch.setattr(relocalization, "Tracker", tracker)
     stopping = threading.Event()
     finished = FinalScene(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)]), [])
-    watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems or Problems(), stopping)
+    watching = Watcher(network, Tracking(interval_s=0.01), lambda: finished, problems or Problems(), stopping)
     thread = threading.Thread(target=watching.run)
     thread.start()
     try:

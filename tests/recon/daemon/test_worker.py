@@ -23,9 +23,9 @@ from splatnode.recon.preparation import prepare
 def test_more_matches_are_looked_for_within_seconds_since_keyframes_wait(asked, seconds, tmp_path, monkeypatch):
     recipes: list[Recipe] = []
     monkeypatch.setattr(worker, "ActiveSubmap", lambda config, recipe, *rest: recipes.append(recipe))
-    config = DaemonConfig(reconstruction=Recipe(ladder=FallbackConfig(most_s=asked)), out=tmp_path / "out")
+    config = DaemonConfig(reconstruction=Recipe(fallbacks=FallbackConfig(timeout_s=asked)), out=tmp_path / "out")
     worker.Worker(config, Store(tmp_path / "checkpoint"), Inbox(), lambda found: None, threading.Event())
-    assert recipes[0].ladder == FallbackConfig(work=FallbackConfig().work, most_s=seconds)
+    assert recipes[0].fallbacks == FallbackConfig(budget=FallbackConfig().budget, timeout_s=seconds)
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["retracted", "retracted, and another of its name came"])

@@ -18,6 +18,10 @@ def turn_y(degrees: float) -> np.ndarray:
     return exp_se3(torch.tensor([0, 0, 0, 0, np.deg2rad(degrees), 0], dtype=torch.float64)).numpy()
 
 
+def turn_z(degrees: float) -> np.ndarray:
+    return exp_se3(torch.tensor([0, 0, 0, 0, 0, np.deg2rad(degrees)], dtype=torch.float64)).numpy()[:3, :3]
+
+
 def arc(num_cameras: int = 6, radius: float = 4.0) -> np.ndarray:
     """(C, 4, 4) cameras on an arc of 50 degrees that look at the origin, at slightly different heights."""
     cameras = []
@@ -83,6 +87,15 @@ def test_centre_error_is_in_percent_of_the_spread():
     true = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])  # RMS spread 1
     estimated = true + 0.05 * np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, -1], [0, 0, -1]])  # no similarity explains this
     assert compute_centre_error_pct(estimated, true) == pytest.approx(5.0, rel=0.01)
+
+
+def test_centre_error_is_the_root_of_the_mean_square():
+    """An inner ring bends like a saddle by 5 % of its radius, an outer one of twice the radius lies where it is."""
+    inner = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    true = np.concatenate([inner, 2.0 * inner @ turn_z(45)])
+    estimated = true + 0.05 * np.array([[0, 0, 1.0], [0, 0, 1], [0, 0, -1], [0, 0, -1], *[[0, 0, 0]] * 4])
+    rms, spread = 0.05 * 0.5**0.5, 2.5**0.5
+    assert compute_centre_error_pct(estimated, true) == pytest.approx(100 * rms / spread, rel=0.01)
 
 
 def test_what_cannot_be_told_is_none():

@@ -19,8 +19,10 @@ from splatnode.recon.evaluate.dataset import Split, load_scene
 from splatnode.recon.evaluate.protocol import (
     Run,
     average_intrinsics,
+    compute_mean,
     evaluate,
     find_test_pose,
+    interpolate_pose,
     psnr,
     undistort_counts,
     undistort_view,
@@ -37,6 +39,7 @@ from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.scene.exposure import relative_illumination
 from tests.support.blobs import (
     HEIGHT,
     NAMES,
@@ -304,6 +307,53 @@ def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):
     row = score(refused, scene_folder)
     assert (row.verdict, row.psnr, row.ssim, row.scene_bytes) == ("NO_PARALLAX", None, None, 0)
     assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_what_a_mask_hides_counts_as_well_rendered_in_ssim(scene_folder, tmp_path):
+    upper = np.indices((HEIGHT, WIDTH))[0] < HEIGHT // 3
+    folder = masked_scene(tmp_path / "blobs", dict.fromkeys(SPLIT.test, ~upper))
+    for name in SPLIT.test:
+        image = cv2.imread(str(folder / "images" / name))
+        image[upper] = 255 - image[upper]
+        cv2.imwrite(str(folder / "images" / name), image)
+    row = score(perfect_snapshot(), folder)
+    assert row.ssim > 0.995 and row.psnr > 45
+
+
+def test_renders_get_the_light_that_was_taken_out_of_photographs(scene_folder, tmp_path):
+    """A lens that keeps half of the light from the corners: with it renders are right, and without it too bright."""
+    folder, falloff = tmp_path / "blobs", 0.7
+    write_scene(folder)
+    light = relative_illumination(falloff, WIDTH, HEIGHT)
+    assert light.max() > 0.99 and light.min() < 0.6
+    for path in (folder / "images").iterdir():
+        dimmed = cv2.imread(str(path)) * light[..., None]
+        cv2.imwrite(str(path), np.rint(dimmed).astype(np.uint8))
+    told = replace(perfect_snapshot(), falloffs=dict.fromkeys(SPLIT.train, falloff))
+    with_light, without = score(told, folder), score(perfect_snapshot(), folder)
+    assert with_light.psnr > 45 and with_light.psnr > without.psnr + 10
+
+
+def test_the_search_starts_from_the_true_pose_or_from_between_its_neighbours(scene_folder, monkeypatch):
+    starts = []
+
+    def align(scene, image, T_world_camera, *view, **steps):
+        starts.append(T_world_camera)
+        return find_test_pose(scene, image, T_world_camera, *view, **steps)
+
+    monkeypatch.setattr("splatnode.recon.evaluate.protocol.find_test_pose", align)
+    snapshot = perfect_snapshot()
+    score(snapshot, scene_folder)
+    score(snapshot, scene_folder, start="interpolated")
+    cameras = {camera.name: camera.T_world_camera for camera in snapshot.cameras}
+    between = [interpolate_pose(name, NAMES, cameras) for name in SPLIT.test]
+    assert all(np.allclose(start, pose) for start, pose in zip(starts[2:], between, strict=True))
+    assert not any(np.allclose(start, pose, atol=1e-3) for start, pose in zip(starts[:2], between, strict=True))
+
+
+def test_a_mean_is_of_all_that_was_measured_also_of_nothing_at_all():
+    assert compute_mean([0.0, 3.0, None]) == 1.5 and compute_mean([0.0]) == 0.0
+    assert compute_mean([None, None]) is None and compute_mean([]) is None
 
 
 def test_one_camera_cannot_be_aligned(scene_folder):

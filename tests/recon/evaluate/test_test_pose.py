@@ -71,3 +71,38 @@ def test_search_never_ends_worse_than_it_started():
     )
     assert found.loss == pytest.approx(0.0, abs=1e-6)
     assert np.array_equal(found.T_world_camera, np.eye(4))
+
+
+class Valley:
+    """A scene that looks right from x = .1 alone, and as much worse as the camera is beside it."""
+
+    num_gaussians, num_bytes = None, 0
+
+    def __init__(self) -> None:
+        self.seen: list[float] = []
+
+    def depth(self, T_world_camera: np.ndarray) -> float:
+        return 1.0
+
+    def difference(self, image, T_world_camera, K, used=None) -> torch.Tensor:
+        loss = (T_world_camera[0, 3] - 0.1).abs()
+        self.seen.append(float(loss.detach()))
+        return loss
+
+    def render(self, T_world_camera, K, width, height) -> torch.Tensor:
+        raise AssertionError("the search renders nothing")
+
+
+@pytest.mark.parametrize("steps", range(8, 14))
+def test_the_best_pose_on_the_way_is_the_one_that_is_found(steps):
+    """Steps that do not fall go to and fro around the place: the last one is not the best."""
+    scene, image = Valley(), torch.zeros(6, 8, 3)
+    found = find_test_pose(scene, image, np.eye(4), K, steps=steps, learning_rate=0.04, final=1.0)
+    assert found.loss == pytest.approx(min(scene.seen), abs=1e-7)
+    assert abs(found.T_world_camera[0, 3] - 0.1) == pytest.approx(found.loss, abs=1e-6)
+
+
+def test_with_several_sizes_the_best_pose_is_the_best_at_the_full_size():
+    scene, image = Valley(), torch.zeros(6, 8, 3)
+    found = find_test_pose(scene, image, np.eye(4), K, steps=12, levels=3, learning_rate=0.04, final=1.0)
+    assert found.loss == pytest.approx(min(scene.seen[8:]), abs=1e-7)

@@ -69,7 +69,7 @@ def estimated(monkeypatch):
 
 
 def working(work: float) -> ReconstructionConfig:
-    return apply_changes(ReconstructionConfig(), {"ladder": {"work": work}})
+    return apply_changes(ReconstructionConfig(), {"fallbacks": {"budget": work}})
 
 
 def climb(first: Reconstruction, *rungs: Fallback, config: ReconstructionConfig | None = None) -> Reconstruction:
@@ -100,7 +100,9 @@ def test_what_no_match_could_help_is_not_touched(first, estimated):
 
 
 def test_quick_stops_at_the_first_rung(estimated):
-    assert climb(NO_OVERLAP, rung("a"), config=ReconstructionConfig(quick=True)) is NO_OVERLAP and estimated() == []
+    assert (
+        climb(NO_OVERLAP, rung("a"), config=ReconstructionConfig(no_fallbacks=True)) is NO_OVERLAP and estimated() == []
+    )
 
 
 def test_the_work_ends_the_climb_between_pieces_and_between_rungs(estimated):
@@ -128,7 +130,7 @@ def test_a_deadline_ends_the_climb_and_without_one_no_clock_is_read(estimated, m
     assert 1 < seeds[0] <= 6 and (read := next(clock)) < 10
     run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=math.inf)
     assert seeds[1] == 100 and next(clock) == read + 1
-    climb(NO_OVERLAP, rung("long", 100), config=apply_changes(working(1000.0), {"ladder": {"most_s": 6.0}}))
+    climb(NO_OVERLAP, rung("long", 100), config=apply_changes(working(1000.0), {"fallbacks": {"timeout_s": 6.0}}))
     assert 1 < seeds[2] <= 6
 
 
@@ -193,7 +195,7 @@ def test_pause_may_abandon_the_climb(estimated):
 def test_photographs_of_three_places_are_refused_with_what_was_tried_unless_quick(quick, monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
     frames = places(msgspec.structs.replace(SMALL, views=3), seeds=(0, 1, 2))
-    *_, final = reconstruct(frames, ReconstructionConfig(quick=quick))
+    *_, final = reconstruct(frames, ReconstructionConfig(no_fallbacks=quick))
     assert final.verdict.code is Code.NO_OVERLAP
     assert ("stronger tilts" in final.verdict.message) != quick
     assert (final.seconds["ladder"] > 0.1) != quick

@@ -96,6 +96,6 @@ def test_what_is_not_exact_or_not_published_is_not_taken(second, asked):
 
 def test_quick_takes_the_first_answer(asked):
     first = estimate(Code.MOVING_SCENE, 6, 5)
-    assert run_fallbacks(first, (), ReconstructionConfig(quick=True)) is first and asked() == []
+    assert run_fallbacks(first, (), ReconstructionConfig(no_fallbacks=True)) is first and asked() == []
     asked(estimate(Code.OK_PARTIAL, 5, 5))
     assert run_fallbacks(first, (), ReconstructionConfig()).publishable

@@ -68,13 +68,13 @@ def test_a_lens_can_be_given(result, photographs, tmp_path, capsys):
         f"intrinsics: {{width: {PLACE.width}, height: {PLACE.height}, "
         f"fx: {K[0, 0]}, fy: {K[1, 1]}, cx: {K[0, 2]}, cy: {K[1, 2]}}}"
     )
-    assert main(["locate", str(result), str(photographs), "--calibration", str(lens)]) == 0
+    assert main(["locate", str(result), str(photographs), "--intrinsics", str(lens)]) == 0
     degrees = str(float(np.degrees(2 * np.arctan(PLACE.width / 2 / K[0, 0]))))
     assert main(["locate", str(result), str(photographs), "--fov", degrees]) == 0
     assert main(["locate", str(result), str(photographs), "--fov", "9"]) == 65
     lens.write_text("fx: 3")
     capsys.readouterr()
-    assert main(["locate", str(result), str(photographs), "--calibration", str(lens)]) == 2
+    assert main(["locate", str(result), str(photographs), "--intrinsics", str(lens)]) == 2
     assert "must give width, height, fx" in capsys.readouterr().err
 
 
@@ -93,7 +93,7 @@ def test_a_lens_that_cannot_be_undone_costs_only_its_photograph(result, photogra
 def test_a_lens_that_can_be_of_no_photograph_is_told_before_the_work(result, photographs, tmp_path, capsys):
     lens = tmp_path / "lens.yaml"
     lens.write_text("{width: 100, height: 100, fx: 90, fy: 90, cx: 50, cy: 50}")
-    given = ["--calibration", str(lens)]
+    given = ["--intrinsics", str(lens)]
     assert main(["locate", str(result), str(photographs), *given]) == 2
     told = capsys.readouterr()
     assert "got those of 100 x 100 for 480 x 360" in told.err and not told.out

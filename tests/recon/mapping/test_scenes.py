@@ -18,7 +18,7 @@ IDENTITY, OTHER = "a" * 32, "b" * 32
 
 @pytest.fixture
 def node(tmp_path):
-    return replace(make_node_config(QUICK, tmp_path / "out"), max_views=4, settle_s=0.2)
+    return replace(make_node_config(QUICK, tmp_path / "out"), max_views=4, idle_finalize_s=0.2)
 
 
 def index(node) -> dict:

@@ -26,7 +26,7 @@ def picture() -> np.ndarray:
 
 
 def test_one_descriptor_a_point_inside_the_image(picture):
-    found = features.extract(picture, features.FeatureConfig(num_features=500))
+    found = features.extract(picture, features.FeatureConfig(max_num_features=500))
     assert 400 < len(found.points) <= 510
     assert found.descriptors.shape == (len(found.points), 128) and found.descriptors.dtype == np.uint8
     np.testing.assert_array_equal(found.point_of, np.arange(len(found.points)))
@@ -40,7 +40,7 @@ def test_points_are_in_full_size_pixels_at_whatever_size_they_are_found(picture,
     y, x = np.mgrid[:480, :640] + 0.5
     dot += 200 * np.exp(-((x - 201.3) ** 2 + (y - 150.8) ** 2) / (2 * 6.0**2))
     image = np.repeat(dot[..., None], 3, axis=2).astype(np.uint8)
-    config = features.FeatureConfig(max_longer_side=longer_side, min_longer_side=min(longer_side, 1000))
+    config = features.FeatureConfig(max_image_size=longer_side, min_longer_side=min(longer_side, 1000))
     found = features.extract(image, config)
     np.testing.assert_allclose(found.points[0], [201.3, 150.8], atol=0.25)
 
@@ -59,7 +59,7 @@ def test_an_image_of_one_colour_has_none():
 
 
 def test_a_tilt_adds_descriptors_to_known_points_and_points(picture):
-    config = features.FeatureConfig(num_features=500)
+    config = features.FeatureConfig(max_num_features=500)
     plain = features.extract(picture, config)
     widened = features.add_affine_features(plain, picture, (1.6,), config)
     added = widened.tilt == 1.6
@@ -89,7 +89,7 @@ def test_a_view_from_above_is_matched_by_tilts_below_one(picture):
 
 def num_right(picture: np.ndarray, shrunk: np.ndarray, tilt: float) -> tuple[int, int]:
     """Right matches of the shrunk picture with plain features of the picture, and with those of this tilt."""
-    config = features.FeatureConfig(num_features=2000)
+    config = features.FeatureConfig(max_num_features=2000)
     front, side = features.extract(picture, config), features.extract(shrunk, config)
     both = features.add_affine_features(front, picture, (tilt,), config)
     there = np.array(picture.shape[1::-1]) / shrunk.shape[1::-1]

@@ -16,7 +16,7 @@ from tests.support.synthetic import photographs, places
 
 
 def features_of(frame) -> Features:
-    return extract(frame.image, FeatureConfig(num_features=2000))
+    return extract(frame.image, FeatureConfig(max_num_features=2000))
 
 
 def test_photographs_of_one_place_are_more_alike_than_those_of_two():

@@ -78,5 +78,7 @@ def test_a_live_scene_leaves_it_out_once_it_is_final():
 
 def test_it_can_be_switched_off():
     graph = graph_of(True)
-    off = replace(graph, config=msgspec.structs.replace(graph.config, moving=MovingObjectsConfig(enabled=False)))
+    off = replace(
+        graph, config=msgspec.structs.replace(graph.config, dynamic_objects=MovingObjectsConfig(enabled=False))
+    )
     assert moving_masks(off) == {} and moving_masks(graph) != {}

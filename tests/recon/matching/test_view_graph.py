@@ -193,7 +193,7 @@ def test_photographs_of_one_place_are_a_pair_and_those_of_two_are_not():
 
 def test_cameras_do_not_depend_on_the_order_of_the_photographs():
     frames = photographs()[1:4]
-    config = matching.MatchingConfig(features=features.FeatureConfig(num_features=1500))
+    config = matching.MatchingConfig(features=features.FeatureConfig(max_num_features=1500))
     found = {}
     for order in ((0, 1, 2), (2, 0, 1)):
         images = [frames[index].image for index in order]

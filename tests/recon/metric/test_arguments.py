@@ -9,7 +9,7 @@ import pytest
 from splatnode.command_line import build_parser
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.config import ReconstructionConfig, apply_changes
-from splatnode.recon.metric.arguments import add_poses, collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import add_poses, collect_drift_changes, collect_metric_changes, trusts_poses
 
 
 def configured(*options: str):
@@ -19,7 +19,7 @@ def configured(*options: str):
 
 def test_options_become_the_configuration():
     plain = configured()
-    assert plain.marker_m is None and plain.stereo_m is None and plain.baselines == ()
+    assert plain.marker_size_m is None and plain.stereo_baseline_m is None and plain.baselines == ()
     metric = configured(
         "--marker",
         "99.4mm@0.2mm",
@@ -32,8 +32,8 @@ def test_options_become_the_configuration():
         "--poses-sigma",
         "1,5",
     )
-    assert (metric.marker_m, metric.marker_sigma_m) == pytest.approx((0.0994, 0.0002))
-    assert (metric.stereo_m, metric.stereo_sigma_m) == pytest.approx((0.075, 0.0003))
+    assert (metric.marker_size_m, metric.marker_size_sigma_m) == pytest.approx((0.0994, 0.0002))
+    assert (metric.stereo_baseline_m, metric.stereo_baseline_sigma_m) == pytest.approx((0.075, 0.0003))
     assert (metric.poses_sigma_m, metric.poses_sigma_deg) == (1.0, 5.0)
 
 
@@ -57,6 +57,19 @@ def test_who_says_how_unsure_poses_are_trusts_them_unless_they_are_only_to_be_ch
     for given, trusted in (
         (["--poses", "p"], False),
         (["--poses", "p", "--poses-sigma", "0.001,0.1"], True),
-        (["--poses", "p", "--poses-sigma", "0.001,0.1", "--poses-only-check"], False),
+        (["--poses", "p", "--poses-sigma", "0.001,0.1", "--check-poses"], False),
     ):
         assert trusts_poses(parser.parse_args(given)) is trusted
+
+
+def test_drift_is_a_share_of_the_way_and_degrees():
+    parser = argparse.ArgumentParser()
+    add_poses(parser)
+    for text, told in (("2%", (0.02, 0.5)), ("1,0.2", (0.01, 0.2))):
+        changes = collect_drift_changes(parser.parse_args(["--poses", "p", "--poses-drift", text]))
+        assert (changes["poses_drift"], changes["poses_drift_deg"]) == pytest.approx(told)
+    for wrong in ("0%", "60%", "2%,x", "nan", "2%,nan"):
+        with pytest.raises(SystemExit):
+            parser.parse_args(["--poses-drift", wrong])
+    with pytest.raises(ValueError, match="which poses drift"):
+        collect_drift_changes(parser.parse_args(["--poses-drift", "2%"]))

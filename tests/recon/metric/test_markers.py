@@ -121,14 +121,14 @@ def test_markers_of_two_sizes_contradict_each_other():
 def test_markers_that_differ_by_more_than_they_may_give_no_metres_whatever_the_ruler_and_others_say():
     known = replace(ball_snapshot(1), cameras=tuple(cameras()))
     evidence = Evidence((*of({0}), *(shrunk(each, 0.98) for each in of({7}))))
-    told = apply_metric_scale(known, MetricConfig(marker_m=0.1), evidence)  # the ruler: half a millimetre, 0.5 %
+    told = apply_metric_scale(known, MetricConfig(marker_size_m=0.1), evidence)  # the ruler: half a millimetre, 0.5 %
     assert not told.scale.metric and told.scale.interval_95 is None
     assert "marker 0 of 100 mm in 3 photographs, contradicts marker 7 of 100 mm" in (told.scale.source or "")
     true = [T[:3, 3] for T, _ in synthetic.scene_cameras(PLACE)]
     apart = float(np.linalg.norm(true[2] - true[0]))
     for sigma in (0.001, 0.5):
         between = MetricConfig(
-            marker_m=0.1, baseline=Baseline("view_000.png", "view_002.png", 1.01 * apart), baseline_sigma=sigma
+            marker_size_m=0.1, baseline=Baseline("view_000.png", "view_002.png", 1.01 * apart), baseline_sigma=sigma
         )
         torn = apply_metric_scale(known, between, evidence)
         assert not torn.scale.metric and "contradicts" in (torn.scale.source or "")
@@ -137,17 +137,17 @@ def test_markers_that_differ_by_more_than_they_may_give_no_metres_whatever_the_r
 def test_a_scene_gets_metres_from_a_marker_and_a_baseline_20_percent_off_is_refused():
     known = replace(ball_snapshot(1), cameras=tuple(cameras()))
     evidence = Evidence(found())
-    metric = apply_metric_scale(known, MetricConfig(marker_m=0.1), evidence)
+    metric = apply_metric_scale(known, MetricConfig(marker_size_m=0.1), evidence)
     assert metric.scale.metric and "marker 0 of 100 mm in 3 photographs" in (metric.scale.source or "")
     true = [T[:3, 3] for T, _ in synthetic.scene_cameras(PLACE)]
     apart = float(np.linalg.norm(true[2] - true[0]))
     placed = [camera.T_world_camera[:3, 3] for camera in metric.cameras]
     assert np.linalg.norm(placed[2] - placed[0]) == pytest.approx(apart, rel=0.01)
     for wrong in (0.8, 1.2):
-        asked = MetricConfig(marker_m=0.1, baseline=Baseline("view_000.png", "view_002.png", wrong * apart))
+        asked = MetricConfig(marker_size_m=0.1, baseline=Baseline("view_000.png", "view_002.png", wrong * apart))
         torn = apply_metric_scale(known, asked, evidence)
         assert not torn.scale.metric and "contradicts marker 0" in (torn.scale.source or "")
-    nothing = apply_metric_scale(known, MetricConfig(marker_m=0.1))
+    nothing = apply_metric_scale(known, MetricConfig(marker_size_m=0.1))
     assert not nothing.scale.metric and "no marker of 100 mm was found" in (nothing.scale.source or "")
 
 
@@ -178,5 +178,5 @@ def test_corners_are_those_of_the_photograph_without_distortion():
 
 def test_nothing_is_looked_for_unless_it_is_asked_for():
     assert gather_evidence(photographs(), MetricConfig()).sightings == ()
-    some = gather_evidence([DroppedFrame("x.png", "unreadable"), photographs()[0]], MetricConfig(marker_m=0.1))
+    some = gather_evidence([DroppedFrame("x.png", "unreadable"), photographs()[0]], MetricConfig(marker_size_m=0.1))
     assert {each.marker for each in some.sightings} == {0, 7}

@@ -75,7 +75,7 @@ def test_what_cannot_be_had_is_said_and_the_scene_stays(seen, tmp_path, monkeypa
     told = apply_metric_scale(unsure, MetricConfig(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
     assert not told.scale.metric and "do not tell these two cameras apart" in (told.scale.source or "")
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
-    assert "no weights" in (apply_metric_scale(seen, MetricConfig(network=True)).scale.source or "")
+    assert "no weights" in (apply_metric_scale(seen, MetricConfig(depth_network=True)).scale.source or "")
 
 
 def test_a_network_gives_the_unit_where_its_views_agree(seen):
@@ -172,7 +172,7 @@ def test_every_file_says_which_scale_it_has(seen, tmp_path):
 def test_a_refused_result_has_no_metres(seen):
     refused = replace(seen, cameras=())
     report = build_report(
-        apply_metric_scale(refused, MetricConfig(network=True)), seed=0, preset="fast", peak_rss_mb=None
+        apply_metric_scale(refused, MetricConfig(depth_network=True)), seed=0, preset="fast", peak_rss_mb=None
     )
     assert (report["scale"], report["scale_source"]) == ("relative", None)
 

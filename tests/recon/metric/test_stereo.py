@@ -111,7 +111,7 @@ def snapshot() -> Snapshot:
 
 
 def test_a_scene_gets_metres_from_its_pairs():
-    metric = apply_metric_scale(snapshot(), MetricConfig(stereo_m=BASELINE_M), Evidence(pairs=pairs()))
+    metric = apply_metric_scale(snapshot(), MetricConfig(stereo_baseline_m=BASELINE_M), Evidence(pairs=pairs()))
     assert metric.scale.metric and "2 stereo pairs with 150 mm between the cameras" in (metric.scale.source or "")
 
 
@@ -139,7 +139,7 @@ def test_a_pair_that_the_newest_estimate_has_no_camera_of_does_not_count(kept):
 @pytest.mark.parametrize("sigma_m", [0.0003, 100.0])
 def test_a_baseline_that_is_configured_is_as_the_configuration_allows(sigma_m):
     metric = apply_metric_scale(
-        snapshot(), MetricConfig(stereo_m=150.0, stereo_sigma_m=sigma_m), Evidence(pairs=pairs())
+        snapshot(), MetricConfig(stereo_baseline_m=150.0, stereo_baseline_sigma_m=sigma_m), Evidence(pairs=pairs())
     )
     assert "150 m between the cameras" in (metric.scale.source or "")
 

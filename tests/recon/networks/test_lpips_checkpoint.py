@@ -47,6 +47,21 @@ def test_the_arrays_get_the_names_and_the_order_of_axes_of_the_network(tmp_path)
     assert loaded(image, image) == 0.0 and loaded(image, image.flip(1)) != 0.0
 
 
+def test_colours_are_shifted_and_scaled_as_the_networks_were_trained():
+    """In [-1, 1]: less (-.030, -.088, -.188), over (.458, .448, .450). One layer shows what it is given."""
+    alone = lpips.Lpips(
+        (Layer(3, kernel=1, padding=0, tap=True),),
+        {
+            "net.0.weight": torch.eye(3)[..., None, None],
+            "net.0.bias": torch.zeros(3),
+            "lin0.weight": torch.ones(1, 3, 1, 1),
+        },
+    )
+    given = torch.tensor([-0.030 + 0.458 * 1, -0.088 + 0.448 * 2, -0.188 + 0.450 * 2])  # 1, 2 and 2 after both
+    (features,) = alone.features(((given + 1) / 2).expand(32, 32, 3))
+    assert features[0, :, 5, 7].tolist() == pytest.approx([1 / 3, 2 / 3, 2 / 3], abs=1e-5)
+
+
 def test_a_network_that_lacks_a_layer_is_a_clear_error(tmp_path):
     (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(network(SHAPES[:4])))
     with pytest.raises(ValueError, match="checkpoint of LPIPS's network 'alex': it lacks"):

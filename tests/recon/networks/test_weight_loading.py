@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -43,6 +44,18 @@ def test_a_tensor_larger_than_its_bytes_is_refused(tmp_path):
         ValueError, match=r"holds 4 bytes of a \(1000000000000,\), fewer than it needs; take the official"
     ):
         read_weights(tmp_path / "a.pth")
+
+
+@pytest.mark.parametrize("protocol", [3, 4])
+def test_another_protocol_of_pickle_is_no_warning(tmp_path, protocol):
+    torch.save({"a": torch.ones(2)}, tmp_path / "a.pth", pickle_protocol=protocol)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            assert read_weights(tmp_path / "a.pth")["a"].tolist() == [1.0, 1.0]
+        except ValueError as error:
+            assert str(error).endswith("take the official file") or "fetch it again" in str(error)
+            assert "Detected pickle protocol" not in str(error)
 
 
 @pytest.mark.parametrize("kind", ["sparse", "meta"])

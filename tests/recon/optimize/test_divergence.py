@@ -52,9 +52,7 @@ def test_a_ruined_scene_is_refused_with_both_figures(truth):
     refused = check_divergence(compute_photometric_misfit(truth), scattered(truth))
     assert refused is not None and refused.code is Code.DIVERGED and not refused.publishable
     assert refused.frames == tuple(view.name for view in truth.views)
-    assert (
-        f"{compute_photometric_misfit(scattered(truth)):.2g}" in refused.message and "optimize.rates" in refused.advice
-    )
+    assert f"{compute_photometric_misfit(scattered(truth)):.2g}" in refused.message and "optimize.lr" in refused.advice
 
 
 def test_numbers_that_nothing_can_show_are_refused(truth):

@@ -18,7 +18,7 @@ from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.known_scene import disturbed, photographed, render
 
 ALONE = RefinementConfig(
-    iterations=40, checkpoints=(15,), dssim=0.2, dropout=ensemble.DropoutConfig(share=0.0), control=None
+    iterations=40, checkpoints=(15,), ssim_lambda=0.2, dropout=ensemble.DropoutConfig(share=0.0), control=None
 )
 TOGETHER = structs.replace(ALONE, ensemble=ensemble.EnsembleConfig(members=3, iterations=60, pseudo_views=2))
 

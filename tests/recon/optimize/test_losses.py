@@ -9,6 +9,7 @@ import torch
 
 from splatnode.recon.networks.lpips import load_lpips
 from splatnode.recon.optimize.losses.depth import local_depth_loss, pearson, tiles
+from splatnode.recon.optimize.losses.dino import DinoFeatures
 from splatnode.recon.optimize.losses.normal import normal_loss
 from splatnode.recon.optimize.losses.perceptual import LpipsDistance, MultiScaleGradient, load_perceptual
 from splatnode.recon.optimize.losses.semantic import semantic_loss
@@ -71,6 +72,19 @@ def test_normal_loss_by_hand():
 def test_semantic_loss_by_hand():
     assert semantic_loss(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0])).item() == 2.0
     assert semantic_loss(torch.tensor([0.6, 0.8]), torch.tensor([0.6, 0.8])).item() == 0.0
+
+
+def test_embeddings_of_dinov2_have_unit_length():
+    """Else the semantic loss would compare how strong features are, and not where they point."""
+
+    class Network:
+        blocks = range(12)
+
+        def __call__(self, image, layers):
+            assert layers == (11,) and max(image.shape[2:]) == 224
+            return (torch.tensor([[[3.0, 0.0, 4.0], [9.0, 9.0, 9.0]]]),)
+
+    assert DinoFeatures(Network())(image(0)).tolist() == pytest.approx([0.6, 0.0, 0.8])
 
 
 def test_multi_scale_gradient_by_hand():

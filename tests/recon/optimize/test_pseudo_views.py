@@ -43,6 +43,16 @@ def test_pseudo_views_lie_between_their_neighbours_and_beside_the_path():
     assert all(abs(view.T_world_camera[1, 3]) < 1e-12 for view in on_path)
 
 
+def test_the_nearest_training_view_is_the_one_that_it_stands_nearest_to():
+    """Its K and size are taken from that view, and the semantic loss compares with it."""
+    cameras, sizes = [camera(0.0), camera(1.0)], [(64, 48), (32, 24)]
+    Ks = [np.diag([100.0, 100.0, 1.0]), np.diag([50.0, 50.0, 1.0])]
+    views = pseudo_views(cameras, Ks, sizes, 40, off_path=0.0, rng=np.random.default_rng(0))
+    assert {view.nearest for view in views} == {0, 1}
+    assert all(view.nearest == int(view.T_world_camera[0, 3] > 0.5) for view in views)
+    assert all((view.width, view.height) == sizes[view.nearest] for view in views)
+
+
 def test_one_camera_has_no_neighbours():
     with pytest.raises(ValueError, match="at least 2"):
         pseudo_views([camera(0.0)], [np.eye(3)], [(8, 8)], 1, off_path=0.0, rng=np.random.default_rng(0))

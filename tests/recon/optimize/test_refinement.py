@@ -31,7 +31,7 @@ FROZEN = LearningRates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0
 
 def plain(**changes: object) -> RefinementConfig:
     """A refinement that keeps all Gaussians in every render and to the end."""
-    nothing = RefinementConfig(checkpoints=(), dssim=0.2, dropout=ensemble.DropoutConfig(share=0.0), control=None)
+    nothing = RefinementConfig(checkpoints=(), ssim_lambda=0.2, dropout=ensemble.DropoutConfig(share=0.0), control=None)
     return structs.replace(nothing, **changes)
 
 
@@ -76,7 +76,7 @@ def test_disturbed_poses_come_back(truth):
     start = turned(truth)
     # Many steps: a ball in the middle of the image hardly tells a turn from a step to the side.
     rates = structs.replace(FROZEN, translation=3e-3, rotation=1e-3)
-    found = last(start, plain(iterations=900, rates=rates))
+    found = last(start, plain(iterations=900, lr=rates))
     assert pose_error(start, truth) > 0.01
     assert pose_error(found, truth) < 0.15 * pose_error(start, truth)
     assert torch.equal(found.views[0].T_world_camera, truth.views[0].T_world_camera)
@@ -236,7 +236,7 @@ def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypa
     start = replace(truth, views=tuple(map(with_pointmap, truth.views)))
     config = plain(iterations=8, half_resolution_share=0.5)
     unpulled = last(start, config)
-    brighter = last(start, structs.replace(config, regularise=WITH_NORMALS))
+    brighter = last(start, structs.replace(config, regularizers=WITH_NORMALS))
     assert brighter.served_by == {"depth": "a wish"} and unpulled.served_by == {}
     assert Brighter.made.names == ["0.png", "1.png", "2.png"]
     assert Brighter.made.shapes == [(True, (24, 32))] * 4 + [(True, (48, 64))] * 2 + [(False, (48, 64))] * 2
@@ -246,12 +246,12 @@ def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypa
 
 def test_a_loss_without_a_point_map_names_the_view(truth):
     with pytest.raises(ValueError, match=r"0\.png has no point map"):
-        last(truth, plain(iterations=1, regularise=WITH_NORMALS))
+        last(truth, plain(iterations=1, regularizers=WITH_NORMALS))
 
 
 def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):
     def moved(**final: float) -> tuple[float, float]:
-        fit = Trainer(disturbed(truth), plain(rates=LearningRates(**final)), seed=0)
+        fit = Trainer(disturbed(truth), plain(lr=LearningRates(**final)), seed=0)
         fit.step(1, progress=1.0)
         scene = fit.scene()
         camera = (scene.views[1].T_world_camera - truth.views[1].T_world_camera).abs().max()
@@ -269,11 +269,11 @@ def test_a_begun_scene_starts_soft_and_one_that_goes_on_does_not(truth):
     sources = torch.zeros_like(gaussians.source_frame)
     sources[0] = SHELL
     scene = replace(truth, gaussians=replace(gaussians, source_frame=sources), iterations=0)
-    still = plain(iterations=training.MIN_SOFT, rates=FROZEN)
+    still = plain(iterations=training.MIN_SOFT, lr=FROZEN)
     soft = last(scene, still).gaussians.opacities
     assert soft[0] == pytest.approx(0.5) and soft[1:].tolist() == pytest.approx([0.1] * (len(soft) - 1))
     gone_on, as_seeded = replace(scene, iterations=1), structs.replace(still, first_opacity=None)
-    few, limited = plain(iterations=2, rates=FROZEN), time.monotonic() + 60
+    few, limited = plain(iterations=2, lr=FROZEN), time.monotonic() + 60
     for end in (last(gone_on, still), last(scene, as_seeded), last(scene, few), last(scene, still, deadline=limited)):
         assert end.gaussians.opacities.tolist() == pytest.approx([0.5] * len(soft))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,7 @@ from splatnode.recon.optimize.regularizers import Regularizer, RegularizerConfig
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.reference import Render
 
-PAPER = CONFIGS["paper"].optimize.regularise
+PAPER = CONFIGS["paper"].optimize.regularizers
 WIDTH, HEIGHT = 96, 64
 K = np.array([[90.0, 0.0, 48.0], [0.0, 90.0, 32.0], [0.0, 0.0, 1.0]])
 
@@ -71,7 +73,7 @@ def weighted(**weights: float) -> RegularizerConfig:
     chosen = {name: {"weight": weight} for name, weight in weights.items()}
     if "depth" in chosen:
         chosen["depth"]["share"] = 1.0
-    return apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}}).optimize.regularise
+    return apply_changes(preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}}).optimize.regularizers
 
 
 def regularisation(config: RegularizerConfig) -> Regularizer:
@@ -120,6 +122,44 @@ def test_the_total_is_the_weighted_sum_of_its_losses(without_networks):
     alone = [loss(point_render=1.0), loss(depth=1.0), loss(normal=1.0)]
     total = 0.25 * alone[0] + 0.05 * alone[1] + 0.01 * alone[2]
     assert min(alone) > 1e-4 and loss(point_render=0.25, depth=0.05, normal=0.01) == pytest.approx(total, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["point_render", "depth", "normal"])
+def test_each_loss_is_compared_with_what_the_pseudo_view_itself_shows(name, without_networks):
+    """What is right from there costs little, and what is wrong much."""
+
+    def loss(draw) -> float:
+        found = regularisation(structs.replace(weighted(**{name: 1.0}), off_path=0.0))
+        parts = [found.pseudo_loss(lambda view, _: draw(view), 0.5) for _ in range(6)]
+        assert all(part is not None for part in parts)
+        return sum(part.item() for part in parts)
+
+    assert loss(truth_at) < 0.5 * loss(lambda view: mirrored(truth_at(view)))
+
+
+def test_pixels_without_a_point_are_white_or_left_out_as_is_chosen(without_networks):
+    """Where no point falls, a render costs what it differs from white by, or nothing."""
+    pointmap, image = wall(0.0, 0)
+    half = replace(pointmap, confidence=np.where(np.arange(WIDTH) < 40, 1.0, 0.0)[None].repeat(HEIGHT, 0))
+    nothing = replace(wall(0.8, 1)[0], confidence=np.zeros_like(pointmap.confidence))
+    costs = {}
+    for compare in (True, False):
+        chosen = {"point_render": {"weight": 1.0, "compare_unseen": compare}}
+        config = apply_changes(
+            preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}}
+        ).optimize.regularizers
+        regularised = Regularizer([half, nothing], [image, image], structs.replace(config, off_path=0.0), seed=0)
+
+        def draw(view, _, dark: bool) -> Render:
+            rgb = truth_at(view).rgb.clone()
+            rgb[:, 60:] = (torch.arange(WIDTH - 60) % 2)[:, None] * (0.0 if dark else 1.0)
+            return Render(rgb, None, None, None)
+
+        dark, striped = (
+            float(regularised.pseudo_loss(lambda view, _, d=d: draw(view, _, d), 0.5)) for d in (True, False)
+        )
+        costs[compare] = abs(dark - striped)
+    assert costs[False] == pytest.approx(0.0, abs=1e-6) and costs[True] > 0.01
 
 
 def test_half_size_renders_are_compared_with_half_of_what_is_known(without_networks):
@@ -217,5 +257,5 @@ def test_a_loss_that_is_not_there_is_named_with_those_that_are():
 
 def test_a_loss_may_be_used_twice_under_names_of_its_own():
     chosen = {"fine": {"kind": "depth", "weight": 1.0, "patch": 16}, "coarse": {"kind": "depth", "weight": 0.5}}
-    changed = apply_changes(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}})
-    assert list(regularisation(changed.optimize.regularise).served_by) == ["fine", "coarse"]
+    changed = apply_changes(preset("balanced"), {"optimize": {"regularizers": {"losses": chosen}}})
+    assert list(regularisation(changed.optimize.regularizers).served_by) == ["fine", "coarse"]

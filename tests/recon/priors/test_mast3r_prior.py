@@ -125,7 +125,7 @@ def test_cameras_and_depth_come_out_right():
 @pytest.mark.parametrize("noise", [False, True])
 def test_what_a_lying_network_invents_is_refused(noise):
     """Frames of three places, or of nothing at all: the network claims that all of them show one wall."""
-    few = matching.MatchingConfig(features=features.FeatureConfig(num_features=2000, min_longer_side=500))
+    few = matching.MatchingConfig(features=features.FeatureConfig(max_num_features=2000, min_longer_side=500))
     frames = places(msgspec.structs.replace(SMALL, views=3, width=192, height=144), seeds=(0, 1, 2))
     if noise:
         rng = np.random.default_rng(0)

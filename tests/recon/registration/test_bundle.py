@@ -64,6 +64,23 @@ def turned_deg(one: bundle_adjustment.Problem, other: bundle_adjustment.Problem)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
 
 
+def test_a_centre_is_where_its_camera_has_the_origin():
+    known = problem(num_points=3)
+    centres = bundle_adjustment.centres(known)
+    assert np.abs(centres).max() > 1.0
+    moved = np.einsum("cij,cj->ci", known.rotations, centres) + known.translations
+    np.testing.assert_allclose(moved, 0.0, atol=1e-12)
+
+
+def test_a_point_behind_a_camera_has_an_infinite_error_wherever_it_is_projected():
+    exact = problem(num_points=3, noise_px=0.0)
+    assert bundle_adjustment.reprojection_errors(exact).max() < 1e-9
+    mirrored = replace(exact, points=exact.points * [[1.0], [-1.0], [1.0]])  # the world's frame is camera 0's
+    errors = bundle_adjustment.reprojection_errors(mirrored).reshape(3, 4)
+    assert np.isinf(errors[1]).all() and np.isfinite(errors[[0, 2]]).all()
+    assert errors[[0, 2]].max() < 1e-9
+
+
 def test_what_was_disturbed_comes_back_exactly_without_noise():
     true = problem(noise_px=0.0)
     prior = replace(PRIOR, sigmas=np.array([1e3]), radial_sigmas=np.full((1, 2), 1e3), shift_sigmas=np.array([1e6]))

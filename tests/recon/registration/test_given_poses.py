@@ -120,3 +120,28 @@ def test_a_false_pose_is_the_most_contradicted(turn: float, shift: float) -> Non
     assert worst == 2
     assert residuals[worst].probability < pose_test.LEAST_PROBABILITY
     assert residuals[worst].sigmas > 4.4
+
+
+def test_poses_whose_errors_depend_on_each_other_are_weighed_as_their_covariance_says() -> None:
+    """As SciPy has it, with a joint covariance that ties the cameras together."""
+    true = problem(12, 3, NOISE_PX)
+    given = given_poses(true, 4)
+    mixing = np.random.default_rng(5).normal(size=(24, 24)) / 10.0 + np.eye(24)
+    scale = np.tile(np.repeat(SIGMAS, 3), 4)
+    given = replace(given, joint=scale[:, None] * (mixing @ mixing.T) * scale)
+    begun = replace(start(true, given), given=given)
+    found = bundle_adjustment.adjust(begun, TOLD, LOSS)
+    whiten = np.linalg.inv(np.linalg.cholesky(given.covariance))
+
+    def errors(values: np.ndarray) -> np.ndarray:
+        poses, points = values[:24].reshape(4, 6), values[24:].reshape(-1, 3)
+        rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ begun.rotations
+        now = replace(begun, rotations=rotations, translations=begun.translations + poses[:, 3:], points=points)
+        off = [np.concatenate(pose_test.deviation(now, given, camera)[:2]) for camera in range(4)]
+        predicted, _ = bundle_adjustment.project(now)
+        return np.concatenate([((predicted - now.pixels) / NOISE_PX).ravel(), whiten @ np.concatenate(off)])
+
+    best = least_squares(errors, np.concatenate([np.zeros(24), begun.points.ravel()]), x_scale="jac", xtol=1e-14)
+    turned = Rotation.from_rotvec(best.x[:24].reshape(4, 6)[:, :3]).as_matrix() @ begun.rotations
+    np.testing.assert_allclose(found.rotations, turned, atol=2e-6)
+    np.testing.assert_allclose(found.translations, begun.translations + best.x[:24].reshape(4, 6)[:, 3:], atol=2e-5)

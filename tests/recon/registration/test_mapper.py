@@ -164,6 +164,12 @@ def test_false_alarms_fall_with_every_match_that_agrees():
     assert alarms[-1] < -25.0
 
 
+def test_the_number_of_false_alarms_by_hand():
+    """(10 - 7) choices of a model, C(10, 8) sets of 8 inliers, C(8, 7) samples among them, and .1 for the eighth."""
+    assert two_view.log10_number_of_false_alarms(10, 8, 7, 0.1) == pytest.approx(np.log10(3 * 45 * 8 * 0.1))
+    assert two_view.log10_number_of_false_alarms(10, 7, 7, 0.1) == 0.0  # a sample agrees with itself
+
+
 def test_pairs_vote_for_the_focal_length(pairs):
     votes = self_calibration.vote(list(pairs.values()), num_candidates=3)
     assert min(abs(np.log(vote * SIZE[0] / FOCAL)) for vote in votes) < 0.08
@@ -288,6 +294,25 @@ def test_tracks_join_matches_and_drop_what_contradicts_itself():
     thinned = triangulation.thin(joined, per_camera=1)
     assert thinned.num_tracks == 1
     assert sorted(thinned.camera_of) == [0, 1, 2]
+
+
+def test_points_that_two_cameras_see_under_less_than_a_degree_are_not_kept():
+    """Two cameras .02 apart: at depth 1 their rays meet under 1.15 degrees, at depth 1.3 under .88."""
+    state = bundle_adjustment.make_empty_problem(
+        rotations=np.tile(np.eye(3), (2, 1, 1)),
+        translations=np.array([[0.0, 0, 0], [-0.02, 0, 0]]),
+        lens_of_camera=np.zeros(2, np.int64),
+        log_focals=np.log([500.0]),
+        radials=np.zeros((1, 2)),
+        shifts=np.zeros((1, 2)),
+    )
+    depths = np.array([1.0, 1.3])
+    pixels = np.array([[500 * (0.01 - x) / depth, 0.0] for depth in depths for x in (0.0, 0.02)])
+    tracks = triangulation.Tracks(np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]), pixels, 2)
+    config = triangulation.TriangulationConfig()
+    found, kept = triangulation.retriangulate(state, tracks, (0, 1), np.ones(2), config, 1.0)
+    assert kept.tolist() == [0]
+    np.testing.assert_allclose(found.points, [[0.01, 0.0, 1.0]], atol=1e-9)
 
 
 def test_triangulated_points_are_where_they_were(taken):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 
 import numpy as np
@@ -63,3 +64,14 @@ NAMES = np.array([b"a"])
 def test_something_else_is_refused(data):
     with pytest.raises(SceneFileError, match="depth.npz"):
         decode_depths(data)
+
+
+def test_a_file_of_an_old_python_is_read_without_a_warning(tmp_path):
+    file, now = io.BytesIO(), encode_depths(KNOWN)
+    with zipfile.ZipFile(io.BytesIO(now)) as archive, zipfile.ZipFile(file, "w") as old:
+        for name in archive.namelist():
+            old.writestr(name, archive.read(name).replace(b"(2, 2), }", b"(2L, 2),}"))
+    assert b"2L" in file.getvalue()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert list(decode_depths(file.getvalue())) == list(KNOWN)

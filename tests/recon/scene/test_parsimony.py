@@ -76,7 +76,7 @@ def refined_wall(image: np.ndarray) -> int:
     pointmap = plane_pointmap(np.eye(4), width=size, height=size)
     T, K = torch.eye(4), torch.from_numpy(pointmap.K).float()
     view = TrainingView("0.png", 0, image, T, K)
-    scene = Scene((view,), initialize_gaussians([pointmap], [image], CONFIG.seeding))
+    scene = Scene((view,), initialize_gaussians([pointmap], [image], CONFIG.initialization))
     return len(list(training.refine(scene, SHORT, seed=0))[-1].gaussians)
 
 

@@ -93,6 +93,25 @@ def test_of_equally_confident_views_the_first_keeps_its_pixels():
     assert not masks[0].any() and masks[1].sum() == 9
 
 
+def test_a_view_is_as_confident_as_its_pixels_are_in_the_mean():
+    """Equation 14: a few sure pixels make no sure view."""
+    even, uneven = wall(at(), 0.5), wall(at(x=0.5), 0.2, frame_id=1)
+    uneven.confidence[:, 0] = 0.9
+    masks = find_redundant_pixels([even, uneven], GaussianInitializationConfig())
+    assert not masks[0].any() and masks[1].sum() == 9
+
+
+def test_what_any_more_confident_view_covers_is_redundant():
+    """Equations 15 to 17 go over all more confident views: each covers a column of its own."""
+    views = [wall(at(), confidence, frame_id) for frame_id, confidence in enumerate((0.9, 0.7, 0.5))]
+    columns = [np.arange(4)[None].repeat(3, 0) == column for column in (0, 3)]
+    sure = [without(view, ~column) for view, column in zip(views[:2], columns, strict=True)]
+    sure = [replace(view, confidence=np.full((3, 4), c, np.float32)) for view, c in zip(sure, (0.9, 0.7), strict=True)]
+    masks = find_redundant_pixels([*sure, views[2]], GaussianInitializationConfig())
+    assert masks[2].tolist() == [[True, False, False, True]] * 3
+    assert not masks[0].any() and not masks[1].any()
+
+
 def test_what_lies_before_the_surface_covers_what_it_hides():
     """Two points fall into one pixel: the nearer one is what the target would see."""
     two_layers = wall(at(), 0.9)

@@ -25,7 +25,7 @@ from splatnode.recon.verification.evidence import VerificationConfig, verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 WIDTH, HEIGHT = 192, 144
-SETTINGS = matching.MatchingConfig(features=features.FeatureConfig(num_features=500, min_longer_side=WIDTH))
+SETTINGS = matching.MatchingConfig(features=features.FeatureConfig(max_num_features=500, min_longer_side=WIDTH))
 FOCAL = 180.0
 GRID = np.stack(np.meshgrid(np.arange(6.0, WIDTH, 7.0), np.arange(6.0, HEIGHT, 7.0)), -1).reshape(-1, 2)
 

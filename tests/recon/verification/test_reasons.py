@@ -95,14 +95,14 @@ def test_who_requires_more_than_is_known_gets_a_refusal_that_says_what_is_known(
         graph(4, all_pairs(4)),
         registration((0, 1, 2, 3)),
         seen,
-        DecisionConfig(require_percent=positions + 0.1, min_log_odds=-100.0),
+        DecisionConfig(max_position_error_percent=positions + 0.1, min_log_odds=-100.0),
     )
     assert given.code == Code.OK_ROUGH
     given = decide(
         graph(4, all_pairs(4)),
         registration((0, 1, 2, 3)),
         seen,
-        DecisionConfig(require_percent=positions - 0.1, min_log_odds=-100.0),
+        DecisionConfig(max_position_error_percent=positions - 0.1, min_log_odds=-100.0),
     )
     assert f"{positions:.2g} % of the distance" in refused(given, Code.TOO_ROUGH).message
 

@@ -12,7 +12,7 @@ from splatnode.recon.matching import features
 from splatnode.recon.verification import consistency
 from tests.support.synthetic import photographs
 
-FEATURES = features.FeatureConfig(num_features=1500)
+FEATURES = features.FeatureConfig(max_num_features=1500)
 CONFIG = consistency.ReflectionConfig()
 PAIRS = set(itertools.combinations(range(5), 2))
 

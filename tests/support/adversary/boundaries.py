@@ -188,7 +188,11 @@ def _read_photograph(data: bytes, folder: Path) -> object:
     return Frame(0, "a.png", 0, found.image, found.intrinsics, mask=found.mask, **told)
 
 
-_CAPTURE = {"camera": {"kind": "folder", "folder": "photos"}, "spool": {"max_mb": 5}, "reader": {"silence_s": 1.0}}
+_CAPTURE = {
+    "camera": {"kind": "folder", "folder": "photos"},
+    "spool": {"max_mb": 5},
+    "reader": {"frame_timeout_s": 1.0},
+}
 _RECON = {"network": {"first_port": 5000}, "checkpoint": "state", "reconstruction": {"seed": 1, "max_gaussians": 9}}
 _MESSAGING, _EXPORT = "splatnode.capture.messaging", "splatnode.recon.result.export"
 _TRUE, _CAPTURE_ROOM = "splatnode.recon.evaluate", "splatnode.capture"

@@ -102,8 +102,11 @@ def unsigned(rng: random.Random, bits: int) -> int:
 
 
 def single(rng: random.Random) -> bytes:
-    """A float32: an edge number, or any bits at all."""
-    if rng.random() < 0.3:
+    """A float32: an edge number, a NaN that signals when it is computed with, or any bits at all."""
+    chance = rng.random()
+    if chance < 0.05:
+        return struct.pack("<I", rng.choice((0x7FA00000, 0x7F800001, 0xFFA00000)))
+    if chance < 0.3:
         return rng.randbytes(4)
     value = number(rng)
     return struct.pack("<f", value if not math.isfinite(value) or abs(value) < 3e38 else math.copysign(math.inf, value))

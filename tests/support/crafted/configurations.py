@@ -64,9 +64,7 @@ def configurations() -> Iterator[Crafted]:
         yield Crafted(f"{name}.yaml", text.encode(), name.replace("_", " "))
     for number, text in enumerate(NUMBERS + NUMBERS_OF_AGES):
         yield Crafted(f"number_{number}.yaml", f"camera: {{kind: synthetic, views: {text}}}".encode(), text[:20])
-        yield Crafted(
-            f"rate_{number}.yaml", f"camera: {{kind: synthetic, frames_per_second: {text}}}".encode(), text[:20]
-        )
+        yield Crafted(f"rate_{number}.yaml", f"camera: {{kind: synthetic, fps: {text}}}".encode(), text[:20])
     yield Crafted("zero_bytes.yaml", bytes(1000), "bytes that are no text")
     yield Crafted("latin.yaml", b"camera: \xff\xfe", "bytes that are no UTF-8")
 

@@ -11,6 +11,7 @@ export const SWITCHES = [
   ["uncertainty", "uncertainty", "7", true],
   ["graph", "graph of a map", "8", true],
   ["ground", "ground grid", "9", true],
+  ["given", "given poses", "0", true],
 ];
 
 const byId = (id) => document.getElementById(id);

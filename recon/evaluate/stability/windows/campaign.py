@@ -411,7 +411,7 @@ def _resume_rows(out: Path, plan: Plan, cores_each: int) -> list[WindowRow]:
     content = _read_content(path)
     begun = content.rows or (path.exists() and (out / _JOURNAL).exists())
     if begun and content.told != plan.told:
-        raise ValueError(f"{path} holds windows with --told {content.told}: give another folder with --out DIR")
+        raise ValueError(f"{path} holds windows with --known-lens {content.told}: give another folder with --out DIR")
     before = content.machine.get("threads")  # which each window had, before a row said so itself
     known = [row.cores or before for row in content.rows if row.seconds is not None]
     check_same_cores([cores for cores in known if cores], cores_each, path)
@@ -634,7 +634,7 @@ if __name__ == "__main__":
     main()
 
 
-# `splatnode stability --windows`.
+# `splatnode robustness --windows`.
 
 
 def run_windows_verb(args: argparse.Namespace) -> int:
@@ -644,10 +644,10 @@ def run_windows_verb(args: argparse.Namespace) -> int:
         find_method(method)
     plan = Plan(
         methods,
-        per_kind=args.per_kind,
+        per_kind=args.windows_per_kind,
         counts=args.counts,
-        told=args.told,
-        fresh=args.fresh,
+        told=args.known_lens,
+        fresh=args.no_cache,
         timeout_s=args.timeout_s,
         max_memory_mb=args.max_memory,
     )

@@ -1,6 +1,8 @@
 """COLMAP's sparse model: cameras, images, and the Gaussians' centres as points without tracks.
 
-The images are those at modelled size; the centre of the top-left pixel is at (0.5, 0.5), as in COLMAP.
+The images are those at modelled size; the centre of the top-left pixel is at (0.5, 0.5), as in COLMAP. Of several
+cameras there are rigs and frames, too, which COLMAP has since 3.12.
+Source of the formats: COLMAP's page on its output; the binary files as pycolmap 4.2 writes them.
 """
 
 from __future__ import annotations
@@ -10,9 +12,11 @@ from dataclasses import dataclass
 from struct import pack
 
 import numpy as np
+import numpy.typing as npt
 
 from splatnode.recon.result.export.prepare import compute_base_rgb, format_number_row, format_text_file
 from splatnode.recon.result.export.quaternions import quats_from_matrices
+from splatnode.recon.result.export.rigs import ExportedFrame, ExportedRig, find_rigs
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale
@@ -20,6 +24,7 @@ from splatnode.recon.result.verdict import RELATIVE, Scale
 DEFAULT_NAME = "colmap"
 
 _PINHOLE = 1  # COLMAP's number for the camera model
+_CAMERA = 0  # and for a sensor that is a camera
 _END_OF_NAME = bytes(1)
 _NO_POINTS2D = bytes(8)  # their number, as 64 bits
 _NO_ERROR, _NO_TRACK = 0.0, 0
@@ -40,35 +45,90 @@ def export(result: StoredResult) -> dict[str, bytes]:
 def encode_colmap(
     cameras: Sequence[CameraEstimate], gaussians: GaussianArrays, scale: Scale = RELATIVE
 ) -> dict[str, bytes]:
-    """The model's three files by name: as text, or in binary where a name has a space.
+    """The model's files by name: as text, or in binary where a name has a space.
 
-    At a space COLMAP, and all who read its text, would end the name. Images with the same calibration share a camera.
+    At a space COLMAP, and all who read its text, would end the name. Images with the same calibration share a camera,
+    if they are of one camera; of several cameras rigs and frames come with the three files.
     """
     calibrations = [(c.width, c.height, c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]) for c in cameras]
-    camera_ids = {calibration: i + 1 for i, calibration in enumerate(dict.fromkeys(calibrations))}
+    sensors = [(camera.camera_id, *calibration) for camera, calibration in zip(cameras, calibrations, strict=True)]
+    numbers = {sensor: i + 1 for i, sensor in enumerate(dict.fromkeys(sensors))}
+    camera_ids = {i: sensor[1:] for sensor, i in numbers.items()}
     images = [
-        _Image(number, _compute_motion(camera), camera_ids[calibration], camera.name)
-        for number, (camera, calibration) in enumerate(zip(cameras, calibrations, strict=True), 1)
+        _Image(number, _compute_motion(camera.T_world_camera), numbers[sensor], camera.name)
+        for number, (camera, sensor) in enumerate(zip(cameras, sensors, strict=True), 1)
     ]
+    rigged = _Rigged(*find_rigs(cameras, [image.camera_id for image in images])) if any(_ids(cameras)) else None
     colours = compute_base_rgb(gaussians)
     points = [
         (i, *mean, *colour)
         for i, (mean, colour) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
     ]
     if any(character.isspace() for camera in cameras for character in camera.name):
-        return _encode_binary(camera_ids, images, points)
-    return _encode_text(camera_ids, images, points, scale)
+        return _encode_binary(camera_ids, images, points) | (_pack_rigs(rigged, images) if rigged else {})
+    text = _encode_text(camera_ids, images, points, scale)
+    return text | (_format_rigs(rigged, images, scale) if rigged else {})
 
 
-def _compute_motion(camera: CameraEstimate) -> tuple[float, ...]:
-    T_camera_world = np.linalg.inv(camera.T_world_camera)
-    return (*quats_from_matrices(T_camera_world[:3, :3]), *T_camera_world[:3, 3])
+def _ids(cameras: Sequence[CameraEstimate]) -> list[str]:
+    return [camera.camera_id for camera in cameras]
+
+
+def _compute_motion(T_world_camera: npt.NDArray[np.float64]) -> tuple[float, ...]:
+    return _format_motion(np.asarray(np.linalg.inv(T_world_camera), np.float64))
+
+
+def _format_motion(T: npt.NDArray[np.float64]) -> tuple[float, ...]:
+    """A rigid motion (4, 4) as quaternion wxyz and translation."""
+    return (*quats_from_matrices(T[:3, :3]), *T[:3, 3])
+
+
+@dataclass(frozen=True)
+class _Rigged:
+    rigs: Sequence[ExportedRig]
+    frames: Sequence[ExportedFrame]
+
+
+def _format_rigs(rigged: _Rigged, images: Sequence[_Image], scale: Scale) -> dict[str, bytes]:
+    rig_lines = []
+    for number, rig in enumerate(rigged.rigs, 1):
+        (reference, _), *others = rig.sensors.items()
+        rest = (f" CAMERA {sensor} 1 {format_number_row(_format_motion(T))}" for sensor, T in others)
+        rig_lines.append(f"{number} {len(rig.sensors)} CAMERA {reference}{''.join(rest)}")
+    frame_lines = []
+    for number, frame in enumerate(rigged.frames, 1):
+        data = "".join(f" CAMERA {images[i].camera_id} {images[i].image_id}" for i in frame.images)
+        motion = format_number_row(_format_motion(frame.T_rig_world))
+        frame_lines.append(f"{number} {frame.rig + 1} {motion} {len(frame.images)}{data}")
+    rig_columns = (
+        "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (SENSOR_TYPE, SENSOR_ID, HAS_POSE, "
+    )
+    frame_columns = "FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW, QX, QY, QZ, TX, TY, TZ], NUM_DATA_IDS, DATA_IDS[] as "
+    return {
+        "rigs.txt": format_text_file(f"{rig_columns}[QW, QX, QY, QZ, TX, TY, TZ])", rig_lines, scale),
+        "frames.txt": format_text_file(f"{frame_columns}(SENSOR_TYPE, SENSOR_ID, DATA_ID)", frame_lines, scale),
+    }
+
+
+def _pack_rigs(rigged: _Rigged, images: Sequence[_Image]) -> dict[str, bytes]:
+    rigs, frames = [], []
+    for number, rig in enumerate(rigged.rigs, 1):
+        (reference, _), *others = rig.sensors.items()
+        packed = pack("<IIiI", number, len(rig.sensors), _CAMERA, reference)
+        rigs.append(
+            packed + b"".join(pack("<iI?7d", _CAMERA, sensor, True, *_format_motion(T)) for sensor, T in others)
+        )
+    for number, frame in enumerate(rigged.frames, 1):
+        packed = pack("<II7dI", number, frame.rig + 1, *_format_motion(frame.T_rig_world), len(frame.images))
+        data = (pack("<iIQ", _CAMERA, images[i].camera_id, images[i].image_id) for i in frame.images)
+        frames.append(packed + b"".join(data))
+    return {"rigs.bin": _pack_records(rigs), "frames.bin": _pack_records(frames)}
 
 
 def _encode_text(
-    camera_ids: dict[tuple, int], images: Sequence[_Image], points: Sequence[tuple], scale: Scale
+    camera_ids: dict[int, tuple], images: Sequence[_Image], points: Sequence[tuple], scale: Scale
 ) -> dict[str, bytes]:
-    camera_lines = [f"{i} PINHOLE {format_number_row(calibration)}" for calibration, i in camera_ids.items()]
+    camera_lines = [f"{i} PINHOLE {format_number_row(calibration)}" for i, calibration in camera_ids.items()]
     image_lines = [
         line
         for image in images
@@ -82,9 +142,9 @@ def _encode_text(
     }
 
 
-def _encode_binary(camera_ids: dict[tuple, int], images: Sequence[_Image], points: Sequence[tuple]) -> dict[str, bytes]:
+def _encode_binary(camera_ids: dict[int, tuple], images: Sequence[_Image], points: Sequence[tuple]) -> dict[str, bytes]:
     return {
-        "cameras.bin": _pack_records([pack("<IiQQ4d", i, _PINHOLE, *lens) for lens, i in camera_ids.items()]),
+        "cameras.bin": _pack_records([pack("<IiQQ4d", i, _PINHOLE, *lens) for i, lens in camera_ids.items()]),
         "images.bin": _pack_records(
             [
                 pack("<I7dI", image.image_id, *image.motion, image.camera_id)

@@ -11,7 +11,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from splatnode.recon.result.export.cameras import BOUNDS_MEANING, STAMP_MEANING, make_stamp_dict
+from splatnode.recon.result.export.cameras import (
+    BOUNDS_MEANING,
+    FRAME_SET_MEANING,
+    GIVEN_MEANING,
+    STAMP_MEANING,
+    make_given_dict,
+    make_stamp_dict,
+)
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate
@@ -27,8 +34,8 @@ def export(result: StoredResult) -> bytes:
     return encode_nerfstudio(result.cameras(), result.scale())
 
 
-def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
-    """The bytes of transforms.json."""
+def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE, points: str | None = None) -> bytes:
+    """The bytes of transforms.json; `points` is the file of the points to begin with, beside it, where there is one."""
     frames = [
         {
             "file_path": f"images/{camera.name}",
@@ -41,8 +48,21 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE
             "transform_matrix": (camera.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(),
             **make_stamp_dict(camera.captured_at),
             "bounds": None if camera.bounds is None else asdict(camera.bounds),
+            "camera_id": camera.camera_id or None,
+            "frame_set": camera.frame_set,
+            "given": _make_given_dict(camera),
         }
         for camera in cameras
     ]
-    meaning = {"stamp_ns": STAMP_MEANING, "bounds": BOUNDS_MEANING}
+    meaning = {"stamp_ns": STAMP_MEANING, "bounds": BOUNDS_MEANING, "frame_set": FRAME_SET_MEANING}
+    meaning |= {"given": GIVEN_MEANING} | ({} if points is None else {"ply_file_path": points})
     return json_bytes({"camera_model": "OPENCV", **meaning, "splatnode": scale.record(), "frames": frames})
+
+
+def _make_given_dict(camera: CameraEstimate) -> dict[str, object] | None:
+    """The pose that was given for a camera, with this file's axes."""
+    told = make_given_dict(camera)
+    if told is None or camera.given is None:
+        return None
+    told.pop("T_world_camera")
+    return {"transform_matrix": (camera.given.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(), **told}

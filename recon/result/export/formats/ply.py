@@ -90,12 +90,12 @@ def decode(data: bytes, name: str = "scene.ply") -> GaussianArrays:
     rows = np.frombuffer(data, dtype, num_gaussians, start)
 
     def columns(*names: str) -> np.ndarray:
-        with np.errstate(over="ignore"):  # what is infinite as a float32 is left out later
+        with np.errstate(all="ignore"):  # what is infinite or no number as a float32 is left out later
             return np.stack([rows[field].astype(np.float32) for field in names], 1)
 
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else np.zeros((num_gaussians, 0), np.float32)
     rest = rest.reshape(num_gaussians, 3, num_rest // 3).transpose(0, 2, 1)
-    with np.errstate(over="ignore"):
+    with np.errstate(all="ignore"):
         return GaussianArrays(
             means=columns("x", "y", "z"),
             quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),

@@ -90,6 +90,14 @@ def test_scenes_lie_where_exact_links_put_them():
     assert errors(at, [*chain(at), link(at, 0, NUM - 1, EdgeKind.LOOP)]).max() < 1e-6
 
 
+def test_it_does_not_matter_from_which_of_its_scenes_a_link_is_told():
+    at = worlds()
+    backwards = [link(at, j, i) for i, j in itertools.pairwise(range(NUM))]
+    assert errors(at, backwards).max() < 1e-6
+    mixed = [each if index % 2 else other for index, (each, other) in enumerate(zip(chain(at), backwards, strict=True))]
+    assert errors(at, mixed).max() < 1e-6
+
+
 def test_a_loop_takes_the_drift_of_scale_out_of_a_chain():
     at, rng = worlds(), np.random.default_rng(1)
     drifting = chain(at, rng, growth=0.01)

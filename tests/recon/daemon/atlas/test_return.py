@@ -69,7 +69,7 @@ def places_file(config) -> dict:
 
 @pytest.fixture
 def kidnapped(config):
-    return replace(config, lost_after=3)
+    return replace(config, new_submap_after=3)
 
 
 def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):

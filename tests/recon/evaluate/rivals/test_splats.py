@@ -83,7 +83,7 @@ def test_3dgs_starts_from_colmap_s_points(model):
     scene = colmap_3dgs.initialize_scene(model, 0)
     assert len(scene.gaussians) == len(model.points)
     assert [view.name for view in scene.views] == [each.frame.name for each in model.registered]
-    rates = colmap_3dgs.scale_rates_to_extent(colmap_3dgs.OPTIMIZE, scene).rates
+    rates = colmap_3dgs.scale_rates_to_extent(colmap_3dgs.OPTIMIZE, scene).lr
     centres = np.stack([each.T_world_camera[:3, 3] for each in model.registered])
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
     assert rates.means == pytest.approx(1.6e-4 * 1.1 * spread, rel=1e-5)

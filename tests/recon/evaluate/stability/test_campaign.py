@@ -165,7 +165,7 @@ def test_a_driver_that_is_killed_repeats_what_was_running_alone(tmp_path):
 def test_command_line():
     parse = build_parser().parse_args
     args = parse(
-        ["stability", "a", "b", "--rows", "1,7", "--seeds", "2", "--methods", "splatnode,colmap", "--out", "o"]
+        ["robustness", "a", "b", "--rows", "1,7", "--seeds", "2", "--methods", "splatnode,colmap", "--out", "o"]
     )
     assert (args.scenes, args.rows, args.seeds) == ([Path("a"), Path("b")], (1, 7), 2)
     assert args.methods == ("splatnode", "colmap") and args.cores is None and args.ray is None

@@ -10,6 +10,7 @@ import pytest
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.result.export import SceneFileError, export_scene, read_cameras
+from splatnode.recon.result.snapshot import GivenCameraPose
 from tests.support.exported import make_snapshot, stamped, write
 
 
@@ -98,3 +99,51 @@ def test_foreign_cameras_file_is_a_clear_error(tmp_path, content):
     (tmp_path / "cameras.json").write_text(content)
     with pytest.raises(SceneFileError, match="cameras.json"):
         read_cameras(tmp_path / "cameras.json")
+
+
+def test_two_cameras_of_one_name_are_a_clear_error(tmp_path):
+    """Files of all formats, and edits of scenes, know a camera by its name."""
+    write(make_snapshot(), tmp_path)
+    file = tmp_path / "cameras.json"
+    content = json.loads(file.read_text())
+    for camera in content["cameras"]:
+        camera["name"] = "same.png"
+    file.write_text(json.dumps(content))
+    with pytest.raises(SceneFileError, match=r"cameras\.json has two cameras of one name"):
+        read_cameras(file)
+
+
+def test_camera_ids_frame_sets_and_given_poses_read_back_exactly(tmp_path):
+    first, second = make_snapshot().cameras
+    T_given = first.T_world_camera.copy()
+    T_given[:3, 3] += [0.03, 0.0, 0.04]
+    first = replace(first, name="left/1.jpg", camera_id="left", frame_set=3, given=GivenCameraPose(T_given, 0.01, 0.5))
+    second = replace(second, name="right/1.jpg", camera_id="right", frame_set=3)
+    write(replace(make_snapshot(), cameras=(first, second)), tmp_path)
+    file = tmp_path / "cameras.json"
+    back = read_cameras(file)
+    assert [(each.name, each.camera_id, each.frame_set) for each in back] == [
+        ("left/1.jpg", "left", 3),
+        ("right/1.jpg", "right", 3),
+    ]
+    assert back[0].given is not None and np.array_equal(back[0].given.T_world_camera, T_given)
+    assert back[0].pose_residual == pytest.approx((0.05, 0.0), abs=1e-6) and back[1].given is None
+    told = json.loads(file.read_text())["cameras"][0]["given"]
+    assert (told["sigma_m"], told["sigma_deg"]) == (0.01, 0.5) and told["residual_m"] == pytest.approx(0.05)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert [(each["name"], round(each["residual_m"], 6)) for each in report["given_poses"]] == [("left/1.jpg", 0.05)]
+    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
+    assert (frame["camera_id"], frame["frame_set"]) == ("left", 3)
+    given = np.array(frame["given"]["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    assert np.allclose(given, T_given)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.png", "a//b.png", "left/../../a.png", "left/"])
+def test_a_name_leads_out_of_no_folder(tmp_path, name):
+    write(make_snapshot(), tmp_path)
+    file = tmp_path / "cameras.json"
+    content = json.loads(file.read_text())
+    content["cameras"][0]["name"] = name
+    file.write_text(json.dumps(content))
+    with pytest.raises(SceneFileError, match="a name must be that of a file"):
+        read_cameras(file)

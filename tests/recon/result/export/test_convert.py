@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians
+from splatnode.recon.result.export.result import write_beside
 from tests.support.exported import make_gaussians, make_snapshot, write
 
 
@@ -37,3 +38,20 @@ def test_export_of_what_is_not_there(tmp_path):
     (tmp_path / "scene.txt").write_text("text")
     with pytest.raises(SceneFileError, match="must end with"):
         export_scene(tmp_path / "scene.txt", "ply", tmp_path / "x.ply")
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_an_export_to_the_same_place_leaves_nothing_of_the_one_before(tmp_path, inside):
+    """COLMAP would read the binary files of an earlier scene in place of the text beside them."""
+    write(make_snapshot(), tmp_path / "out")
+    place = tmp_path / ("out/model" if inside else "model")
+    write_beside(place, {"cameras.bin": b"1", "images.bin": b"2", "points3D.bin": b"3"}, tmp_path / "out")
+    (place / "images.bin").write_bytes(b"mine")
+    export_scene(tmp_path / "out", "colmap", place)
+    assert sorted(path.name for path in place.iterdir() if path.suffix != ".json") == [
+        "cameras.txt",
+        "images.bin",
+        "images.txt",
+        "points3D.txt",
+    ]
+    assert (place / "images.bin").read_bytes() == b"mine"

@@ -105,7 +105,7 @@ def assert_same(one: object, other: object) -> None:
 def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkeypatch):
     """Of firm pairs and of weak ones, which tilted features are made for, and which are chosen by window."""
     config = ReconstructionConfig()
-    few = replace(config.matching.features, num_features=1000)
+    few = replace(config.matching.features, max_num_features=1000)
     matching = replace(config.matching, features=few, tilting=replace(config.matching.tilting, firm_matches=100))
     config = replace(config, matching=matching)
     keyframes = [prepare(frame, config) for frame in campaign.load_window_frames(place, window(place, 0, 1, 6))]

@@ -158,12 +158,12 @@ def test_windows_with_a_given_lens_and_without_are_not_mixed(tmp_path, monkeypat
     rows = run_windows(plan, places, tmp_path, "command", replace(on, answers=noted))
     assert json.loads(as_it_works[0])["told"] == "nothing", "the file says of what the journal is"
     before = (tmp_path / "windows.json").read_bytes()
-    with pytest.raises(ValueError, match=r"windows\.json holds windows with --told nothing"):
+    with pytest.raises(ValueError, match=r"windows\.json holds windows with --known-lens nothing"):
         run_windows(replace(plan, told="given"), places, tmp_path, "command", on)
     assert (tmp_path / "windows.json").read_bytes() == before
     (tmp_path / "windows.json").write_bytes(as_it_works[0])  # as a killed process leaves it: all is in the journal
     (tmp_path / "windows.jsonl").write_text(f"{json.dumps(json.loads(before)['rows'][1])}\n")
-    with pytest.raises(ValueError, match="with --told nothing"):
+    with pytest.raises(ValueError, match="with --known-lens nothing"):
         run_windows(replace(plan, told="given"), places, tmp_path, "command", on)
     assert run_windows(plan, places, tmp_path, "command", on)[1] == rows[1]
 
@@ -270,6 +270,6 @@ def test_charts(tmp_path):
 
 
 def test_command_line():
-    command = ["stability", "a", "--windows", "--per-kind", "3", "--fresh", "--cores", "2", "--out", "o"]
+    command = ["robustness", "a", "--windows", "--windows-per-kind", "3", "--no-cache", "--cores", "2", "--out", "o"]
     args = build_parser().parse_args(command)
-    assert (args.windows, args.per_kind, args.fresh, args.methods, args.cores) == (True, 3, True, None, 2)
+    assert (args.windows, args.windows_per_kind, args.no_cache, args.methods, args.cores) == (True, 3, True, None, 2)

@@ -15,6 +15,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.capture.lenses.lens import project
 from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.recon.pipeline import _add_given_lenses
 from tests.support.exported import make_snapshot, write
 
 WIDTH, HEIGHT = 1024, 768
@@ -89,3 +90,59 @@ def test_without_its_photographs_there_is_none(tmp_path, capsys, damage, said):
     assert command_line.main(["export", str(folder), "--to", "dataset"]) != 0
     told = capsys.readouterr().err
     assert said in told and told.count("\n") == 1 and not (folder / "dataset").exists()
+
+
+def test_nerfstudio_finds_the_points(tmp_path):
+    """Where nerfstudio looks, in the world of its cameras; Open3D, by which it reads, takes these properties."""
+    folder = result(tmp_path, ("a.png", "b.jpg"))
+    assert command_line.main(["export", str(folder), "--to", "dataset"]) == 0
+    content = json.loads((folder / "dataset" / "transforms.json").read_text())
+    assert content["ply_file_path"] == "sparse_pc.ply"
+    data = (folder / "dataset" / content["ply_file_path"]).read_bytes()
+    head, _, body = data.partition(b"end_header\n")
+    assert head.decode().splitlines() == [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(make_snapshot().gaussians)}",
+        *(f"property float {name}" for name in "xyz"),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+    ]
+    rows = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    model = (folder / "dataset" / "sparse" / "0" / "points3D.txt").read_text().splitlines()
+    told = np.array([line.split()[1:7] for line in model if not line.startswith("#")], float)
+    assert np.allclose(rows["xyz"], told[:, :3], atol=1e-5) and np.array_equal(rows["rgb"], told[:, 3:])
+
+
+def test_photographs_of_several_cameras_lie_in_their_folders(tmp_path):
+    folder = tmp_path / "out"
+    (folder / "images" / "left").mkdir(parents=True)
+    (folder / "images" / "right").mkdir()
+    result(folder, ("left/1.png", "right/1.png"))
+    assert command_line.main(["export", str(folder), "--to", "dataset"]) == 0
+    frames = json.loads((folder / "dataset" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["images/left/1.png", "images/right/1.png"]
+    assert all((folder / "dataset" / frame["file_path"]).is_file() for frame in frames)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [replace(LENS, source="given"), replace(LENS, source="given", distortion=(), fy=760.0)],
+    ids=["distortion", "pixels that are not square"],
+)
+def test_a_lens_that_was_given_is_taken_out_and_told(tmp_path, given):
+    """cameras.json has K of the picture as it was modelled; the two focal lengths that were given stay two numbers."""
+    folder = tmp_path / "out"
+    (folder / "images").mkdir(parents=True)
+    (folder / "images" / "a.png").write_bytes(encode_png(photograph(given)))
+    frame = Frame(0, "a.png", 0, photograph(given), given)
+    camera, *_ = make_snapshot().cameras
+    pinhole = undistort_frame(frame).intrinsics.resized(camera.width, camera.height)
+    snapshot = replace(make_snapshot(), cameras=(replace(camera, name="a.png", K=pinhole.K),))
+    write(_add_given_lenses(snapshot, [frame]), folder)
+    told = json.loads((folder / "cameras.json").read_text())["cameras"][0]
+    assert (told["given_lens"]["fx"], told["given_lens"]["fy"]) == (given.fx, given.fy) and told["lens"] is None
+    assert command_line.main(["export", str(folder), "--to", "dataset"]) == 0
+    (shown,) = json.loads((folder / "dataset" / "transforms.json").read_text())["frames"]
+    image = decode_image((folder / "dataset" / shown["file_path"]).read_bytes())[0]
+    seen = RAYS[:, :2] * [shown["fl_x"], shown["fl_y"]] + [shown["cx"], shown["cy"]]
+    assert np.abs(spots(image) - seen[np.argsort(seen[:, 1])]).max() < 0.3

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export import SceneFileError
+from splatnode.recon.result.export import SceneFileError, read_gaussians
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians, compute_ply_bytes, encode_ply
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
 from splatnode.recon.result.snapshot import GaussianArrays
@@ -86,3 +88,16 @@ def test_ply_of_another_program_may_have_another_order_and_more_properties():
 def test_damaged_or_foreign_ply_is_a_clear_error(damage, message):
     with pytest.raises(SceneFileError, match=message):
         decode_ply(damage(encode_ply(make_gaussians())), "scene.ply")
+
+
+@pytest.mark.parametrize("bits", [0x7FA00000, 0xFFA00000, 0x7F800001, 0x7F7FFFFF])
+def test_a_number_that_signals_is_no_warning(tmp_path, bits):
+    head, body = encode_ply(make_gaussians(3)).split(b"end_header\n")
+    row = len(body) // 3
+    odd = np.full(row // 4, bits, "<u4").tobytes()
+    path = tmp_path / "scene.ply"
+    path.write_bytes(head + b"end_header\n" + body[:row] + odd + body[2 * row :])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(decode_ply(path.read_bytes())) == 3
+        assert len(read_gaussians(path)) == 2

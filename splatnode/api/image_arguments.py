@@ -1,0 +1,101 @@
+"""Lens, pose, motion and gravity of one image, as a program gives them, as the records that a frame has."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Intrinsics
+from splatnode.capture.odometry import (
+    GRAVITY_SIGMA_DEG,
+    MOTION_DRIFT,
+    MOTION_SIGMA_DEG,
+    MOTION_SIGMA_M,
+    SIGMA_DEG,
+    SIGMA_M,
+    GivenPose,
+    Gravity,
+    Motion,
+    make_given_pose,
+)
+
+Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
+Sigmas: TypeAlias = "tuple[float, float]"  # metres and degrees
+
+
+def make_intrinsics(lens: Lens, width: int, height: int) -> Intrinsics:
+    """Returns the lens of an image of this size: as it is, or a pinhole of a matrix K (3, 3) in its pixels.
+
+    Raises TypeError, ValueError.
+    """
+    if isinstance(lens, Intrinsics):
+        return lens
+    K = np.asarray(lens, np.float64) if isinstance(lens, (np.ndarray, list, tuple)) else None
+    if K is None or K.shape != (3, 3):
+        shape = type(lens).__name__ if K is None else str(K.shape)
+        raise TypeError(f"intrinsics must be splatnode.Intrinsics or a matrix K (3, 3), got {shape}")
+    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Intrinsics(width, height, fx, fy, cx, cy, source="given")
+
+
+def make_pose(
+    pose: npt.ArrayLike | None, sigma: Sigmas | None, usual: Sigmas = (SIGMA_M, SIGMA_DEG)
+) -> GivenPose | None:
+    """Returns the pose T_world_camera (4, 4), metres, of an image; None without one. `sigma` None: as `usual`.
+
+    Raises TypeError, ValueError.
+    """
+    if pose is None:
+        if sigma is not None:
+            raise ValueError("pose_sigma says how unsure a pose is: give pose, too")
+        return None
+    sigmas = usual if sigma is None else parse_sigmas(sigma, "pose_sigma")
+    return make_given_pose(np.asarray(pose, np.float64), *sigmas)
+
+
+def append_motion(
+    before: Motion | None,
+    name: str,
+    step: npt.ArrayLike | None,
+    sigma: Sigmas | None,
+    drift: float = MOTION_DRIFT,
+    sigma_deg: float = MOTION_SIGMA_DEG,
+) -> Motion:
+    """Returns the motions up to the image `name`: with one `step` more, T_previous_current (4, 4), metres.
+
+    Without a step a chain begins with the image. `sigma` None: `drift` times the length of the step, and `sigma_deg`.
+    Raises TypeError, ValueError.
+    """
+    if step is None:
+        if sigma is not None:
+            raise ValueError("motion_sigma says how unsure a motion is: give motion, too")
+        return Motion(name)
+    if before is None:
+        raise ValueError("motion is that since the photograph before: the first one has none")
+    moved = np.asarray(step, np.float64)
+    if moved.shape != (4, 4):
+        raise TypeError(f"motion must be T_previous_current (4, 4) or None, got shape {moved.shape}")
+    usual = max(drift * float(np.linalg.norm(moved[:3, 3])), MOTION_SIGMA_M), sigma_deg
+    return before.append_step(moved, *(usual if sigma is None else parse_sigmas(sigma, "motion_sigma")))
+
+
+def make_gravity(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravity | None:
+    """Returns the direction of down (3,) in the camera's frame; None without one. Raises TypeError, ValueError."""
+    if gravity is None:
+        if sigma_deg is not None:
+            raise ValueError("gravity_sigma says how unsure gravity is: give gravity, too")
+        return None
+    down = np.asarray(gravity, np.float64)
+    if down.shape != (3,):
+        raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
+    x, y, z = down.tolist()
+    return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))
+
+
+def parse_sigmas(sigmas: Any, what: str) -> Sigmas:
+    """Returns two standard deviations, metres and degrees. Raises TypeError; `what` is the argument."""
+    if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
+        raise TypeError(f"{what} must be metres and degrees, (0.01, 2.0), got {sigmas!r}")
+    return float(sigmas[0]), float(sigmas[1])

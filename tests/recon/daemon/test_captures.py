@@ -1,0 +1,254 @@
+"""Several captures beside one recon: order of time, frame sets, an answer to each, and none is lost by a kill."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.messaging.network import AlreadyRunning, Network, find_captures
+from splatnode.capture.messaging.spool import Spool, SpoolConfig
+from splatnode.capture.process.logs import Problems
+from splatnode.capture.rig import form_frame_sets
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.daemon import captures, ingest
+from splatnode.recon.daemon.captures import FrameSetConfig, FrameSetQueue, WaitingFrame
+from splatnode.recon.daemon.checkpoint.records import read_frame
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
+from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
+from splatnode.recon.daemon.worker import number_frame_sets
+from tests.capture.messaging.test_sockets import wait_for
+from tests.conftest import ROOT
+from tests.support.three_captures import STEP_NS, install_camera
+
+IMAGE = np.zeros((12, 16, 3), np.uint8)
+IDS = ("left", "middle", "right")
+CLIENT = SimpleNamespace(served=True)
+
+
+def frame(camera_id: str, ms: int | None) -> Frame:
+    at = None if ms is None else Stamp(ms * 1_000_000, Clock.UTC)
+    return Frame(0, f"{camera_id}_{ms}", 0, IMAGE, None, captured_at=at, camera_id=camera_id)
+
+
+def waiting(item, arrived_s=0.0, client=CLIENT) -> WaitingFrame:
+    return WaitingFrame(client, ReceivedFrame("0" * 32, 0, item), arrived_s)
+
+
+def take_all(queue: FrameSetQueue, now_s: float) -> list[list[str]]:
+    found = []
+    while together := queue.take(now_s):
+        found.append([each.received.frame.name for each in together])
+    return found
+
+
+def test_frames_come_in_the_order_of_their_times_and_those_taken_together_as_one():
+    queue = FrameSetQueue(FrameSetConfig(tolerance_s=0.02, wait_s=0.3))
+    for camera_id, ms in (("right", 105), ("right", 305), ("left", 100), ("left", 200), ("left", 300)):
+        queue.add(waiting(frame(camera_id, ms)))
+    assert take_all(queue, 0.0) == [["left_100", "right_105"], ["left_200"], ["left_300", "right_305"]]
+
+
+def test_a_frame_waits_for_the_other_cameras_and_no_longer_than_it_is_told():
+    queue = FrameSetQueue(FrameSetConfig(wait_s=0.3))
+    queue.add(waiting(frame("left", 100)))
+    assert take_all(queue, 0.0) == [["left_100"]]  # no other camera is known: it does not wait
+    queue.add(waiting(frame("right", 100), 0.1))
+    queue.add(waiting(frame("right", 200), 0.2))
+    assert take_all(queue, 0.2) == []  # left may still send one of that time
+    assert take_all(queue, 0.45) == [["right_100"]]
+    queue.add(waiting(frame("left", 210), 0.46))
+    assert take_all(queue, 0.46) == [["right_200", "left_210"]]
+    queue.add(waiting(frame("right", 9000), 9.0))
+    assert take_all(queue, 9.0) == [["right_9000"]]  # left has been silent for long
+
+
+def test_frames_wait_until_captures_that_were_just_found_have_sent_something():
+    queue = FrameSetQueue(FrameSetConfig())
+    queue.add(waiting(frame("left", 100)))
+    assert queue.take(0.5, complete=False) == [] and take_all(queue, 0.5) == [["left_100"]]
+
+
+def test_what_has_no_camera_or_no_time_is_alone_and_waits_for_nobody():
+    queue = FrameSetQueue(FrameSetConfig())
+    for item in (frame("left", 100), frame("", 100), frame("right", None), DroppedFrame("x", "for the test")):
+        queue.add(waiting(item))
+    assert [each for each in take_all(queue, 0.1) if len(each) > 1] == []
+    assert take_all(queue, 1.0) == [["left_100"]]
+
+
+def test_what_another_recon_is_served_now_is_forgotten():
+    queue, client = FrameSetQueue(FrameSetConfig()), SimpleNamespace(served=True)
+    queue.add(waiting(frame("left", 100), client=client))
+    client.served = False
+    assert queue.take(1.0) == []
+
+
+def test_a_frame_set_goes_into_the_map_together():
+    inbox, stopping = Inbox(), threading.Event()
+    keyframes = [ArrivedKeyframe(None, 0.0, number) for number in (0, 0, 0, 1, 1, 1)]  # pyright: ignore
+    inbox.enqueue_together(keyframes[:3], stopping)
+    inbox.enqueue_together(keyframes[3:], stopping)
+    inbox.enqueue_now(RemovedFrame("x"))
+    assert [getattr(each, "frame_set", None) for each in inbox.dequeue(0)] == [0, 0, 0, 1, 1, 1]
+    stored = [SimpleNamespace(name=each.name, frame=each) for each in
+              (frame("left", 0), frame("left", 100), frame("right", 5), frame("", 0), frame("right", 101))]  # fmt: skip
+    again = number_frame_sets(stored, 0.02)
+    names = [each.keyframe.frame.name for each in again]
+    assert names == ["left_0", "right_5", "left_100", "right_101", "_0"]
+    assert again[0].frame_set == again[1].frame_set != again[2].frame_set == again[3].frame_set
+    assert again[4].frame_set is None
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Keyframes need no features."""
+    monkeypatch.setattr(ingest, "prepare", lambda each, _: SimpleNamespace(name=each.name, frame=each))
+
+
+def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain, monkeypatch):
+    monkeypatch.setattr(captures, "CONNECT_S", 30.0)  # a busy machine connects them one by one
+    patient = FrameSetConfig(wait_s=30.0)
+    network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
+    with ExitStack() as resources:
+        servers = {
+            each: resources.enter_context(
+                KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "state"), each), each)
+            )
+            for each in IDS
+        }
+        assert find_captures(network) == sorted(IDS)
+        with pytest.raises(AlreadyRunning, match="capture.keyframes@left is offered .* camera_id of their own"):
+            KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "other"), "left"), "left")
+        for ms in range(0, 600, 200):
+            for offset, (camera_id, server) in enumerate(servers.items()):
+                server.offer(frame(camera_id, ms + offset))
+        store = Store(tmp_path / "checkpoint")
+        resources.callback(store.close)
+        intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping, patient)
+        thread = threading.Thread(target=intake.run)
+        thread.start()
+        found: list = []
+
+        def come():
+            for server in servers.values():
+                server.serve(0.01)
+            found.extend(inbox.dequeue(0))
+            return len(found) == 9 and not any(server.num_queued for server in servers.values())
+
+        try:
+            wait_for(come, 30.0)
+        finally:
+            stopping.set()
+            thread.join()
+    assert [each.keyframe.name for each in found] == [
+        f"{c}_{ms + i}" for ms in (0, 200, 400) for i, c in enumerate(IDS)
+    ]
+    assert [each.frame_set for each in found] == [0, 0, 0, 3, 3, 3, 6, 6, 6]
+    assert {server.acknowledged for server in servers.values()} == {3}
+
+
+def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path):
+    store = Store(tmp_path / "checkpoint")
+    for number, each in enumerate([frame("left", 100), frame("right", 105), frame("left", 300), frame("", 100)]):
+        store.add_frame(ReceivedFrame("0" * 32, number, each))
+    inbox = Inbox()
+    node = SimpleNamespace(
+        _store=store,
+        _inbox=inbox,
+        _config=DaemonConfig(),
+        _worker=SimpleNamespace(find_inactive_scenes=lambda name: []),
+        _remove_keyframe=lambda name: Daemon._remove_keyframe(node, name),
+    )
+    answer = Daemon._answer(node, RemoveKeyframe("right_105"))
+    assert answer.done and answer.message.endswith("with it left_100, taken at the same time")
+    assert store.names == {"left_300", "_100"}
+    assert Daemon._answer(node, RemoveKeyframe("left_300")).message == (
+        "left_300 is removed; the scene is built anew without it"
+    )
+    assert not Daemon._answer(node, RemoveKeyframe("right_105")).done
+    store.close()
+
+
+class Node:
+    """Three captures and the receiving half of recon, each a process that can be killed and started again."""
+
+    def __init__(self, folder: Path, seconds: float) -> None:
+        self.folder, self.until_s = folder, round(time.time() + seconds)
+        install_camera(folder / "packages")
+        self.environment = os.environ | {"PYTHONPATH": f"{folder / 'packages'}:{ROOT}"}
+        self.processes: dict[str, subprocess.Popen] = {}
+        for seed, each in enumerate(IDS):
+            (folder / f"{each}.yaml").write_text(
+                f"camera: {{kind: grid, until_s: {self.until_s}, seed: {seed}}}\n"
+                "selection: {every_frame: true}\npreview: {per_second: 0}\n"
+                f"spool: {{directory: {folder / 'state'}}}\nnetwork: {{directory: {folder / 'run'}}}\n"
+            )
+
+    def start(self, name: str) -> None:
+        if name == "recon":
+            command = ["-m", "tests.support.three_captures", str(self.folder / "run"), str(self.folder / "checkpoint")]
+        else:
+            command = ["-m", "splatnode", "capture", str(self.folder / f"{name}.yaml"), "--camera-id", name]
+        with open(self.folder / f"{name}.log", "a") as log:
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, *command], cwd=ROOT, env=self.environment, stderr=log
+            )
+
+    def kill(self, name: str) -> None:
+        self.processes[name].send_signal(signal.SIGKILL)
+        self.processes[name].wait()
+
+    def spooled(self) -> set[str]:
+        """Names of the keyframes that the captures have promised to keep."""
+        logs = "".join((self.folder / f"{each}.log").read_text() for each in IDS)
+        return set(re.findall(r"event=keyframe name=(\S+_\d+)\s", logs))
+
+    @property
+    def is_drained(self) -> bool:
+        return not list((self.folder / "state").glob("spool-*/*.frame"))
+
+
+def test_three_captures_survive_a_kill_of_each_in_turn_and_lose_nothing(tmp_path):
+    node, victims = Node(tmp_path, seconds=45.0), ("left", "recon", "middle", "right", "recon")
+    for each in (*IDS, "recon"):
+        node.start(each)
+    try:
+        wait_for(lambda: len(node.spooled()) >= 9)
+        for victim in victims:
+            before = len(node.spooled())
+            node.kill(victim)
+            node.start(victim)
+            wait_for(lambda before=before: len(node.spooled()) >= before + 12)
+        wait_for(lambda: time.time() > node.until_s + 1)
+        wait_for(lambda: node.is_drained)
+    finally:
+        for process in node.processes.values():
+            process.kill()
+            process.wait()
+    paths = sorted((tmp_path / "checkpoint" / "frames").glob("*.frame"))
+    stored = [each for each in map(read_frame, paths) if each.frame.name.rpartition("_")[2].isdecimal()]
+    assert len({each.key for each in stored}) == len(stored)  # none twice
+    assert {each.frame.name for each in stored} >= node.spooled()  # none lost
+    for camera_id in IDS:
+        taken = [each.frame.captured_at.ns for each in stored if each.frame.camera_id == camera_id]
+        assert taken == sorted(taken) and len(set(taken)) == len(taken) > 20
+    sets = form_frame_sets([(each.frame.name, each.frame.camera_id, each.frame.captured_at) for each in stored])
+    assert all(len({name.rpartition("_")[2] for name in each.names.values()}) == 1 for each in sets)
+    assert len(sets) == len({each.frame.captured_at.ns // STEP_NS for each in stored})
+    assert sum(len(each.names) == 3 for each in sets) > 20
