@@ -104,9 +104,9 @@ class Registration:
 
     @property
     def image_part(self) -> Registration:
-        """Returns it without the cameras that the rig alone places, of which images tell nothing."""
+        """Returns it without its rig and the cameras that the rig alone places, of which images tell nothing."""
         placed = () if self.rig is None else self.rig.placed
-        return replace(self, cameras=tuple(camera for camera in self.cameras if camera.index not in placed))
+        return replace(self, cameras=tuple(each for each in self.cameras if each.index not in placed), rig=None)
 
 
 def register(

@@ -23,6 +23,9 @@ Array = npt.NDArray[np.float64]
 LEAST_PROBABILITY = 1e-5  # of a false alarm, as of given poses
 STIFF_TURN = np.radians(0.005)  # by which cameras of a rig turn against each other in use: nothing is stiffer
 STIFF_SHIFT = 2e-4  # and shift, as a share of the distance to the scene
+MOST_SCATTER_TURN = np.radians(1.0)  # of a frame set: a camera that turns more is on an arm, and on no rig
+MOST_SCATTER_SHIFT = 0.03  # likewise, as a share of the distance to the scene
+_LEAST_RUN = 4  # frame sets that a camera stands still, in the mean, if it moves on its rig now and then
 _MEDIAN_OF_CHI2_3 = 2.366
 _ENOUGH_DIFFERENCES = 4  # between sets, to know how much their measurements scatter
 
@@ -117,6 +120,17 @@ def compare(one: tuple[Array, Array, Array], other: tuple[Array, Array, Array]) 
     turn = Rotation.from_matrix(one[0] @ other[0].T).as_rotvec()
     error = np.concatenate([turn, one[1] - other[1]])
     return float(chi2.sf(error @ np.linalg.solve(one[2] + other[2], error), 6))
+
+
+def is_mounted(poses: RelativePoses, distance: float) -> bool:
+    """Whether a camera is on a rig with the reference: it stands still to it, or moves once and again, as by a blow.
+
+    A camera on an arm moves all the time. `distance` is that to the scene.
+    """
+    if poses.scatter[0] > MOST_SCATTER_TURN**2 or poses.scatter[1] > (MOST_SCATTER_SHIFT * distance) ** 2:
+        return False
+    parts, count = find_mounts(poses), len(poses.sets)
+    return len(parts[0]) > 1 and (2 * len(parts[0]) > count or _LEAST_RUN * len(parts) <= count)
 
 
 def find_mounts(poses: RelativePoses) -> list[list[int]]:

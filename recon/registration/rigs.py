@@ -35,6 +35,8 @@ class Mount:
     covariance: Array  # (6, 6) of its turn in the rig's axes, radians, and of its centre; 0 of the rig's own camera
     sets: tuple[int, ...]  # numbers of the frame sets that have it so
     given: bool  # whether what was given holds it, too
+    # Standard deviations of a single frame set from it, in each direction: of the turn, radians, and of the centre
+    scatter: tuple[float, float] = (0.0, 0.0)
 
     @property
     def sigma_deg(self) -> float:
@@ -71,6 +73,11 @@ class RigEstimate:
     scale_sigma: float  # standard deviation of its logarithm
     placed: tuple[int, ...]  # keyframes that the rig alone places
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether all is known that is claimed of the mounts."""
+        return all(np.isfinite(m.covariance).all() and np.isfinite(m.T_rig_camera).all() for m in self.mounts)
+
     def rescale(self, unit: float) -> RigEstimate:
         """Returns it in a world whose unit is `unit` of this one's."""
         by = np.diag([1.0] * 3 + [1.0 / unit] * 3)
@@ -78,7 +85,8 @@ class RigEstimate:
         for mount in self.mounts:
             T = mount.T_rig_camera.copy()
             T[:3, 3] /= unit
-            mounts.append(replace(mount, T_rig_camera=T, covariance=by @ mount.covariance @ by))
+            scatter = mount.scatter[0], mount.scatter[1] / unit
+            mounts.append(replace(mount, T_rig_camera=T, covariance=by @ mount.covariance @ by, scatter=scatter))
         changes = tuple(replace(change, shift=change.shift / unit) for change in self.changes)
         metres = None if self.metres_per_unit is None else self.metres_per_unit * unit
         return replace(self, mounts=tuple(mounts), changes=changes, metres_per_unit=metres)
@@ -141,11 +149,15 @@ def adjust_with_rig(
     estimate = replace(estimate, rig=constraint)
     estimate = bundle_adjustment.adjust(estimate, found.prior, found.loss, found.views[0])
     adjusted = replace(found, estimate=estimate)
-    return adjusted, _describe(adjusted, sets, labels, measured, reference, given)
+    told_of_rig = _describe(adjusted, sets, labels, measured, reference, given)
+    return (adjusted, told_of_rig) if told_of_rig.is_finite else None
 
 
 def _measure(found: Map, sets: _Sets, joint: Array, distance: float) -> dict[tuple[str, str], RelativePoses]:
-    """The relative poses of each ordered pair of cameras, as unsure as they scatter, no surer than rigs are stiff."""
+    """The relative poses of each ordered pair of cameras that are on one rig.
+
+    They are as unsure as they scatter, and no surer than rigs are stiff.
+    """
     ids = sorted({camera for views in sets.views for camera in views})
     measured = {}
     for first in ids:
@@ -156,7 +168,9 @@ def _measure(found: Map, sets: _Sets, joint: Array, distance: float) -> dict[tup
             poses = rig_poses.measure_relative_poses(found.estimate, joint, pairs)
             if len(poses.sets) >= _LEAST_SETS:
                 stiff = poses.widen(rig_poses.STIFF_TURN**2, (rig_poses.STIFF_SHIFT * distance) ** 2)
-                measured[first, other] = stiff.widen(*rig_poses.estimate_scatter(stiff))
+                scattered = stiff.widen(*rig_poses.estimate_scatter(stiff))
+                if rig_poses.is_mounted(scattered, distance):
+                    measured[first, other] = scattered
     return measured
 
 
@@ -249,7 +263,9 @@ def _describe(
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = rig.mount_rotations[at].T, -rig.mount_rotations[at].T @ rig.mount_translations[at]
         is_held = bool(np.isfinite(rig.given_sigmas[at]).any())
-        mounts.append(Mount(camera, T, covariances[at], own, is_held))
+        tied = rig.sigmas[rig.mount_of_camera == at]
+        scatter = (float(tied[0, 0]), float(tied[0, 1])) if len(tied) else (0.0, 0.0)
+        mounts.append(Mount(camera, T, covariances[at], own, is_held, scatter))
     told = {}
     for mount in mounts[1:]:
         told.setdefault(mount.camera_id, (mount.T_rig_camera[:3, :3], mount.T_rig_camera[:3, 3], mount.covariance))

@@ -49,9 +49,10 @@ def compute_placed_bounds(
 
 
 def _mount_bounds(mounts: tuple[Mount, ...]) -> tuple[float, float]:
-    """Degrees and a length: the largest of all mounts."""
+    """Degrees and a length: the largest of all mounts, with how much single frame sets scatter about them."""
     wide = _TWO_SIDED_95 * np.sqrt(3.0)
-    return wide * max(mount.sigma_deg for mount in mounts), wide * max(mount.sigma for mount in mounts)
+    turn = max(float(np.hypot(mount.sigma_deg, np.degrees(mount.scatter[0]))) for mount in mounts)
+    return wide * turn, wide * max(float(np.hypot(mount.sigma, mount.scatter[1])) for mount in mounts)
 
 
 def describe_rig(verdict: Verdict, graph: ViewGraph, rig: RigEstimate) -> Verdict:
