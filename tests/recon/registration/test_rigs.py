@@ -16,7 +16,7 @@ from splatnode.capture.frame import Frame, Stamp
 from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.registration import bundle_adjustment
+from splatnode.recon.registration import bundle_adjustment, rigs
 from splatnode.recon.registration.incremental_mapper import Map
 from splatnode.recon.registration.rig_constraint import RigConstraint
 from splatnode.recon.registration.rigs import Mount, RigEstimate, adjust_with_rig
@@ -105,6 +105,7 @@ def make_drive(
     moved: tuple[str, float, float] = ("left", 2.0, 0.0),  # degrees and metres
     unit: float = 2.0,  # metres that the map's unit has
     late_m: float = 0.0,  # by which a camera's image is taken elsewhere, to and fro
+    arm_deg: float = 0.0,  # by which a camera is turned further from set to set
     seed: int = 0,
 ) -> tuple[Map, list[Keyframe], np.ndarray]:
     """The map, its keyframes, and the true T_world_camera of each, metres."""
@@ -122,6 +123,8 @@ def make_drive(
                 T[0, 3] += moved[2]
             if camera_id == "right":
                 T[0, 3] += late_m * generator.normal()
+                turn = Rotation.from_euler("y", arm_deg * np.sin(2.0 * index), degrees=True).as_matrix()
+                T[:3, :3] = T[:3, :3] @ turn
             Ts.append(T)
             stamp = Stamp(index * 500_000_000, StampClock.RECORDING)
             frame = Frame(
@@ -232,6 +235,20 @@ def test_cameras_that_are_not_triggered_together_make_the_rig_less_sure_and_name
     assert not late.changes
     sigmas = [{m.camera_id: m.sigma for m in rig.mounts} for rig in (sure, late)]
     assert sigmas[1]["right"] > 2.0 * sigmas[0]["right"]
+
+
+@pytest.mark.parametrize("num_sets", [3, 4, 8])
+def test_a_camera_on_an_arm_is_on_no_rig_and_did_not_move_on_it(num_sets: int) -> None:
+    found, keyframes, _ = make_drive(num_sets, arm_deg=6.0)
+    rig = find_rig(found, keyframes)[1]
+    assert not rig.changes
+    assert {mount.camera_id for mount in rig.mounts} == {"front", "left"}
+
+
+def test_nothing_is_claimed_of_a_rig_whose_numbers_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, keyframes, _ = make_drive(3)
+    monkeypatch.setattr(rigs, "_mount_covariances", lambda adjusted: np.full((3, 6, 6), np.nan))
+    assert adjust_with_rig(found, keyframes, None, TOLERANCE_S) is None
 
 
 def test_a_known_rig_tells_metres_within_their_interval() -> None:
