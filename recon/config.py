@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin, build_config, merge_config, replace_former_names
 from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.rig import TOLERANCE_S
@@ -29,9 +30,10 @@ from splatnode.recon.verification import decision, evidence
 
 
 class PriorChoice(Plugin):
-    """A module of recon/priors, which gives depth, and matches that plain features miss."""
+    """A module of recon/priors, or one beside it, which gives depth, and matches that plain features miss."""
 
     package = "splatnode.recon.priors"
+    group = plugins.PRIORS
     needs = ("Config", "load")
     usual = "classical"
 

@@ -24,7 +24,6 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose, group_frame_sets
 from splatnode.capture.lens_file import Lenses, describe_image
-from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, mask_frames, open_masks
 from splatnode.capture.multi_camera import ALL as EVERY_CAMERA
 from splatnode.capture.multi_camera import CameraSet, select_cameras
@@ -306,13 +305,9 @@ def _check_there(request: Request) -> None:
         raise FileNotFoundError(
             f"{str(path)!r} is not there; give a folder that holds photographs, a video, or an MCAP file"
         )
-    if path.is_dir() and data_set.is_data_set(path):
-        first = data_set.list_parts(path)[0]
-        raise ValueError(
-            f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
-            f"{str(film.part_of(path, first))!r}, or an episode with --cameras all, or give it to `splatnode batch`, "
-            "which takes them all"
-        )
+    found = film.find_reader(path) if path.is_dir() else None
+    if found is not None and (why := found[1].explain_many(path)) is not None:
+        raise ValueError(why)
 
 
 def _list_photographs(request: Request) -> Sequence[str]:

@@ -41,12 +41,12 @@ def choose_rig(file: Path | None, cameras: CameraSet | None, tell: Tell) -> Rig 
     """
     if file is not None:
         return read_rig(file)
-    if cameras is None or not cameras.is_one_log:
-        return None
     try:
-        told = cameras.read_rig()
+        told = None if cameras is None else cameras.find_rig()
     except ValueError as error:
         tell(f"no rig is known before, the images tell: {error}")
+        return None
+    if told is None:
         return None
     tell(
         f"the static transforms of the recording tell where its {len(told.cameras)} cameras stand, "

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.calibration.board import DICTIONARIES
+from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.registration.undistortion import radial_of
