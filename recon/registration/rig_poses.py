@@ -94,9 +94,12 @@ def measure_relative_poses(
         centres.append(problem.translations[reference] - placed)
         covariances.append((covariance + covariance.T) / 2.0)
     count = len(sets)
-    shapes = ((count, 3, 3), (count, 3), (count, 6, 6))
-    values = (np.reshape(each, shape) for each, shape in zip((rotations, centres, covariances), shapes, strict=True))
-    return RelativePoses(tuple(sets), *values)
+    return RelativePoses(
+        tuple(sets),
+        np.reshape(rotations, (count, 3, 3)),
+        np.reshape(centres, (count, 3)),
+        np.reshape(covariances, (count, 6, 6)),
+    )
 
 
 def estimate_scatter(poses: RelativePoses) -> tuple[float, float]:
