@@ -37,11 +37,11 @@ class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     lenses: Internal[self_calibration.LensGroupingConfig] = self_calibration.LensGroupingConfig()
     mapper: Internal[incremental_mapper.MapperConfig] = incremental_mapper.MapperConfig()
-    # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
-    # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
+    # Given poses are priors of cameras with a known lens; images that contradict one reject it. --poses-sigma sets it.
+    # Otherwise they are only compared with the images' cameras
     trust_poses: bool = False
-    # How fast trusted poses drift from the first photograph on, as odometry does: the standard deviation of a step's
-    # error in each direction, and of all lengths alike, as a share; 0: each pose is absolute. --poses-drift sets it
+    # Drift of trusted poses from the first image on: standard deviation of a step's error in each direction, and of all
+    # lengths alike, as a share; 0: poses are absolute. --poses-drift sets it
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
     # And of the turn about each axis that has grown after a metre, degrees; it grows with the root of the way
     poses_drift_deg: Annotated[float, msgspec.Meta(ge=0, le=90)] = 0.0
