@@ -37,7 +37,8 @@ from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
-from splatnode.recon.replay_source import add_poses, apply_masks
+from splatnode.recon.replay_source import Source, add_poses, apply_masks
+from splatnode.recon.rig_choice import apply_rig
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
 
@@ -250,6 +251,7 @@ def reconstruct(
     poses: Poses | None = None,
     poses_sigma: PosesSigma | None = None,
     poses_only_check: bool = False,
+    rig: str | PathLike[str] | None = None,
     masks: Masks | None = None,
     scale: Scale | None = None,
     budget_s: float | None = None,
@@ -280,6 +282,7 @@ def reconstruct(
       They give metres and the world's axes; one that does not fit is named and left out. `poses_sigma`: standard
       deviations, metres and degrees, of all poses or in a list or mapping. With sigmas (also from the file) and
       `intrinsics` they are priors of the cameras, unless `poses_only_check`.
+    - `rig`: a file with where the cameras stand to each other, as for `--rig`. None: a log tells, else the images do.
     - `masks`: white (any value above 0) is used, black is ignored. A folder of masks with the images' names, one file
       for all, or a list of arrays (H, W), paths, or None. None: all is used.
     - `scale`: the metres between two cameras, `("a.jpg", "b.jpg", 0.5)` or by places in the list, `(0, 3, 0.5)`;
@@ -298,21 +301,39 @@ def reconstruct(
     telling = tell or ignore_progress
     check_counts(views=views, threads=threads)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
-    source = load_frames(images, views, every_frame, telling, several)
-    source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
-    source = apply_lens(source, intrinsics, images)
+    loaded = load_frames(images, views, every_frame, telling, several)
+    source = _apply_given(loaded, masks, intrinsics, images, telling)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
+    source, chosen = apply_rig(source, chosen, rig, telling)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
     if trusted and known is not None:
-        source = add_poses(source, known, None if sigmas_of(poses_sigma) is None else chosen.metric.poses_sigmas, own)
-        known = None  # they are the photographs' own now
+        source, known = _hold_cameras(source, known, poses_sigma, chosen, own), None  # they are the photographs' own
     given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
+
+
+def _apply_given(
+    source: Source, masks: Masks | None, intrinsics: LensChoice | None, images: Images, tell: Tell
+) -> Source:
+    """The frames with their masks and lenses."""
+    masked = source if masks is None else apply_masks(source, make_mask_finder(masks, images), tell)
+    return apply_lens(masked, intrinsics, images)
+
+
+def _hold_cameras(
+    source: Source,
+    known: Mapping[str, npt.NDArray[np.float64]],
+    sigma: PosesSigma | None,
+    config: ReconstructionConfig,
+    own: Mapping[str, Sigmas],
+) -> Source:
+    """The frames with the poses that hold their cameras."""
+    return add_poses(source, known, None if sigmas_of(sigma) is None else config.metric.poses_sigmas, own)
 
 
 def build_config(

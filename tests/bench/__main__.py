@@ -61,6 +61,7 @@ BENCHMARKS = {
         "registrations",
         "known_poses",
         "several_cameras",
+        "rigs",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

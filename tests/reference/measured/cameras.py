@@ -133,6 +133,22 @@ def several_cameras() -> str:
     return table(header, rows)
 
 
+def rigs() -> str:
+    """Mounts of three cameras on a rig: the largest error of two, and the largest share of a bound."""
+    rows = []
+    for method, words in (
+        ("estimated", "the frame sets alone"),
+        ("given", "given, .5 cm and .5°"),
+        ("colmap", "COLMAP"),
+    ):
+        group = [row for row in raw("rigs")["rows"] if row["method"] == method]
+        shares = [row[of] / row[bound] for row in group if row["bound_deg"] is not None
+                  for of, bound in (("degrees", "bound_deg"), ("percent", "bound_percent"))]  # fmt: skip
+        degrees, percent = (max(row[of] for row in group) for of in ("degrees", "percent"))
+        rows.append((words, f"{degrees:.3f}", f"{percent:.3f}", f"{max(shares):.2f}" if shares else "–"))
+    return table(("rig", "degrees", "% of the distance", "largest error over its bound"), rows)
+
+
 def known_poses() -> str:
     """Poses that are given, with one of them false or none."""
     found, rows = raw("known_poses")["rows"], []
@@ -388,6 +404,7 @@ BLOCKS = (
     bounds,
     lens_assumptions,
     several_cameras,
+    rigs,
     known_poses,
     hard_sets,
     told_lenses,
