@@ -390,8 +390,8 @@ def _decode_rows(data: bytes, layout: Layout, max_pixels: int) -> npt.NDArray[np
             f"{width} x {height} of {channels} bytes must have rows of {row} bytes or more, it has rows of "
             f"{layout.step} and {len(data)} bytes in all"
         )
-    padded = np.frombuffer(data[: layout.step * height].ljust(layout.step * height, b"\0"), np.uint8)
-    pixels = np.ascontiguousarray(padded.reshape(height, layout.step)[:, :row]).reshape(height, width, channels)
+    rows = np.ndarray((height, row), np.uint8, data, strides=(layout.step, 1))  # no copy of what a step leaves out
+    pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
     try:
         image = pixels if code is None else cv2.cvtColor(pixels, code)
     except cv2.error as error:  # such as a Bayer pattern of one row

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,8 +21,11 @@ from splatnode.capture.logged.messages import (
     Calibration,
     Cdr,
     Fields,
+    Layout,
+    Picture,
     UnusableMessage,
     calibration_topic,
+    rgb,
 )
 from tests.support.mcap_files import START_NS, jpeg, write
 
@@ -111,6 +115,16 @@ def test_foxglove_topics_of_its_own_protobuf(tmp_path):
     for topic in ("/cam/image", "/cam/raw"):
         frame = only(file, topic)
         assert frame.intrinsics.cx == 32.0
+
+
+def test_an_image_of_one_row_allocates_no_more_than_its_pixels():
+    picture = Picture("optical", START_NS, bytes(range(15)), Layout(5, 1, "rgb8", 2**31))
+    tracemalloc.start()
+    try:
+        assert (rgb(picture, 100) == np.arange(15).reshape(1, 5, 3)).all()
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20  # of the 2 GB that one step is long
+    finally:
+        tracemalloc.stop()
 
 
 def only(file: Path, topic: str) -> Any:
