@@ -105,8 +105,8 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()  # how the processes reach each other
     # An image of the camera's size: black is never used, as where the camera sees the robot itself; white is used
     body_mask: Path | None = None
-    # Where several captures run beside one recon, each has an id of its own, of letters, digits, - and _: its frames
-    # carry it. Frames that they took at one time form a frame set
+    # Of this capture, where several run beside one recon: letters, digits, - and _. Frames of several that were taken
+    # at one time form a frame set
     camera_id: CaptureId = ""
 
 

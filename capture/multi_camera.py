@@ -60,16 +60,23 @@ class CameraSet:
         named = all(camera.path.name == camera.camera_id for camera in self.cameras)
         return self.cameras[0].path.parent if len(parents) == 1 and named and not self.is_film else None
 
+    def find_rig(self) -> Rig | None:
+        """Returns where the cameras stand to each other, as their one recording tells; None: they have none that may.
+
+        Raises as the recording's reader does.
+        """
+        parts = {camera.camera_id: film.file_and_part(camera.path) for camera in self.cameras}
+        files = {file for file, _ in parts.values()}
+        found = film.find_reader(min(files)) if len(files) == 1 else None
+        return found and found[1].read_rig(min(files), {camera_id: part for camera_id, (_, part) in parts.items()})
+
     def read_rig(self) -> Rig:
         """Returns where the cameras stand to each other, as the static transforms of their one log tell.
 
         Raises ValueError where they are of no log, or of several, and as the log's reader does.
         """
-        parts = {camera.camera_id: film.file_and_part(camera.path) for camera in self.cameras}
-        files = {file for file, _ in parts.values()}
-        found = film.find_reader(min(files)) if len(files) == 1 else None
-        named = {camera_id: part for camera_id, (_, part) in parts.items()}
-        if found is None or (rig := found[1].read_rig(min(files), named)) is None:
+        rig = self.find_rig()
+        if rig is None:
             raise ValueError("static transforms are those of one MCAP file; of other cameras, give the rig in a file")
         return rig
 

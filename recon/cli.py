@@ -26,6 +26,7 @@ from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.report import bound_result_bytes
 from splatnode.recon.result.submap_index import FILE, is_map_set
 from splatnode.recon.result.summary import print_summary
+from splatnode.recon.rig_choice import apply_rig
 from splatnode.recon.viewer_process import Show, viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -57,6 +58,7 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
     if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
         say(taken, error=True)
+    given, config = apply_rig(given, config, args.rig, tell)
     check_baseline(config, given)
     trajectory = None if args.poses is None else read_poses(args.poses)
     known = _load_scale_evidence(args, given, trajectory)

@@ -53,8 +53,8 @@ PREVIEW = training.RefinementConfig(
 class FallbackConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fallbacks, tried before images are rejected or left out for want of matches."""
 
-    # Work up to which a further fallback begins; what has begun is finished. A second of one idle core is about 1, but
-    # it is counted by what is done, not by a clock: the same images get the same work on any machine
+    # Work up to which a further fallback begins, about seconds of one idle core. It counts operations, not time, so
+    # that results do not depend on the machine
     budget: Annotated[float, Meta(ge=0)] = 4.0
     # Time after which no further fallback begins, by the clock. None: no clock decides; in a node it is 4
     timeout_s: Annotated[float, Meta(ge=0)] | None = None

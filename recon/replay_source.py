@@ -80,6 +80,7 @@ class Source:
     frames: tuple[Frame | DroppedFrame, ...]
     photographs: Path | None  # the folder that they lie in; None: they lie in none, as a film's
     choice: Choice | None  # None: all that were asked for are used
+    cameras: CameraSet | None = None  # whose they are; None: they are one camera's, or no source tells
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -236,7 +237,7 @@ def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
     _check_there(request)
-    found = _load_unmasked(request, tell)
+    found = replace(_load_unmasked(request, tell), cameras=request.cameras)
     if request.lenses is not None:
         found = apply_lenses(found, request.lenses)
     return found if request.masks is None else apply_masks(found, open_masks(request.masks), tell)
