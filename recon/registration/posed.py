@@ -19,8 +19,7 @@ from splatnode.recon.registration import (
     self_calibration,
 )
 from splatnode.recon.registration.bundle_adjustment import differentiate_by_pose
-from splatnode.recon.registration.drift import Drift
-from splatnode.recon.registration.known_poses import Given, GivenWorld, Offset
+from splatnode.recon.registration.known_poses import Drift, Given, GivenWorld, Offset
 from splatnode.recon.registration.posed_mapping import PosedMap
 from splatnode.recon.registration.registration import (
     Registration,

@@ -13,8 +13,10 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, norm
 
-from splatnode.recon.registration import bundle_adjustment, epipolar, incremental_mapper, pose_test, resection
+from splatnode.recon.registration import bundle_adjustment, epipolar, incremental_mapper, resection
 from splatnode.recon.registration.known_poses import Deviation, Given
 from splatnode.recon.registration.mapping_problem import MapperInput, PartialMap
 from splatnode.recon.registration.subpixel import PatchImage
@@ -50,6 +52,74 @@ class PosedMap:
 
     map: incremental_mapper.Map
     deviations: tuple[Deviation, ...]  # of views, the worst first; lengths in metres
+
+
+# Whether images contradict given poses: the residual of each pose against all others, beyond both sigmas.
+#
+# A pose g with covariance S holds its camera; the adjustment puts that at x with covariance C, in which g counts. Then
+# x - g has the covariance S - C, whatever else is known, so that no adjustment without g is needed (Cook and Weisberg,
+# "Residuals and influence in regression", 1982, 2.2). Directions that images do not tell do not count.
+
+# Of a false alarm: 4.4 sigmas. What is named wrongly among a thousand poses is what the sigmas do not tell
+LEAST_PROBABILITY = 1e-5
+_TOLD = 0.05  # least share of a pose's variance that images must take away for a direction to count
+_SMALLEST = 1e-300  # of a probability, whose sigmas are finite
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """How far a camera is from its given pose."""
+
+    turn: Array  # (3,) radians, about the camera's axes
+    shift: Array  # (3,) along them, in the problem's unit
+    probability: float  # that an error as large comes by chance; 1 where images tell nothing
+    squared: float = 0.0  # its length in its own sigmas, squared: by how much the cost falls without the pose
+
+    @property
+    def sigmas(self) -> float:
+        """The deviation of a normal variable that is as unlikely."""
+        return float(norm.isf(max(self.probability, _SMALLEST) / 2.0))
+
+
+def residuals(
+    problem: bundle_adjustment.Problem, given: bundle_adjustment.GivenPoses, covariance: bundle_adjustment.Covariance
+) -> dict[int, Residual]:
+    """Computes the residual of each camera that `given` has a pose of and `covariance` is finite for.
+
+    Where `problem.given` holds a camera, its residual is against all others; where not, against the images alone.
+    """
+    held = np.zeros(len(given.sigmas), bool) if problem.given is None else problem.given.is_held
+    blocks, found, priors = covariance.cameras, {}, given.covariance
+    for camera in np.flatnonzero(given.is_held).tolist():
+        if not np.isfinite(blocks[camera]).all() or not blocks[camera].any():
+            continue
+        turn, shift, by_pose = deviation(problem, given, camera)
+        own = slice(6 * camera, 6 * camera + 6)
+        whiten = np.linalg.inv(np.linalg.cholesky(priors[own, own]))
+        error = whiten @ np.concatenate([turn, shift])
+        known = whiten @ by_pose @ blocks[camera] @ by_pose.T @ whiten.T
+        of_residual = np.eye(6) - known if held[camera] else np.eye(6) + known
+        variances, directions = np.linalg.eigh((of_residual + of_residual.T) / 2.0)
+        counts = variances > _TOLD
+        squared = float(((directions.T @ error)[counts] ** 2 / variances[counts]).sum())
+        probability = float(chi2.sf(squared, counts.sum())) if counts.any() else 1.0
+        found[camera] = Residual(turn, shift, probability, squared)
+    return found
+
+
+def deviation(
+    problem: bundle_adjustment.Problem, given: bundle_adjustment.GivenPoses, camera: int
+) -> tuple[Array, Array, Array]:
+    """Turn (3,) and shift (3,) of a camera from its given pose, and their derivatives (6, 6) by the camera's pose."""
+    rotation = problem.rotations[camera]
+    turn = Rotation.from_matrix(rotation @ given.rotations[camera].T).as_rotvec()
+    x, y, z = seen = rotation @ given.centres[camera]
+    by_pose = np.eye(6)
+    by_pose[3:, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    return turn, seen + problem.translations[camera], by_pose
+
+
+# The map.
 
 
 def build_map(
@@ -215,7 +285,7 @@ def _find_contradictions(
     held = set(_find_held_views(partial))
     found = _residuals(_weigh(problem, _count_as_given(problem, partial), alike), given)
     found = {view: residual for view, residual in found.items() if view in held}
-    beyond = {view for view, residual in found.items() if residual.probability < pose_test.LEAST_PROBABILITY}
+    beyond = {view for view, residual in found.items() if residual.probability < LEAST_PROBABILITY}
     return refuted | beyond, max((residual.squared for residual in found.values()), default=0.0)
 
 
@@ -399,12 +469,12 @@ def _test_poses(
     return partial if len(_find_held_views(partial)) >= _LEAST_HELD and _most_hold(partial, given) else None
 
 
-def _find_contradicted(found: Mapping[int, pose_test.Residual]) -> list[int]:
+def _find_contradicted(found: Mapping[int, Residual]) -> list[int]:
     """The view whose pose is the most contradicted, and then others of which nothing tells that it is not they instead.
 
     None where no pose is contradicted.
     """
-    beyond = [view for view in found if found[view].probability < pose_test.LEAST_PROBABILITY]
+    beyond = [view for view in found if found[view].probability < LEAST_PROBABILITY]
     beyond.sort(key=lambda view: (found[view].probability, -found[view].squared))
     return [view for view in beyond if found[beyond[0]].squared - found[view].squared < _DECIDED]
 
@@ -413,11 +483,11 @@ def _most_hold(partial: PartialMap, given: Given) -> bool:
     return 2 * len(_find_held_views(partial)) > int(given.poses.is_held.sum())
 
 
-def _residuals(finished: incremental_mapper.FinalMap, given: Given) -> dict[int, pose_test.Residual]:
+def _residuals(finished: incremental_mapper.FinalMap, given: Given) -> dict[int, Residual]:
     """The residuals of the poses in a map in which these and images are weighed."""
     partial = finished.map
     covariance = bundle_adjustment.covariance(partial.estimate, partial.prior, finished.loss, -1)
-    return pose_test.residuals(partial.estimate, given.poses, covariance)
+    return residuals(partial.estimate, given.poses, covariance)
 
 
 def _finish_map(
@@ -458,7 +528,7 @@ def _deviations(finished: incremental_mapper.FinalMap, given: Given) -> tuple[De
     for view in np.flatnonzero(given.poses.is_held).tolist():
         if view in held:
             continue
-        turn, shift, _ = pose_test.deviation(finished.map.estimate, given.poses, view)
+        turn, shift, _ = deviation(finished.map.estimate, given.poses, view)
         sigmas = residuals[view].sigmas if view in residuals else math.nan
         metres = given.metres * float(np.linalg.norm(shift))
         found.append(Deviation(view, metres, float(np.degrees(np.linalg.norm(turn))), sigmas))

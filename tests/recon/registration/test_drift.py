@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.registration import bundle_adjustment
-from splatnode.recon.registration.drift import Drift, compute_drift_covariance
+from splatnode.recon.registration.known_poses import Drift, compute_drift_covariance
 from splatnode.recon.registration.posed import compute_scale_sigma
 
 DRIFT = Drift(0.02, 0.3)

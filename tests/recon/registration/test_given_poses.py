@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.registration import bundle_adjustment, pose_test
+from splatnode.recon.registration import bundle_adjustment, posed_mapping
 from tests.recon.registration.test_bundle import problem
 
 NOISE_PX, SIGMAS = 0.5, np.array([np.radians(0.1), 0.004])
@@ -86,7 +86,7 @@ def test_errors_are_as_large_as_the_covariance_says_and_smaller_than_those_of_th
         covariance = bundle_adjustment.covariance(found, TOLD, LOSS)
         assert found.given is not None
         for camera in range(4):
-            turn, shift, by_pose = pose_test.deviation(
+            turn, shift, by_pose = posed_mapping.deviation(
                 found, replace(found.given, rotations=true.rotations, centres=bundle_adjustment.centres(true)), camera
             )
             error = np.concatenate([turn, shift])
@@ -104,10 +104,10 @@ def test_true_poses_are_not_contradicted_and_their_residuals_are_what_chance_giv
     for seed in range(25):
         _, found = adjusted(seed)
         assert found.given is not None
-        residuals = pose_test.residuals(found, found.given, bundle_adjustment.covariance(found, TOLD, LOSS))
+        residuals = posed_mapping.residuals(found, found.given, bundle_adjustment.covariance(found, TOLD, LOSS))
         probabilities += [each.probability for each in residuals.values()]
     assert len(probabilities) == 100
-    assert min(probabilities) > pose_test.LEAST_PROBABILITY
+    assert min(probabilities) > posed_mapping.LEAST_PROBABILITY
     assert 0.35 < np.mean(probabilities) < 0.65
 
 
@@ -115,10 +115,10 @@ def test_true_poses_are_not_contradicted_and_their_residuals_are_what_chance_giv
 def test_a_false_pose_is_the_most_contradicted(turn: float, shift: float) -> None:
     _, found = adjusted(1, (2, turn, shift))
     assert found.given is not None
-    residuals = pose_test.residuals(found, found.given, bundle_adjustment.covariance(found, TOLD, LOSS))
+    residuals = posed_mapping.residuals(found, found.given, bundle_adjustment.covariance(found, TOLD, LOSS))
     worst = min(residuals, key=lambda camera: residuals[camera].probability)
     assert worst == 2
-    assert residuals[worst].probability < pose_test.LEAST_PROBABILITY
+    assert residuals[worst].probability < posed_mapping.LEAST_PROBABILITY
     assert residuals[worst].sigmas > 4.4
 
 
@@ -137,7 +137,7 @@ def test_poses_whose_errors_depend_on_each_other_are_weighed_as_their_covariance
         poses, points = values[:24].reshape(4, 6), values[24:].reshape(-1, 3)
         rotations = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ begun.rotations
         now = replace(begun, rotations=rotations, translations=begun.translations + poses[:, 3:], points=points)
-        off = [np.concatenate(pose_test.deviation(now, given, camera)[:2]) for camera in range(4)]
+        off = [np.concatenate(posed_mapping.deviation(now, given, camera)[:2]) for camera in range(4)]
         predicted, _ = bundle_adjustment.project(now)
         return np.concatenate([((predicted - now.pixels) / NOISE_PX).ravel(), whiten @ np.concatenate(off)])
 
