@@ -28,7 +28,8 @@ def undistort_frame(frame: Frame) -> Frame:
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
     invented. A fisheye's has as many pixels in another shape, and a mask where the fisheye saw nothing
-    (wide_pinhole.py). Its right image, if it has one, is taken the same way, since both have one lens. Raises
+    (wide_pinhole.py). Its right image, if it has one, is taken the same way, since both have one lens. An aligned depth
+    image keeps its pixels, and gets the lens that they were seen through. Raises
     ValueError for coefficients that fold the picture over.
     """
     if frame.right is None:
@@ -57,6 +58,8 @@ def _undistort_single(frame: Frame) -> Frame:
     if given is None:
         return frame
     given = given.resized(frame.width, frame.height)
+    if frame.depth is not None and not (given.model == "opencv" and _is_square_pinhole(given)):
+        frame = replace(frame, depth=frame.depth.apply_lens(given))
     if given.model == "fisheye":
         return _undistort_fisheye(frame, given)
     if _is_square_pinhole(given):
