@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import Frame, Intrinsics, RightImage, grey
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
@@ -42,6 +43,14 @@ def undistort_frame(frame: Frame) -> Frame:
     return replace(left, right=RightImage(grey(right.image), frame.right.baseline))
 
 
+def straighten_depth(frame: Frame) -> DepthImage | None:
+    """The frame's depth image as `undistort_frame` leaves it: aligned with resampled pixels, it has their old lens."""
+    given, depth = frame.intrinsics, frame.depth
+    if depth is None or given is None or not is_resampled(frame):
+        return depth
+    return depth.apply_lens(given.resized(frame.width, frame.height))
+
+
 def is_resampled(frame: Frame) -> bool:
     """Whether `undistort_frame` makes another picture of the frame: its lens is no pinhole with square pixels."""
     given = frame.intrinsics
@@ -58,8 +67,8 @@ def _undistort_single(frame: Frame) -> Frame:
     if given is None:
         return frame
     given = given.resized(frame.width, frame.height)
-    if frame.depth is not None and not (given.model == "opencv" and _is_square_pinhole(given)):
-        frame = replace(frame, depth=frame.depth.apply_lens(given))
+    if frame.depth is not None:
+        frame = replace(frame, depth=straighten_depth(frame))
     if given.model == "fisheye":
         return _undistort_fisheye(frame, given)
     if _is_square_pinhole(given):

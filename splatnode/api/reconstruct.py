@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.depths import Depths, add_depths
 from splatnode.api.image_arguments import Sigmas, parse_sigmas
 from splatnode.api.photographs import (
     Images,
@@ -251,6 +252,7 @@ def reconstruct(
     poses_sigma: PosesSigma | None = None,
     poses_only_check: bool = False,
     masks: Masks | None = None,
+    depths: Depths | None = None,
     scale: Scale | None = None,
     budget_s: float | None = None,
     preset: str = "balanced",
@@ -288,6 +290,10 @@ def reconstruct(
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
+    - `depths`: what a depth camera measured beside each photograph: a folder of files with the photographs' names, a
+      mapping by them, or a list (None: not measured) of `DepthImage`, arrays (H, W) aligned with the photograph, uint16
+      of millimetres or float of metres, or files (PNG of 16 bits, .npy, .exr). They give metres, and depth where
+      photographs show nothing to match; the photographs test them, and `report["depth"]` tells the outcome.
     - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
       places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or `splatnode.Stereo`; or a
       list of these, which check one another. None: lengths have no unit.
@@ -307,7 +313,7 @@ def reconstruct(
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     source = load_frames(images, views, every_frame, telling, several)
     source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
-    source = apply_lens(source, intrinsics, images)
+    source = add_depths(apply_lens(source, intrinsics, images), depths, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
+from splatnode.api.depths import DepthOf, parse_optional_depth
 from splatnode.api.image_arguments import append_motion, make_gravity, make_intrinsics, make_pose
 from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
@@ -117,6 +118,7 @@ class Session:
         gravity_sigma: float | None = None,
         right: Picture | None = None,
         baseline_m: float | None = None,
+        depth: DepthOf = None,
     ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
@@ -130,7 +132,8 @@ class Session:
         One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
         degrees; it gives `Result.map` its up. `right` is what the right half of a stereo camera saw at that moment,
         rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
-        the scene metres, too.
+        the scene metres, too. `depth` is what a depth camera measured at that moment, as `reconstruct` takes it: it
+        gives metres, and depth where images show nothing to match.
 
         Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
         milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
@@ -149,7 +152,8 @@ class Session:
             usual = metric.odometry_drift, metric.odometry_sigma_deg
             moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
             came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
-            frame = replace(frame, **came, right=_make_right_image(right, baseline_m))
+            beside = {"right": _make_right_image(right, baseline_m), "depth": parse_optional_depth(depth)}
+            frame = replace(frame, **came, **beside)
             self._motion = moved
             self._given.add(frame.name)
             self._sizes += {(frame.width, frame.height)}.difference(self._sizes)
@@ -160,8 +164,9 @@ class Session:
                 self._evidence = self._evidence.merge(gather_evidence((frame,), self._config.metric))
                 work.add_frame(frame)
                 work.update()
-                made = work.snapshot()  # stereo pairs are measured by landmarks
-                self._snapshot = add_landmarks(made, work.find_reconstruction()) if self._evidence.pairs else made
+                made = work.snapshot()  # stereo pairs and depth images are measured by landmarks
+                by_points = bool(self._evidence.pairs or self._evidence.depths)
+                self._snapshot = add_landmarks(made, work.find_reconstruction()) if by_points else made
             taken = frame.name in work.names
             left_out = {each.name: each.reason for each in work.dropped}
             return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)
