@@ -33,7 +33,7 @@ MOST_SIGMA = 0.04  # of a measured depth that is taken, as a share of it
 _CONFIDENT_SIGMA = 0.005  # at which a measured depth has the confidence 1
 _MOST_CONFIDENCE = 0.9
 _APART_SIGMAS = 3.0  # by which stereo and measured depth may differ and be averaged
-_SURE = 0.5  # confidence of stereo above which it is kept where both differ by more
+_SURE = 0.9  # confidence of stereo from which on it is kept where both differ by more; below, it widens outlines
 _JUMP = 0.03  # relative step of depth across which nothing is interpolated
 
 

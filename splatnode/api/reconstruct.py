@@ -290,19 +290,16 @@ def reconstruct(
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
-    - `depths`: what a depth camera measured beside each photograph: a folder of files with the photographs' names, a
-      mapping by them, or a list (None: not measured) of `DepthImage`, arrays (H, W) aligned with the photograph, uint16
-      of millimetres or float of metres, or files (PNG of 16 bits, .npy, .exr). They give metres, and depth where
-      photographs show nothing to match; the photographs test them, and `report["depth"]` tells the outcome.
+    - `depths`: of a depth camera, for metres and plain walls: a folder, a mapping by names, or a list of `DepthImage`,
+      files (16-bit PNG, .npy, .exr), or arrays (H, W), aligned: uint16 millimetres, float metres; None: not measured.
     - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
       places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or `splatnode.Stereo`; or a
       list of these, which check one another. None: lengths have no unit.
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
     - `views`: so many photographs or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
-    - `only_seen`: leaves out what no two photographs confirm, and the far background.
-    - `seed`: of what is drawn by chance. None: the configuration's, 0.
-    - `threads`: of this call at most, of torch and of the compiled core. None: as many as there are processors.
+      `only_seen`: leaves out what no two photographs confirm, and the far background.
+    - `seed`: of what is drawn by chance; None: the configuration's, 0. `threads`: at most; None: one a processor.
     - `tell`: hears what is being done, in the calling thread: a step with `doing`, `done`, `of`, or a line of text.
       What it raises ends the work.
 

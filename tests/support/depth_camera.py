@@ -51,3 +51,20 @@ def add_depths(frames: Sequence[Frame], config: synthetic.Config, camera: DepthC
     """The photographs of the built-in capture, each with what the depth camera measured."""
     camera = camera or DepthCamera()
     return [replace(each, depth=measure(synthetic.depth(config, i), camera, i)) for i, each in enumerate(frames)]
+
+
+def whitewash(frames: Sequence[Frame], config: synthetic.Config) -> list[Frame]:
+    """The photographs with plain walls: shaded, without anything to match but what stands before them."""
+    found = []
+    for index, frame in enumerate(frames):
+        (T, K), z = synthetic.scene_cameras(config)[index], synthetic.depth(config, index)
+        across, down = np.meshgrid(np.arange(frame.width) + 0.5, np.arange(frame.height) + 0.5)
+        rays = np.stack([(across - K[0, 2]) / K[0, 0], (down - K[1, 2]) / K[1, 1], np.ones_like(across)], -1)
+        with np.errstate(invalid="ignore"):
+            points = (rays * z[..., None]) @ T[:3, :3].T + T[:3, 3]
+            wall = (np.abs(points[..., :2]) < 0.01).any(-1)
+        light = np.where(np.abs(points[..., 0]) < 0.01, 190.0, 165.0) + 8.0 * np.nan_to_num(points[..., 2])
+        grain = np.random.default_rng([config.seed, index]).normal(size=frame.image.shape)
+        plain = np.clip(np.rint(light[..., None] + grain), 0, 255).astype(np.uint8)
+        found.append(replace(frame, image=np.where(wall[..., None], plain, frame.image)))
+    return found

@@ -183,7 +183,7 @@ def pointmap(depth: np.ndarray, confidence: np.ndarray) -> Pointmap:
 
 
 def test_depth_is_filled_where_stereo_has_none_and_averaged_where_both_agree():
-    stereo, confidence = np.full((12, 16), 2.0), np.full((12, 16), 0.9)
+    stereo, confidence = np.full((12, 16), 2.0), np.full((12, 16), 0.95)
     stereo[:, :4] = confidence[:, :4] = 0.0
     stereo[:, 12:] = 3.0
     told = np.full((12, 16), 2.01)
