@@ -98,7 +98,7 @@ def _read_until(reader: Reader, seconds: float | None) -> Iterator[Frame | Dropp
 def find(args: argparse.Namespace) -> int:
     """Lists the cameras that are connected, as lines that can be copied into a configuration."""
     found = {}
-    for kind in [*Camera.kinds(), *Camera.kinds_elsewhere()]:
+    for kind in Camera.kinds():
         try:
             source = Camera.load_module(kind)
         except ConfigError as error:  # of another package: the other cameras are found all the same

@@ -19,6 +19,7 @@ from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.network import CaptureId, Network
 from splatnode.capture.messaging.wire import Header, Message, Name, Numbering, Sequential, Text, WireError
+from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.quality import Limits
@@ -72,11 +73,11 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
 
 
 class Camera(Plugin):
-    """The source of frames: a module of capture/cameras, or one that another package brings."""
+    """The source of frames: a module of capture/cameras, or one that is installed beside it."""
 
     package = "splatnode.capture.cameras"
+    group = plugins.CAMERAS
     needs = ("Config", "stream")
-    entry_points = "splatnode.cameras"
 
 
 class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -104,8 +105,8 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()  # how the processes reach each other
     # An image of the camera's size: black is never used, as where the camera sees the robot itself; white is used
     body_mask: Path | None = None
-    # Where several captures run beside one recon, each has an id of its own, of letters, digits, - and _: its frames
-    # carry it. Frames that they took at one time form a frame set
+    # Of this capture, where several run beside one recon: letters, digits, - and _. Frames of several that were taken
+    # at one time form a frame set
     camera_id: CaptureId = ""
 
 

@@ -1,6 +1,8 @@
 """A recording in a file, by its name: a video, an image topic of an MCAP file, or an episode of a LeRobot data set.
 
 film.mp4, film.mp4#t=10,20.5, drive.mcap#/front/image, pusht#episode_000003/observation.images.top
+
+Videos are read here. Other recordings are read by cameras that an entry point of `splatnode.recordings` names.
 """
 
 from __future__ import annotations
@@ -9,22 +11,66 @@ import errno
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from urllib.parse import quote, unquote
 
-from splatnode.capture.cameras import lerobot, mcap, video
+from splatnode.capture.cameras import video
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.lerobot.data_set import is_data_set
+from splatnode.capture.process import plugins
 from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.rig import Rig
 
-MCAP = ".mcap"
-_MODULES = {"mcap": mcap, "lerobot": lerobot, "video": video}
 _MARK = "#"  # between a file and the part of it that is meant
 # Seconds of a video from its first frame, the first of which is in it, as W3C's Media Fragments have it: t=10,20.5.
 # No more digits than there are in the largest that a video has: more could be infinite.
 _SECONDS = re.compile(r"t=(\d{1,9}(?:\.\d{0,9})?)?(?:,(\d{1,9}(?:\.\d{0,9})?))?", re.ASCII)
+
+
+class RecordingReader(Protocol):
+    """The interface of a camera that reads recordings of one kind, which is the name of its entry point."""
+
+    Config: Callable[..., Any]  # of the camera
+    stream: Callable[[Any], Iterator[Frame | DroppedFrame]]
+
+    def is_recording(self, path: Path) -> bool:
+        """Whether this file or folder, by its name or by what lies in it, is of this kind."""
+        ...
+
+    def configure_part(self, path: Path, part: str) -> dict[str, Any]:
+        """The camera's configuration for this part of it; an empty part means all."""
+        ...
+
+    def explain_many(self, path: Path) -> str | None:
+        """Why this recording is no film as a whole, and what to name; None where it is one."""
+        ...
+
+    def list_cameras(self, path: Path, part: str) -> Sequence[tuple[Sequence[str], str]] | None:
+        """The cameras of this part, each by its name in segments and its own part; None where it is one camera's.
+
+        Raises ValueError where several cameras are those of another part.
+        """
+        ...
+
+    def read_rig(self, path: Path, parts: Mapping[str, str]) -> Rig | None:
+        """Returns where cameras stand to each other, by the part of each; None where such a recording does not tell it.
+
+        Raises ValueError where this one does not tell it.
+        """
+        ...
+
+
+def find_reader(path: Path) -> tuple[str, RecordingReader] | None:
+    """The kind of camera that reads this file or folder, and its module; None where it is a video, or no recording.
+
+    Raises BrokenPlugin.
+    """
+    for kind, entry in plugins.entry_points(plugins.RECORDINGS).items():
+        reader: RecordingReader = entry.load()
+        if reader.is_recording(path):
+            return kind, reader
+    return None
 
 
 def file_and_part(path: Path) -> tuple[Path, str]:
@@ -37,7 +83,7 @@ def file_and_part(path: Path) -> tuple[Path, str]:
     text = str(path)
     for place in (place for place, letter in enumerate(text) if letter == _MARK):
         file = Path(text[:place])
-        if _is_there(file) and (file.is_file() or is_data_set(file)):
+        if _is_there(file) and (file.is_file() or find_reader(file) is not None):
             return file, unquote(text[place + 1 :])
     return path, ""
 
@@ -70,10 +116,9 @@ def camera(path: Path) -> tuple[str, dict[str, Any]]:
     Raises ValueError for a part of a video that is no range of seconds.
     """
     file, part = file_and_part(path)
-    if file.suffix.lower() == MCAP:
-        return "mcap", {"file": file, "topic": part}
-    if file.is_dir():
-        return "lerobot", {"folder": file, "part": part}
+    if (found := find_reader(file)) is not None:
+        kind, reader = found
+        return kind, reader.configure_part(file, part)
     return "video", {"file": file, **(_parse_seconds(file, part) if part else {})}
 
 
@@ -93,6 +138,7 @@ def _parse_seconds(file: Path, part: str) -> dict[str, float]:
 
 def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
     """Its frames. Raises FileNotFoundError, or ValueError where they cannot be had."""
-    kind, told = camera(path)
-    module = _MODULES[kind]
-    return module.stream(module.Config(**told))
+    _, told = camera(path)
+    found = find_reader(file_and_part(path)[0])
+    reader = video if found is None else found[1]
+    return reader.stream(reader.Config(**told))

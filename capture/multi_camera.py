@@ -15,19 +15,16 @@ from pathlib import Path
 from typing import TypeAlias
 
 from splatnode.capture import film, recording
-from splatnode.capture.cameras import folder, mcap
+from splatnode.capture.cameras import folder
 from splatnode.capture.exif import exif_time, name_time
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.image_file import UnusableImage, read_image_file
 from splatnode.capture.image_header import read_header
-from splatnode.capture.lerobot import data_set
-from splatnode.capture.logged.static_rig import read_rig
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import LONGEST_NAME, digest_name, guard_untrusted, sanitize_name, sanitize_text
 from splatnode.capture.rig import TOLERANCE_S, FrameSet, Rig, form_frame_sets
 
 ALL = "all"  # in place of the names of cameras
-_COPIES = ("/compressed", "/theora", "/ffmpeg")  # behind a topic's name: ROS sends its images once more, packed
 
 
 @dataclass(frozen=True)
@@ -63,16 +60,25 @@ class CameraSet:
         named = all(camera.path.name == camera.camera_id for camera in self.cameras)
         return self.cameras[0].path.parent if len(parents) == 1 and named and not self.is_film else None
 
-    def read_rig(self) -> Rig:
-        """Returns where the cameras stand to each other, as the static transforms of their one log tell.
+    def find_rig(self) -> Rig | None:
+        """Returns where the cameras stand to each other, as their one recording tells; None: they have none that may.
 
-        Raises ValueError where they are of no log, or of several, and as `static_rig.read_rig`.
+        Raises as the recording's reader does.
         """
         parts = {camera.camera_id: film.file_and_part(camera.path) for camera in self.cameras}
         files = {file for file, _ in parts.values()}
-        if len(files) > 1 or min(files).suffix.lower() != film.MCAP:
+        found = film.find_reader(min(files)) if len(files) == 1 else None
+        return found and found[1].read_rig(min(files), {camera_id: part for camera_id, (_, part) in parts.items()})
+
+    def read_rig(self) -> Rig:
+        """Returns where the cameras stand to each other, as the static transforms of their one log tell.
+
+        Raises ValueError where they are of no log, or of several, and as the log's reader does.
+        """
+        rig = self.find_rig()
+        if rig is None:
             raise ValueError("static transforms are those of one MCAP file; of other cameras, give the rig in a file")
-        return read_rig(min(files), {camera_id: topic for camera_id, (_, topic) in parts.items()})
+        return rig
 
     def form_frame_sets(self, names: Sequence[str] = ()) -> Sequence[FrameSet]:
         """Returns which photographs of folders, all or those called `names`, were taken together, in their order.
@@ -239,21 +245,13 @@ def find_cameras(path: Path) -> tuple[CameraSource, ...]:
     """
     file, part = film.file_and_part(path)
     shown = repr(sanitize_text(str(path)))
-    if file.is_dir() and data_set.is_data_set(file):
-        keys = data_set.read_info(file).cameras
-        if not part or "/" in part:
-            first = film.part_of(file, data_set.episode_name(0))
-            raise ValueError(f"{shown}: of a data set, several cameras are those of an episode, such as {str(first)!r}")
-        return _name_cameras([key.split(".") for key in keys], [film.part_of(file, f"{part}/{key}") for key in keys])
-    if not part and file.suffix.lower() == film.MCAP and file.is_file():
-        topics = [topic.name for topic in mcap.image_topics(file)]
-        topics = [topic for topic in topics if not any(topic == f"{each}{copy}" for each in topics for copy in _COPIES)]
-        split = [[segment for segment in topic.split("/") if segment] for topic in topics]
-        return _name_cameras(split, [film.part_of(file, topic) for topic in topics])
-    if not part and file.is_dir():
-        return _find_folders(file, shown)
     if not part and not file.exists():
         raise FileNotFoundError(f"{shown} is not there; give a folder with a folder of each camera, or a film of each")
+    found = film.find_reader(file)
+    if found is not None and (listed := found[1].list_cameras(file, part)) is not None:
+        return _name_cameras([name for name, _ in listed], [film.part_of(file, each) for _, each in listed])
+    if not part and file.is_dir():
+        return _find_folders(file, shown)
     raise ValueError(
         f"{shown} has one camera; give a folder with a folder of each camera, an MCAP file, an episode of a data set, "
         "or a film of each camera"

@@ -25,7 +25,7 @@ class RigCamera:
     Raises ValueError where the pose is no rigid motion, or a number is out of bounds.
     """
 
-    camera_id: str
+    camera_id: str  # as its frames have it
     T_rig_camera: tuple[float, ...] | None = None  # None: nobody knows, the images tell
     sigma_m: float = SIGMA_M  # standard deviation of the position in each direction, metres
     sigma_deg: float = SIGMA_DEG  # of the orientation about each axis, degrees

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.calibration.verb import CALIBRATE
-from splatnode.capture.process.arguments import Verb, add_json, import_lazily, natural, positive, seconds
-from splatnode.capture.process.text import metres_argument
+from splatnode.capture.process.arguments import Verb, add_json, import_lazily, seconds
 
 
 def _camera_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,21 +49,6 @@ def _keys_arguments(parser: argparse.ArgumentParser) -> None:
     change.add_argument("--server", metavar="KEY", help="connect to the machine with this public key")
 
 
-def _marker_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("file", type=Path, metavar="FILE", help="the PDF that is written, such as markers.pdf")
-    add("--side", type=metres_argument, default=0.1, metavar="LENGTH", help="of the black square (default: 100mm)")
-    add("--count", type=positive, metavar="N", help="how many different ones (default: as many as a page holds)")
-    add("--first", type=natural, default=0, metavar="NUMBER", help="of the first one (default: 0)")
-    add("--paper", choices=("a4", "letter"), default="a4", help="default: a4")
-    add(
-        "--dictionary",
-        default="4X4_50",
-        metavar="NAME",
-        help="of OpenCV's ArUco dictionaries (default: 4X4_50), or APRILTAG_36h11",
-    )
-
-
 def _status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
     parser.add_argument("--acknowledge", action="store_true", help="the problems that are told need not be told again")
@@ -86,7 +69,6 @@ VERBS = (
         _config_arguments,
         import_lazily("splatnode.capture.cli", "config"),
     ),
-    CALIBRATE,
     Verb(
         "list-cameras", "list the cameras that are connected", add_json, import_lazily("splatnode.capture.cli", "find")
     ),
@@ -95,12 +77,6 @@ VERBS = (
         "make this machine's keys; say who may connect",
         _keys_arguments,
         import_lazily("splatnode.capture.cli", "keys"),
-    ),
-    Verb(
-        "marker",
-        "write markers of known size as a PDF to print: in a scene, they give it metres",
-        _marker_arguments,
-        import_lazily("splatnode.capture.calibration.board", "command"),
     ),
     Verb(
         "status",

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin, build_config, merge_config, replace_former_names
 from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.rig import TOLERANCE_S
@@ -29,9 +30,10 @@ from splatnode.recon.verification import decision, evidence
 
 
 class PriorChoice(Plugin):
-    """A module of recon/priors, which gives depth, and matches that plain features miss."""
+    """A module of recon/priors, or one beside it, which gives depth, and matches that plain features miss."""
 
     package = "splatnode.recon.priors"
+    group = plugins.PRIORS
     needs = ("Config", "load")
     usual = "classical"
 
@@ -51,8 +53,8 @@ PREVIEW = training.RefinementConfig(
 class FallbackConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fallbacks, tried before images are rejected or left out for want of matches."""
 
-    # Work up to which a further fallback begins; what has begun is finished. A second of one idle core is about 1, but
-    # it is counted by what is done, not by a clock: the same images get the same work on any machine
+    # Work up to which a further fallback begins, about seconds of one idle core. It counts operations, not time, so
+    # that results do not depend on the machine
     budget: Annotated[float, Meta(ge=0)] = 4.0
     # Time after which no further fallback begins, by the clock. None: no clock decides; in a node it is 4
     timeout_s: Annotated[float, Meta(ge=0)] | None = None

@@ -21,6 +21,7 @@ from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.posed import register_posed
 from splatnode.recon.registration.registration import Registration, register
 from splatnode.recon.registration.resection import compute_pooled_ratio
+from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.snapshot import Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Verdict
@@ -34,6 +35,7 @@ from splatnode.recon.verification.error_model import (
 from splatnode.recon.verification.evidence import Evidence, verify, verify_further
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import explain_refusal, refuse_stereo_or_panorama
+from splatnode.recon.verification.on_rig import compute_placed_bounds, describe_rig
 from splatnode.recon.verification.posed import compute_posed_bounds, decide_posed
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
@@ -58,6 +60,7 @@ class ReconstructionSummary:
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
     moving: Mapping[str, float] = field(default_factory=dict)  # share that was found to move, by keyframe
     given: GivenWorld | None = None  # the world of given poses that hold the cameras; None: none do
+    rig: RigEstimate | None = None  # that the cameras are on; None: they are on none
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,11 @@ class Reconstruction:
         return None if self.registration is None else self.registration.given
 
     @property
+    def rig(self) -> RigEstimate | None:
+        """The rig that the cameras are on; None where they are on none."""
+        return None if self.registration is None else self.registration.rig
+
+    @property
     def bounds(self) -> Mapping[str, Bounds]:
         """Returns the error bounds of each camera, by its keyframe's name; empty where nothing was verified.
 
@@ -94,6 +102,8 @@ class Reconstruction:
         names, cameras = self.graph.names, self.registration.cameras
         covariances = {names[camera.index]: camera.centre_covariance for camera in cameras}
         found = shape_bounds(predict_bounds(self.evidence, FITTED.select_model(self.evidence).claims), covariances)
+        if self.registration.rig is not None:
+            found |= compute_placed_bounds(self.graph, self.registration, self.registration.rig, found)
         wider = PROVISIONALLY_WIDER if self.verdict.provisional else 1.0
         return {name: bounds.widen(wider) for name, bounds in found.items()}
 
@@ -113,7 +123,7 @@ class Reconstruction:
         masked, moving = self._hidden
         ids = {each.name: each.frame.camera_id for each in self.graph.keyframes if each.frame.camera_id}
         told = self.verdict, self.bounds, self.evidence_record, known, ids
-        return ReconstructionSummary(*told, masked=masked, moving=moving, given=self.prior_world)
+        return ReconstructionSummary(*told, masked=masked, moving=moving, given=self.prior_world, rig=self.rig)
 
     @property
     def _hidden(self) -> tuple[dict[str, float], dict[str, float]]:
@@ -177,12 +187,15 @@ def _estimate_from_images(
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
         return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
-    registration = register(graph.keyframes, graph.pairs, config.registration, pause)
+    registration = register(graph.keyframes, graph.pairs, config.registration, pause, config.frame_set_tolerance_s)
     pause()
-    evidence = verify(graph, registration, config.verification, pause)
+    seen = None if registration is None else registration.image_part
+    evidence = verify(graph, seen, config.verification, pause)
     give_back_memory()
-    verdict = explain_refusal(decide(graph, registration, evidence, config.decision), graph)
-    return Reconstruction(graph, registration, evidence, verdict)
+    verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
+    if registration is not None and registration.rig is not None:
+        verdict = describe_rig(verdict, graph, registration.rig)
+    return Reconstruction(graph, registration if verdict.publishable else seen, evidence, verdict)
 
 
 def _estimate_from_poses(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
-from importlib import import_module
 
 from splatnode.recon.config import PriorChoice
 from splatnode.recon.networks import depth_anything
@@ -41,7 +40,7 @@ OTHERS = (
 
 
 def list_learned_parts() -> tuple[LearnedPart, ...]:
-    """The priors that have weights, as recon/priors has them, and the networks of other rooms."""
+    """The priors that have weights, in recon/priors or beside it, and the networks of other rooms."""
     return (*_priors(), *OTHERS)
 
 
@@ -62,7 +61,7 @@ def find_unavailable_reason(part: LearnedPart) -> str:
 
 
 def _priors() -> list[LearnedPart]:
-    modules = {kind: import_module(f"{PriorChoice.package}.{kind}") for kind in PriorChoice.kinds()}
+    modules = {kind: PriorChoice.load_module(kind) for kind in PriorChoice.kinds()}
     return [
         LearnedPart(kind, "prior", module.WEIGHTS, getattr(module, "PACKAGE", None))
         for kind, module in modules.items()

@@ -23,7 +23,7 @@ class ReconstructionCache:
     recent: tuple[tuple[Key, Reconstruction], ...] = ()
     refused: tuple[frozenset[str], ...] = ()  # sets of keyframes for which a thorough estimate forbade a scene
     proven: frozenset[str] = frozenset()  # keyframes of the last thorough estimate that was publishable
-    # Starts of fallbacks that gained nothing (recon.ladder.ladder.fallback_key), and what the verdict then said of them
+    # Starts of fallbacks that gained nothing (recon/fallbacks/run.py), and what the verdict then said of them
     fruitless: tuple[tuple[str, str], ...] = ()
 
     def find_reconstruction(self, key: Key) -> Reconstruction | None:

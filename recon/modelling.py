@@ -25,7 +25,7 @@ from splatnode.recon.priors.pointmap import Pointmap, compute_consistent_depths
 from splatnode.recon.rasterize.dispatch import choose_device
 from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.npz_files import append_consistent_depth
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, InGivenWorld, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, InGivenWorld, OnRig, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import exposure as scene_exposure
 from splatnode.recon.scene import growth, transients
@@ -184,6 +184,7 @@ def snapshot(
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
         given=_find_given_world(conclusion) if scene and final else None,
+        rig=_find_rig(conclusion) if scene and final else None,
         landmarks=conclusion.landmarks if scene and final else None,
         depths=_find_consistent_depths(scene) if scene and final else {},
         masked=conclusion.masked,
@@ -210,6 +211,16 @@ def _find_given_world(conclusion: ReconstructionSummary) -> InGivenWorld | None:
     if given is None:
         return None
     return InGivenWorld(given.scale, given.rotation, given.translation, given.scale_sigma, len(given.held))
+
+
+def _find_rig(conclusion: ReconstructionSummary) -> OnRig | None:
+    """Returns the rig with one mount a camera: of one that moved, the mount of the most frame sets."""
+    rig = conclusion.rig
+    if rig is None:
+        return None
+    mounts = {each.camera_id: each for each in reversed(rig.mounts)}
+    told = tuple((m.camera_id, m.T_rig_camera, m.sigma, m.sigma_deg) for m in reversed(mounts.values()))
+    return OnRig(told, rig.metres_per_unit, rig.scale_sigma)
 
 
 def _falloffs(scene: Scene) -> dict[str, float]:

@@ -24,7 +24,6 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose, group_frame_sets
 from splatnode.capture.lens_file import Lenses, describe_image
-from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, mask_frames, open_masks
 from splatnode.capture.multi_camera import ALL as EVERY_CAMERA
 from splatnode.capture.multi_camera import CameraSet, select_cameras
@@ -82,6 +81,7 @@ class Source:
     frames: tuple[Frame | DroppedFrame, ...]
     photographs: Path | None  # the folder that they lie in; None: they lie in none, as a film's
     choice: Choice | None  # None: all that were asked for are used
+    cameras: CameraSet | None = None  # whose they are; None: they are one camera's, or no source tells
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -238,7 +238,7 @@ def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
     _check_there(request)
-    found = _load_unmasked(request, tell)
+    found = replace(_load_unmasked(request, tell), cameras=request.cameras)
     if request.lenses is not None:
         found = apply_lenses(found, request.lenses)
     return found if request.masks is None else apply_masks(found, open_masks(request.masks), tell)
@@ -306,13 +306,9 @@ def _check_there(request: Request) -> None:
         raise FileNotFoundError(
             f"{str(path)!r} is not there; give a folder that holds photographs, a video, or an MCAP file"
         )
-    if path.is_dir() and data_set.is_data_set(path):
-        first = data_set.list_parts(path)[0]
-        raise ValueError(
-            f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
-            f"{str(film.part_of(path, first))!r}, or an episode with --cameras all, or give it to `splatnode batch`, "
-            "which takes them all"
-        )
+    found = film.find_reader(path) if path.is_dir() else None
+    if found is not None and (why := found[1].explain_many(path)) is not None:
+        raise ValueError(why)
 
 
 def _list_photographs(request: Request) -> Sequence[str]:

@@ -62,6 +62,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="the lens of all photographs, or one of each image or camera: YAML as a camera's configuration has it, a "
         "model of COLMAP (its folder, or cameras.txt), or Kalibr's camchain",
     )
+    parser.add_argument(
+        "--rig",
+        type=Path,
+        metavar="FILE",
+        help="where the cameras of one robot stand to each other, in metres: rig.yaml, COLMAP's rig_config.json, or "
+        "Kalibr's camchain; without it the frame sets tell. What is estimated is rig.yaml of the result",
+    )
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
     add_selection_options(chosen)

@@ -10,34 +10,27 @@ import re
 from pathlib import Path
 from pkgutil import iter_modules
 
+from splatnode.capture.process import plugins
 from splatnode.capture.process.arguments import (
     Verb,
     add_json,
-    angle,
     box,
     import_lazily,
     length,
     megabytes,
-    natural,
     positive,
 )
-from splatnode.recon.batch.verb import BATCH
-from splatnode.recon.evaluate.verbs import BENCH, STABILITY
 from splatnode.recon.metric.arguments import add_marker
 from splatnode.recon.replay_verb import REPLAY
-from splatnode.recon.shared_arguments import add_device, add_multi_view_only
+from splatnode.recon.shared_arguments import add_lens, add_multi_view_only
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
-EXPORT_FORMATS = tuple(
-    sorted(module.name for module in iter_modules([str(_FORMATS_FOLDER)]))
-)  # no import: it takes time
 
 
-def _demo_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
-    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
-    add_device(parser)
-    add_json(parser)
+def list_export_formats() -> tuple[str, ...]:
+    """The names of all formats, without an import, which would take time."""
+    own = (module.name for module in iter_modules([str(_FORMATS_FOLDER)]))
+    return tuple(sorted({*own, *plugins.entry_points(plugins.EXPORT_FORMATS)}))
 
 
 def _recon_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +52,7 @@ def _remove_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
-    parser.add_argument("--to", required=True, choices=EXPORT_FORMATS, help="the format")
+    parser.add_argument("--to", required=True, choices=list_export_formats(), help="the format")
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
     add_multi_view_only(parser)
     parser.add_argument(
@@ -81,35 +74,8 @@ def _locate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "images", type=Path, nargs="+", metavar="IMAGE", help="photographs, or folders of them, by any camera"
     )
-    _add_lens(parser)
+    add_lens(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")
-
-
-def _audit_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("result", type=Path, metavar="RESULT", help="the folder that replay wrote, with landmarks.npz")
-    parser.add_argument(
-        "recordings",
-        type=Path,
-        nargs="+",
-        metavar="RECORDING",
-        help="in the order of time: a folder of photographs (one a camera, of the camera's name, or a folder a "
-        "camera), an MCAP file, a LeRobot data set (each episode), a video, a folder that holds such, or a text file "
-        "that names them, one a line",
-    )
-    _add_lens(parser)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw it into this file (SVG)")
-
-
-def _add_lens(parser: argparse.ArgumentParser) -> None:
-    lens = parser.add_mutually_exclusive_group()
-    lens.add_argument(
-        "--intrinsics",
-        type=Path,
-        metavar="FILE",
-        help="their lens: YAML with width, height, fx, ..., COLMAP's cameras.txt, or Kalibr's camchain",
-    )
-    lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
 
 
 def _occupancy_arguments(parser: argparse.ArgumentParser) -> None:
@@ -142,9 +108,7 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("demo", "reconstruct the built-in capture", _demo_arguments, import_lazily("splatnode.recon.cli", "demo")),
     REPLAY,
-    BATCH,
     Verb(
         "export",
         "write a scene in another format",
@@ -156,12 +120,6 @@ VERBS = (
         "tell where further photographs of a scene were taken",
         _locate_arguments,
         import_lazily("splatnode.recon.locating.command", "locate"),
-    ),
-    Verb(
-        "audit",
-        "tell which camera of a station moved, when and by how much",
-        _audit_arguments,
-        import_lazily("splatnode.recon.auditing.command", "audit"),
     ),
     Verb(
         "occupancy",
@@ -187,8 +145,6 @@ VERBS = (
         _remove_arguments,
         import_lazily("splatnode.recon.daemon.node", "remove_keyframe"),
     ),
-    BENCH,
-    STABILITY,
     Verb(
         "weights",
         "get and check the weights of optional networks",

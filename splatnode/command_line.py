@@ -1,5 +1,7 @@
 """The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
 
+Further verbs are entry points of `splatnode.verbs`, as those of the room `extras` are.
+
 Exit codes: 0 good; 2 usage or configuration; 65 the photographs give no scene, or no lens (the text says why);
 69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted;
 141 nobody reads what is printed any more, as after `| head`.
@@ -26,7 +28,8 @@ import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
 from splatnode.capture import former_names as capture_names
-from splatnode.capture.process.arguments import replace_former_words
+from splatnode.capture.process import plugins
+from splatnode.capture.process.arguments import Verb, replace_former_words
 from splatnode.capture.process.files import default_runtime_directory
 from splatnode.capture.process.library_lines import keep_last_words, tell_last_words
 from splatnode.capture.process.logs import use_plain_lines
@@ -46,6 +49,7 @@ os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 
+# Of the core; further ones are entry points.
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
 # Hidden aliases: no help lists them
 FORMER_VERBS = recon_names.VERBS | capture_names.VERBS
@@ -59,10 +63,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    parser = build_parser()
     words, told = replace_former_words(sys.argv[1:] if argv is None else argv, FORMER_VERBS, FORMER_FLAGS)
     for sentence in told:
         say(f"splatnode: {sentence}", error=True)
+    parser = build_parser(words[0] if words else None)
     args = parser.parse_args(words)
     if args.verb is None:
         parser.print_help(sys.stderr)
@@ -109,7 +113,15 @@ class _Parser(argparse.ArgumentParser):
         super().error(sanitize_lines(message))
 
 
-def build_parser() -> argparse.ArgumentParser:
+def list_verbs() -> tuple[Verb, ...]:
+    """All verbs: those of the core, whose names no other has, then those that are installed beside it."""
+    own = {verb.name for verb in VERBS}
+    further = {verb.name: verb for verb in plugins.load_all(plugins.VERBS).values()}
+    return *VERBS, *(verb for name, verb in further.items() if name not in own)
+
+
+def build_parser(wanted: str | None = None) -> argparse.ArgumentParser:
+    """Returns the parser of all verbs, or of the core's verb `wanted` alone, for which nothing else is loaded."""
     parser = _Parser(
         prog="splatnode",
         description="Photographs in, camera poses and a 3D Gaussian scene out, on a CPU.",
@@ -117,7 +129,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.set_defaults(verb=None)
     verbs = parser.add_subparsers(metavar="VERB")
-    for verb in VERBS:
+    for verb in [verb for verb in VERBS if verb.name == wanted] or list_verbs():
         subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
         verb.add_arguments(subparser)
         subparser.add_argument(

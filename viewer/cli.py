@@ -17,9 +17,9 @@ from splatnode.capture.process.terminal import say, show_progress, show_waiting
 from splatnode.recon.result.rendering import use_threads
 from splatnode.recon.result.stored_snapshot import load_images
 from splatnode.recon.result.submap_index import is_map_set
+from splatnode.viewer.further import find_chosen, load_viewers
 from splatnode.viewer.pictures import update_picture, write_movie, write_series
 from splatnode.viewer.probe import open3d_installed, probe_window
-from splatnode.viewer.rerun_stream import URL, stream
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import BUDGET, FixedSource, LiveSource, Maps, MapSource, Source, load_result, map_moment
 from splatnode.viewer.splash import splash
@@ -40,20 +40,17 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     _check_web(args)
-    if not (args.web or args.viser or args.rerun or args.headless or args.export is not None):
+    further = find_chosen(args)
+    if not (args.web or further or args.headless or args.export is not None):
         return _show_in_window(args)
     with show_waiting("reading the scene"):
         finished, network = _load_finished_source(args), _network(args)
     if args.web:
         where = web.resolve_address(args.listen, web.PORT if args.port is None else args.port, args.key)
         web.show(_source(finished, network), where, _lower_priority, say)
-    if args.viser:
+    if further is not None:
         _lower_priority()
-        viser = import_module("splatnode.viewer.viser")  # an extra
-        viser.show(_source(finished, network), args.listen, viser.PORT if args.port is None else args.port, say)
-    if args.rerun:
-        _lower_priority()
-        stream(_source(finished, network), args.rerun_url or URL)
+        further.show(_source(finished, network), args)
         return EXIT_GOOD
     if args.export is None:
         return _write_pictures(args, finished, network)
@@ -118,14 +115,15 @@ def _check_web(args: argparse.Namespace) -> None:
     if args.key is not None and not args.web:
         raise ValueError("--key needs --web")
     alone = [name for name in ("port", "listen") if getattr(args, name) is not None]
-    if alone and not (args.web or args.viser):
-        raise ValueError(f"--{alone[0]} needs --web or --viser")
-    if args.rerun_url is not None and not args.rerun:
-        raise ValueError("--rerun-url needs --rerun")
-    if args.rerun and (args.web or args.viser or args.headless or args.export is not None):
-        raise ValueError("--rerun shows it in the rerun viewer; leave out --web, --viser, --headless and --export")
-    if args.viser and (args.web or args.headless or args.export is not None):
-        raise ValueError("--viser shows it in a browser; leave out --web, --headless and --export")
+    viewers = load_viewers()
+    further = find_chosen(args)
+    servers = [viewer.name for viewer in viewers if viewer.is_server]
+    if alone and not args.web and (further is None or not further.is_server):
+        raise ValueError(f"--{alone[0]} needs --{' or --'.join(['web', *servers])}")
+    for viewer in viewers:
+        viewer.check(args)
+    if further is not None and (args.web or args.headless or args.export is not None):
+        raise ValueError(f"--{further.name} {further.shows}; leave out --web, --headless and --export")
     if args.web and (args.headless or args.export is not None):
         raise ValueError("--web shows it in a browser; --headless and --export write pictures: one of them at a time")
 

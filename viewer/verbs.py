@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.process.arguments import Verb, address, import_lazily, port, positive, size
+from splatnode.viewer.further import load_viewers
 
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,11 +32,6 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         "this machine's own; from another one, ssh -L leads to it",
     )
     parser.add_argument(
-        "--viser",
-        action="store_true",
-        help="show it in a browser by viser, with the means of that (needs the extra viser); --web lets in fewer",
-    )
-    parser.add_argument(
         "--port", type=port, metavar="N", help="of --web or --viser (default: 8347 or 8080; 0: any that is free)"
     )
     parser.add_argument(
@@ -51,13 +47,9 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="with --web: ask for the key in FILE, made if it is not there; otherwise each start has a new one",
     )
-    parser.add_argument(
-        "--rerun",
-        action="store_true",
-        help="show it in the rerun viewer that runs on this machine, or that ssh -R leads to; of a node each "
-        "update, until Ctrl-C",
-    )
-    parser.add_argument("--rerun-url", metavar="URL", help="of --rerun, where the viewer is elsewhere")
+    for viewer in load_viewers():
+        parser.add_argument(f"--{viewer.name}", action="store_true", help=viewer.summary)
+        viewer.add_arguments(parser)
     parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
     parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")

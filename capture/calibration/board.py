@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.process.files import make_folder, write_atomically
 from splatnode.capture.process.terminal import say
 
@@ -127,11 +128,6 @@ def _string(text: str) -> bytes:
     return b"(" + raw + b")"
 
 
-DICTIONARIES = {
-    name.removeprefix("DICT_"): getattr(cv2.aruco, name)
-    for name in sorted(dir(cv2.aruco))
-    if name.startswith(("DICT_4X4", "DICT_5X5", "DICT_6X6", "DICT_7X7", "DICT_APRILTAG_36h11"))
-}  # by the name that people write, such as 5X5_100
 _TEXT_MM = 3.5
 
 

@@ -1,11 +1,12 @@
-"""`splatnode calibrate` on the command line: its arguments, and what runs it."""
+"""`splatnode calibrate` and `splatnode marker` on the command line: their arguments, and what runs them."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import Verb, import_lazily, millimetres, positive, seconds
+from splatnode.capture.process.arguments import Verb, import_lazily, millimetres, natural, positive, seconds
+from splatnode.capture.process.text import metres_argument
 
 _MODELS = ("auto", "pinhole", "opencv2", "opencv4", "fisheye", "opencv5", "opencv8")
 
@@ -33,9 +34,31 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a change to the camera's configuration")
 
 
+def _marker_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("file", type=Path, metavar="FILE", help="the PDF that is written, such as markers.pdf")
+    add("--side", type=metres_argument, default=0.1, metavar="LENGTH", help="of the black square (default: 100mm)")
+    add("--count", type=positive, metavar="N", help="how many different ones (default: as many as a page holds)")
+    add("--first", type=natural, default=0, metavar="NUMBER", help="of the first one (default: 0)")
+    add("--paper", choices=("a4", "letter"), default="a4", help="default: a4")
+    add(
+        "--dictionary",
+        default="4X4_50",
+        metavar="NAME",
+        help="of OpenCV's ArUco dictionaries (default: 4X4_50), or APRILTAG_36h11",
+    )
+
+
 CALIBRATE = Verb(
     "calibrate",
     "find a camera's lens from a printed board",
     _arguments,
     import_lazily("splatnode.capture.calibration.collect", "calibrate"),
+)
+
+MARKER = Verb(
+    "marker",
+    "write markers of known size as a PDF to print: in a scene, they give it metres",
+    _marker_arguments,
+    import_lazily("splatnode.capture.calibration.board", "command"),
 )

@@ -55,8 +55,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iso: Annotated[int, msgspec.Meta(ge=100, le=1600)] = 400  # sensitivity, with exposure_us
     focus: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None  # position of the lens; None: as it is at the start
     frame_timeout_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # so long without a frame, the camera counts as lost
-    # The left one of the stereo cameras instead of the colour camera: the right one's picture goes with each frame, and
-    # lengths are in metres by the baseline that the camera carries. Rectified on the camera; grey where the sensors are
+    # Use the left stereo camera, not the colour camera, and send the right image with each frame: lengths are metres by
+    # the device's baseline. Rectified on the device; grey where the sensors are
     stereo: bool = False
 
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from splatnode.capture.cameras import video
+from splatnode.capture.film import part_of
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp, rename_frame
 from splatnode.capture.image_file import MaxPixels
-from splatnode.capture.lerobot.data_set import Film, film
+from splatnode.capture.lerobot.data_set import Film, episode_name, film, is_data_set, list_parts, read_info
 from splatnode.capture.pace import Pace, pace_frames
-from splatnode.capture.process.text import LONGEST_NAME, sanitize_name
+from splatnode.capture.process.text import LONGEST_NAME, sanitize_name, sanitize_text
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
@@ -46,6 +48,38 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     )
     early_s = _EARLY / found.rate if found.rate else 0.0
     return pace_frames(_frames(video.stream(part, early_s), found), config.pace)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether this folder is a data set."""
+    return is_data_set(path)
+
+
+def configure_part(path: Path, part: str) -> dict[str, Any]:
+    return {"folder": path, "part": part}
+
+
+def explain_many(path: Path) -> str:
+    """Says that a data set holds many films, and how one is named. Raises UnusableDataSet."""
+    first = list_parts(path)[0]
+    return (
+        f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
+        f"{str(part_of(path, first))!r}, or an episode with --cameras all, or give it to `splatnode batch`, "
+        "which takes them all"
+    )
+
+
+def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]]:
+    """The cameras of an episode. Raises ValueError where `part` is no whole episode, UnusableDataSet."""
+    if not part or "/" in part:
+        first = part_of(path, episode_name(0))
+        shown = repr(sanitize_text(str(part_of(path, part) if part else path)))
+        raise ValueError(f"{shown}: of a data set, several cameras are those of an episode, such as {str(first)!r}")
+    return [(key.split("."), f"{part}/{key}") for key in read_info(path).cameras]
+
+
+def read_rig(path: Path, parts: Mapping[str, str]) -> None:
+    """Returns nothing: a data set does not tell where its cameras stand."""
 
 
 def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
 from splatnode.capture.lens_file import same_aspect
+from splatnode.capture.logged import static_rig
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
 from splatnode.capture.logged.messages import (
     CALIBRATIONS,
@@ -30,10 +32,13 @@ from splatnode.capture.logged.messages import (
 from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_name, sanitize_text
+from splatnode.capture.rig import Rig
 
 log = logging.getLogger(__name__)
 
+SUFFIX = ".mcap"
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the message comes behind it
+_COPIES = ("/compressed", "/theora", "/ffmpeg")  # behind a topic's name: ROS sends its images once more, packed
 _NOT_PHOTOGRAPHS = "/compressedDepth"  # the end of a topic's name: depth that ROS packs into a PNG
 
 
@@ -55,6 +60,32 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         raise FileNotFoundError(f"no file {str(config.file)!r}; give an MCAP file")
     topic = _select_topic(config)
     return pace_frames(_frames(config, topic), config.pace)
+
+
+def is_recording(path: Path) -> bool:
+    return path.suffix.lower() == SUFFIX
+
+
+def configure_part(path: Path, part: str) -> dict[str, Any]:
+    return {"file": path, "topic": part}
+
+
+def explain_many(path: Path) -> None:
+    """A file is a film as a whole where one topic has images; `stream` says so where that is not so."""
+
+
+def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]] | None:
+    """The topics with images, each once; None where one of them is meant. Raises as `image_topics`."""
+    if part or not path.is_file():
+        return None
+    names = [topic.name for topic in image_topics(path)]
+    names = [name for name in names if not any(name == f"{each}{copy}" for each in names for copy in _COPIES)]
+    return [([segment for segment in name.split("/") if segment], name) for name in names]
+
+
+def read_rig(path: Path, parts: Mapping[str, str]) -> Rig:
+    """Returns where the cameras of these topics stand to each other. Raises as `static_rig.read_rig`."""
+    return static_rig.read_rig(path, parts)
 
 
 def image_topics(file: Path) -> list[Topic]:

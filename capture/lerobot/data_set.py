@@ -177,7 +177,7 @@ def _where(folder: Path) -> str:
 def _video(info: Info, key: str, chunk: int, file: int) -> PurePosixPath:
     """The path in the data set, which leads nowhere else."""
     path = PurePosixPath(video_path(info.video_path or "", key, chunk, file))
-    if path.is_absolute() or ".." in path.parts or not str(path).isprintable():
+    if not path.parts or path.is_absolute() or ".." in path.parts or not str(path).isprintable():
         raise UnusableDataSet(
             f"video_path must lead to a file of the data set, it leads to {sanitize_text(path, 200)!r}"
         )

@@ -1,9 +1,9 @@
 """YAML and changes to it -> a typed, frozen Struct. What the Struct does not know fails, with what it does know.
 
 Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
-names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. A field
-whose type is a Mapping of Plugins holds several by name, which is also their kind where they say no other.
-`config_keys` knows internal keys and former names.
+names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. Further
+kinds are installed beside the core (`plugins.py`). A field whose type is a Mapping of Plugins holds several by name,
+which is also their kind where they say no other. `config_keys` knows internal keys and former names.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
@@ -33,6 +32,7 @@ from splatnode.capture.process.config_keys import (
 )
 from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
 from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.plugins import EntryPoint, entry_points
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
@@ -48,13 +48,14 @@ OF_VERBS = {  # keys by which a file is known that was given to another verb
 class Plugin:
     """A module of `package`, chosen by `kind`, with its Config. A room subclasses it and names the package.
 
-    Modules of the package that lack what `needs` names are no plug-ins. `usual` is the kind where none is named.
+    Modules of the package that lack what `needs` names are no plug-ins. `usual` is the kind where none is named. The
+    entry points of `group` name further modules, which lie elsewhere.
     """
 
     package: ClassVar[str]
+    group: ClassVar[str | None] = None
     needs: ClassVar[tuple[str, ...]] = ("Config",)
     usual: ClassVar[str | None] = None
-    entry_points: ClassVar[str | None] = None  # the group by which other packages bring plug-ins; None: none may
     kind: str
     config: Any  # the module's Config
 
@@ -64,47 +65,55 @@ class Plugin:
 
     @classmethod
     def load_module(cls, kind: str) -> ModuleType:
-        """The module of a kind that there is. Raises ConfigError where one of another package does not load."""
-        if kind in cls._names():
+        """Returns the module of `kind`: a file of the package, or what an entry point names.
+
+        Raises ImportError, or ConfigError where one of another package does not load.
+        """
+        entry = None if kind in cls._own_names() else cls._entry_points().get(kind)
+        if entry is None:
             return import_module(f"{cls.package}.{kind}")
-        point, *others = entry_points(group=cls.entry_points or "", name=kind)
-        if others:
-            raise ConfigError(f"{kind}: several packages bring a plug-in of this name; uninstall all but one of them")
-        brought = f"{kind}: the plug-in {point.value}{f' of {point.dist.name}' if point.dist else ''}"
+        brought = f"{kind}: the plug-in {entry.target} of {entry.package}"
         try:
-            module = point.load()
-        except Exception as error:  # it is another's code
+            module = entry.load()
+        except ImportError as error:
+            if entry.is_ours:
+                raise
+            cause = error.__cause__ or error
             raise ConfigError(
-                f"{brought} does not load ({type(error).__name__}: {sanitize_text(error)}); install that package anew, "
+                f"{brought} does not load ({type(cause).__name__}: {sanitize_text(cause)}); install that package anew, "
                 "or choose another kind"
             ) from error
-        missing = [needed for needed in cls.needs if not hasattr(module, needed)]
-        if missing:
-            raise ConfigError(f"{brought} has no {' and no '.join(missing)}; it must be a module that has both")
+        if missing := [needed for needed in cls.needs if not hasattr(module, needed)]:
+            both = "both" if len(cls.needs) == 2 else " and ".join(cls.needs)
+            raise ConfigError(f"{brought} has no {' and no '.join(missing)}; it must be a module that has {both}")
         return module
 
     @classmethod
-    def kinds_elsewhere(cls) -> list[str]:
-        """The names of plug-ins that other packages bring; none of them is imported. Ours count before theirs."""
-        found = entry_points(group=cls.entry_points) if cls.entry_points else ()
-        return sorted({point.name for point in found}.difference(cls._names()))
-
-    @classmethod
     def kinds(cls) -> list[str]:
-        """All there are. It imports every module of the package, to see what each has."""
-        return [name for name in cls._names() if cls.is_kind(name)]
+        """All there are, those of other packages last. It imports every module of the package, and no entry point's."""
+        brought = {name for name, entry in cls._entry_points().items() if not entry.is_ours} - cls._own_names()
+        return [name for name in sorted(cls._names() - brought) if cls.is_kind(name)] + sorted(brought)
 
     @classmethod
     def is_kind(cls, name: object) -> bool:
         """Whether there is a plug-in of this name; no other module is imported."""
-        if name not in cls._names():
-            return False
+        own = cls._own_names()
+        if name not in own:
+            return name in cls._entry_points()
         module = import_module(f"{cls.package}.{name}")
         return all(hasattr(module, needed) for needed in cls.needs)
 
     @classmethod
-    def _names(cls) -> list[str]:
-        return sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
+    def _names(cls) -> set[str]:
+        return {*cls._own_names(), *cls._entry_points()}
+
+    @classmethod
+    def _own_names(cls) -> set[str]:
+        return {module.name for module in iter_modules(import_module(cls.package).__path__)}
+
+    @classmethod
+    def _entry_points(cls) -> Mapping[str, EntryPoint]:
+        return {} if cls.group is None else entry_points(cls.group)
 
 
 def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
@@ -200,7 +209,7 @@ def _replace_names(raw: Any, schema: Any, base: Any, place: KeyPlace) -> Any:
         }
     if isinstance(schema, type) and issubclass(schema, Plugin):
         kind = raw.get("kind", base.get("kind", schema.usual))
-        if not (schema.is_kind(kind) or kind in schema.kinds_elsewhere()):
+        if not schema.is_kind(kind):
             return raw  # which is refused where the whole is read
         try:
             module = schema.load_module(str(kind))
@@ -263,9 +272,8 @@ def _add_kind(kind: object, raw: Any) -> Any:
 
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
-    elsewhere = schema.kinds_elsewhere()
-    if not (kind in elsewhere or schema.is_kind(kind)):
-        known = ", ".join([*schema.kinds(), *elsewhere])
+    if not schema.is_kind(kind):
+        known = ", ".join(schema.kinds())
         raise ConfigError(f"{join_keys(where, 'kind')}: expected one of {known}, got {sanitize_text(repr(kind), 100)}")
     try:
         module = schema.load_module(str(kind))

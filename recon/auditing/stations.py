@@ -12,6 +12,7 @@ from pathlib import Path
 from splatnode.capture import film
 from splatnode.capture.cameras import folder as cameras_folder
 from splatnode.capture.cameras.folder import explain_unreadable_file, frame_name, image_paths
+from splatnode.capture.cameras.mcap import SUFFIX as MCAP
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lens_file import assign_lens
 from splatnode.capture.lerobot import data_set
@@ -186,7 +187,7 @@ def _make_shot(path: Path, named: Path) -> _Shot | _Unreadable:
         if part and data_set.is_data_set(file):
             number, key = data_set.episode_and_camera(file, data_set.read_info(file), part)
             return _Shot((*file.parts, data_set.episode_name(number)), sanitize_name(key), Film(path))
-        if not part and (data_set.is_data_set(file) or file.suffix.lower() == film.MCAP):
+        if not part and (data_set.is_data_set(file) or file.suffix.lower() == MCAP):
             batch.list_parts(file)  # which has found none; one of both tells why
             film.stream(file)
     except ModuleNotFoundError as error:
@@ -194,7 +195,7 @@ def _make_shot(path: Path, named: Path) -> _Shot | _Unreadable:
     except (ValueError, OSError) as error:
         raise_shortage(error)
         return _Unreadable(path.parts, str(error))
-    if part and file.suffix.lower() == film.MCAP:
+    if part and file.suffix.lower() == MCAP:
         return _Shot(file.parts, sanitize_name(part), Film(path))
     if path == named:
         return _Shot(path.parts, _ONE_CAMERA, Film(path))

@@ -143,7 +143,7 @@ def list_parts(path: Path) -> list[str]:
 
     Raises ValueError, OSError and ModuleNotFoundError where it cannot be read.
     """
-    if path.suffix.lower() == film.MCAP and path.is_file():
+    if path.suffix.lower() == mcap.SUFFIX and path.is_file():
         return [topic.name for topic in mcap.image_topics(path)]
     return data_set.list_parts(path) if data_set.is_data_set(path) else []
 
@@ -207,7 +207,7 @@ def _below(folder: Path) -> list[Path] | None:
     visible = (
         path for path in folder.iterdir() if not path.name.startswith(".") and not path.name.endswith(OWN_SUFFIX)
     )
-    films = {*VIDEOS, film.MCAP}
+    films = {*VIDEOS, mcap.SUFFIX}
     chosen = [path for path in visible if _is(path.is_dir) or (path.suffix.lower() in films and _is(path.is_file))]
     return sorted(chosen, key=natural_order)
 
@@ -221,7 +221,7 @@ def _label(path: Path, source: Path | None = None) -> str:
         below = [own.parent.name] if own.name == _PHOTOGRAPHS else [own.name]
     elif below[-1] == _PHOTOGRAPHS:
         below.pop()
-    if own.suffix.lower() in {*VIDEOS, film.MCAP}:
+    if own.suffix.lower() in {*VIDEOS, mcap.SUFFIX}:
         below[-1] = Path(below[-1]).stem
     return _name([*below, *part.split("/")])
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture import film
+from splatnode.capture.cameras.mcap import SUFFIX as MCAP
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.logged.mcap import topics
 from splatnode.capture.logged.messages import read_times
@@ -50,10 +51,10 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
         file, part = film.file_and_part(Path(row.source))
-        if part and not row.has_failed and (file.is_dir() or file.suffix.lower() == film.MCAP):
+        if part and not row.has_failed and (file.is_dir() or file.suffix.lower() == MCAP):
             found[file].append((part, row))
     for file, parts in found.items():
-        write = _write_log if file.suffix.lower() == film.MCAP else _write_data_set
+        write = _write_log if file.suffix.lower() == MCAP else _write_data_set
         try:
             with _lock_exclusively(file):
                 sentence = write(file, parts, out, in_place)

@@ -21,6 +21,9 @@ std::vector<int> free_parameters(const Bundle& bundle) {
         if (i / kPose != bundle.fixed_camera) kept.push_back(i);
     for (int k = 0; k < kLens * bundle.num_lenses; ++k)
         if (is_free(bundle, k)) kept.push_back(kPose * bundle.num_cameras + k);
+    for (int i = 0; i < kPose * bundle.num_sets; ++i) kept.push_back(first_set(bundle) + i);
+    for (int i = 0; i < kPose * bundle.num_mounts; ++i)
+        if (!(bundle.given_mount_information[2 * (i / kPose)] < 0)) kept.push_back(first_mount(bundle) + i);
     return kept;
 }
 
@@ -51,6 +54,7 @@ bool solve(const System& system, const std::vector<int>& kept, std::vector<doubl
 // The parameters of a bundle, to be kept and put back.
 struct State {
     std::vector<double> rotations, translations, log_focals, radials, shifts, log_aspects, points;
+    std::vector<double> set_rotations, set_translations, mount_rotations, mount_translations;
 
     explicit State(const Bundle& b)
         : rotations(b.rotations, b.rotations + 9 * b.num_cameras),
@@ -59,7 +63,11 @@ struct State {
           radials(b.radials, b.radials + 2 * b.num_lenses),
           shifts(b.shifts, b.shifts + 2 * b.num_lenses),
           log_aspects(b.log_aspects, b.log_aspects + b.num_lenses),
-          points(b.points, b.points + 3 * size_t(b.num_points)) {}
+          points(b.points, b.points + 3 * size_t(b.num_points)),
+          set_rotations(b.set_rotations, b.set_rotations + 9 * b.num_sets),
+          set_translations(b.set_translations, b.set_translations + 3 * b.num_sets),
+          mount_rotations(b.mount_rotations, b.mount_rotations + 9 * b.num_mounts),
+          mount_translations(b.mount_translations, b.mount_translations + 3 * b.num_mounts) {}
 
     void put_back(const Bundle& b) const {
         std::copy(rotations.begin(), rotations.end(), b.rotations);
@@ -69,6 +77,10 @@ struct State {
         std::copy(shifts.begin(), shifts.end(), b.shifts);
         std::copy(log_aspects.begin(), log_aspects.end(), b.log_aspects);
         std::copy(points.begin(), points.end(), b.points);
+        std::copy(set_rotations.begin(), set_rotations.end(), b.set_rotations);
+        std::copy(set_translations.begin(), set_translations.end(), b.set_translations);
+        std::copy(mount_rotations.begin(), mount_rotations.end(), b.mount_rotations);
+        std::copy(mount_translations.begin(), mount_translations.end(), b.mount_translations);
     }
 };
 
@@ -82,10 +94,15 @@ void move(const Bundle& bundle, const System& system, const std::vector<double>&
                 for (int i = 0; i < 3; ++i) at[i] -= system.spread[(size_t(o) * kOwn + k) * 3 + i] * by;
             }
     }
-    for (int camera = 0; camera < bundle.num_cameras; ++camera) {
-        turn(bundle.rotations + 9 * camera, &step[kPose * camera]);
-        for (int i = 0; i < 3; ++i) bundle.translations[3 * camera + i] += step[kPose * camera + 3 + i];
-    }
+    const auto move_poses = [&](double* rotations, double* translations, int count, int start) {
+        for (int pose = 0; pose < count; ++pose) {
+            turn(rotations + 9 * pose, &step[start + kPose * pose]);
+            for (int i = 0; i < 3; ++i) translations[3 * pose + i] += step[start + kPose * pose + 3 + i];
+        }
+    };
+    move_poses(bundle.rotations, bundle.translations, bundle.num_cameras, 0);
+    move_poses(bundle.set_rotations, bundle.set_translations, bundle.num_sets, first_set(bundle));
+    move_poses(bundle.mount_rotations, bundle.mount_translations, bundle.num_mounts, first_mount(bundle));
     for (int g = 0; g < bundle.num_lenses; ++g) {
         const double* of_lens = &step[kPose * bundle.num_cameras + kLens * g];
         bundle.log_focals[g] += std::clamp(of_lens[0], -0.5, 0.5);
@@ -133,7 +150,8 @@ CORE_API double core_bundle_adjust(const Bundle* bundle, int max_iterations, dou
     return cost;
 }
 
-// The normal matrix of all poses and lenses with the points eliminated, (6 C + 6 G, 6 C + 6 G), without damping.
+// The normal matrix of all poses, lenses, frame sets and mounts with the points eliminated, without damping:
+// (6 C + 6 G + 6 S + 6 M) on a side.
 CORE_API void core_bundle_information(const Bundle* bundle, double* matrix) {
     System system(*bundle);
     assemble(*bundle, 0.0, system);

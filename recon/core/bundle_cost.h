@@ -31,6 +31,14 @@ struct Bundle {
     // Given poses, world to camera: rotations (C, 3, 3), centres (C, 3), and the information (6 C, 6 C) of their errors in
     // the cameras' axes, of each a turn and a shift; 0 on the diagonal: nothing is given. Null: nothing of any camera.
     const double *given_rotations, *given_centres, *given_information;
+    // A rig: cameras of a frame set have one pose together, and each its mount on the rig. Rotations (., 3, 3) and
+    // translations (., 3) of S sets, world to rig, and of M mounts, rig to camera, are parameters after the lenses.
+    double *set_rotations, *set_translations, *mount_rotations, *mount_translations;
+    const int32_t *set_of_camera, *mount_of_camera;  // (C,) -1: this camera is in no frame set
+    const double* rig_information;                   // (C, 2) of a turn and of a shift between camera and rig
+    // Given mounts as given poses are: (M, 3, 3), (M, 3), (M, 2); a negative information fixes the mount.
+    const double *given_mount_rotations, *given_mount_centres, *given_mount_information;
+    int32_t num_sets, num_mounts;
 };
 
 struct Projection {
@@ -92,12 +100,12 @@ inline bool is_free(const Bundle& bundle, int parameter) {
     return bundle.prior_information[size_t(parameter) * (kLens * bundle.num_lenses) + parameter] > 0;
 }
 
-// How far a camera is from its given pose, in its own axes: the turn (3) and the shift (3), and what they depend on.
+// How far a pose is from a given one, in its own axes: the turn (3) and the shift (3), and what they depend on.
 struct PoseDeviation {
-    double turn[3], shift[3], seen[3];  // seen: the given centre from the camera's origin of translation, R c
+    double turn[3], shift[3], seen[3];  // seen: the given centre from the pose's origin of translation, R c
 
-    PoseDeviation(const Bundle& bundle, int camera) {
-        const double *rotation = bundle.rotations + 9 * camera, *given = bundle.given_rotations + 9 * camera;
+    // `rotation` (3, 3) and `translation` (3) of the pose, `given` (3, 3) and `centre` (3) of the given one.
+    PoseDeviation(const double* rotation, const double* translation, const double* given, const double* centre) {
         double by[3][3];
         for (int i = 0; i < 3; ++i) {
             for (int j = 0; j < 3; ++j) {
@@ -105,8 +113,8 @@ struct PoseDeviation {
                 for (int k = 0; k < 3; ++k) by[i][j] += rotation[3 * i + k] * given[3 * j + k];
             }
             seen[i] = 0;
-            for (int k = 0; k < 3; ++k) seen[i] += rotation[3 * i + k] * bundle.given_centres[3 * camera + k];
-            shift[i] = seen[i] + bundle.translations[3 * camera + i];
+            for (int k = 0; k < 3; ++k) seen[i] += rotation[3 * i + k] * centre[k];
+            shift[i] = seen[i] + translation[i];
         }
         const double half[3] = {(by[2][1] - by[1][2]) / 2, (by[0][2] - by[2][0]) / 2, (by[1][0] - by[0][1]) / 2};
         const double sine = std::sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2]);
@@ -115,6 +123,44 @@ struct PoseDeviation {
         for (int i = 0; i < 3; ++i) turn[i] = factor * half[i];
     }
 };
+
+inline PoseDeviation deviate_camera(const Bundle& b, int i) {
+    return {b.rotations + 9 * i, b.translations + 3 * i, b.given_rotations + 9 * i, b.given_centres + 3 * i};
+}
+
+inline PoseDeviation deviate_mount(const Bundle& b, int i) {
+    return {b.mount_rotations + 9 * i, b.mount_translations + 3 * i, b.given_mount_rotations + 9 * i,
+            b.given_mount_centres + 3 * i};
+}
+
+// The pose that a camera has by the rig, world to camera: that of its frame set, then its mount.
+struct RigPose {
+    double rotation[9], translation[3], centre[3];
+
+    RigPose(const Bundle& bundle, int camera) {
+        const int set = bundle.set_of_camera[camera], mount = bundle.mount_of_camera[camera];
+        const double *m = bundle.mount_rotations + 9 * mount, *s = bundle.set_rotations + 9 * set;
+        for (int i = 0; i < 3; ++i) {
+            translation[i] = bundle.mount_translations[3 * mount + i];
+            for (int k = 0; k < 3; ++k) translation[i] += m[3 * i + k] * bundle.set_translations[3 * set + k];
+            for (int j = 0; j < 3; ++j) {
+                rotation[3 * i + j] = 0;
+                for (int k = 0; k < 3; ++k) rotation[3 * i + j] += m[3 * i + k] * s[3 * k + j];
+            }
+        }
+        for (int j = 0; j < 3; ++j) {
+            centre[j] = 0;
+            for (int i = 0; i < 3; ++i) centre[j] -= rotation[3 * i + j] * translation[i];
+        }
+    }
+};
+
+inline double deviation_cost(const PoseDeviation& d, const double* information) {
+    double cost = 0;
+    for (int i = 0; i < 3; ++i)
+        cost += information[0] * d.turn[i] * d.turn[i] + information[1] * d.shift[i] * d.shift[i];
+    return cost;
+}
 
 // What pulls the cameras: Gaussian priors on how far they are from their given poses, which may depend on each other.
 struct PosePriors {
@@ -128,7 +174,7 @@ struct PosePriors {
         for (int camera = 0; camera < bundle.num_cameras; ++camera) {
             if (!(information(bundle, camera, 0)[kPose * camera] > 0)) continue;
             cameras.push_back(camera);
-            seen.emplace_back(bundle, camera);
+            seen.push_back(deviate_camera(bundle, camera));
             deviations.insert(deviations.end(), seen.back().turn, seen.back().turn + 3);
             deviations.insert(deviations.end(), seen.back().shift, seen.back().shift + 3);
         }
@@ -154,6 +200,24 @@ struct PosePriors {
     }
 };
 
+// What the rig says: how far cameras are from where their frame sets and mounts have them, and mounts from given ones.
+static double rig_cost(const Bundle& bundle) {
+    if (bundle.num_sets == 0) return 0;
+    double cost = 0;
+    for (int camera = 0; camera < bundle.num_cameras; ++camera) {
+        if (bundle.set_of_camera[camera] < 0) continue;
+        const RigPose by_rig(bundle, camera);
+        const double *rotation = bundle.rotations + 9 * camera, *translation = bundle.translations + 3 * camera;
+        const PoseDeviation d(rotation, translation, by_rig.rotation, by_rig.centre);
+        cost += deviation_cost(d, bundle.rig_information + 2 * camera);
+    }
+    for (int mount = 0; mount < bundle.num_mounts; ++mount) {
+        const double* information = bundle.given_mount_information + 2 * mount;
+        if (information[0] > 0 || information[1] > 0) cost += deviation_cost(deviate_mount(bundle, mount), information);
+    }
+    return cost;
+}
+
 static double total_cost(const Bundle& bundle) {
     std::vector<double> costs(kChunks, 0.0);
     run_parallel(kChunks, [&](int chunk, int) {
@@ -169,7 +233,7 @@ static double total_cost(const Bundle& bundle) {
     });
     double cost = 0;
     for (const double value : costs) cost += value;
-    return cost + LensPriors(bundle).cost() + PosePriors(bundle).cost();
+    return cost + LensPriors(bundle).cost() + PosePriors(bundle).cost() + rig_cost(bundle);
 }
 
 // Derivatives of a residual (2) by its camera's pose and lens (12) and by its point (3), and its weight.

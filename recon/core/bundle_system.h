@@ -19,6 +19,10 @@ namespace {
 constexpr double kFloor = 1e-12;  // added to diagonals that damping scales
 constexpr int kRowsPerTask = 16;   // of the system, when the chunks are added up
 
+// Where the parameters of frame sets and of mounts begin.
+inline int first_set(const Bundle& bundle) { return kPose * bundle.num_cameras + kLens * bundle.num_lenses; }
+inline int first_mount(const Bundle& bundle) { return first_set(bundle) + kPose * bundle.num_sets; }
+
 // Parameters of one camera or lens that a point touches: `size` of them from `start` on, and their place among the
 // columns of the point.
 struct Block {
@@ -42,7 +46,7 @@ struct System {
     std::vector<Sums> sums;        // of each chunk
 
     explicit System(const Bundle& bundle)
-        : size(kPose * bundle.num_cameras + kLens * bundle.num_lenses),
+        : size(first_mount(bundle) + kPose * bundle.num_mounts),
           matrix(size_t(size) * size),
           gradient(size),
           spread(size_t(bundle.first_of_point[bundle.num_points]) * 3 * kOwn),
@@ -200,6 +204,68 @@ void add_given_poses(const Bundle& bundle, double damping, System& system) {
     }
 }
 
+// What a given mount says of its own, as a given pose does of its camera.
+void add_given_mount(const Bundle& bundle, int mount, double damping, System& system) {
+    const double* information = bundle.given_mount_information + 2 * mount;
+    if (!(information[0] > 0 || information[1] > 0)) return;
+    const PoseDeviation d = deviate_mount(bundle, mount);
+    double by_pose[kPose][kPose];
+    differentiate_deviation(d, by_pose);
+    const int start = first_mount(bundle) + kPose * mount;
+    for (int i = 0; i < kPose; ++i) {
+        double* row = &system.matrix[size_t(start + i) * system.size + start];
+        for (int k = 0; k < kPose; ++k) {
+            const double weighed = information[k / 3] * by_pose[k][i];
+            system.gradient[start + i] += weighed * (k < 3 ? d.turn[k] : d.shift[k - 3]);
+            for (int j = 0; j <= i; ++j) row[j] += weighed * by_pose[k][j] * (i == j ? 1 + damping : 1.0);
+        }
+    }
+}
+
+// The lines of a cross product with v: cross(v, w) = product w.
+inline void fill_cross(const double* v, double (&product)[3][3]) {
+    const double rows[3][3] = {{0, -v[2], v[1]}, {v[2], 0, -v[0]}, {-v[1], v[0], 0}};
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) product[i][j] = rows[i][j];
+}
+
+// What a rig says of a camera, its frame set and its mount. The deviations are a turn (3) and a shift (3); turns are
+// small, as above.
+void add_rig(const Bundle& bundle, int camera, double damping, System& system) {
+    const int set = bundle.set_of_camera[camera], mount = bundle.mount_of_camera[camera];
+    if (set < 0) return;
+    const RigPose by_rig(bundle, camera);
+    const PoseDeviation d(bundle.rotations + 9 * camera, bundle.translations + 3 * camera, by_rig.rotation,
+                          by_rig.centre);
+    const double* of_mount = bundle.mount_rotations + 9 * mount;
+    double seen[3][3], placed[3][3], offset[3][3], by[6][18] = {};
+    fill_cross(d.seen, seen);
+    fill_cross(by_rig.translation, placed);
+    fill_cross(bundle.mount_translations + 3 * mount, offset);
+    for (int i = 0; i < 3; ++i) {
+        by[i][i] = by[3 + i][3 + i] = 1;
+        by[i][12 + i] = by[3 + i][15 + i] = -1;
+        for (int j = 0; j < 3; ++j) {
+            by[3 + i][j] = -seen[i][j];
+            by[3 + i][12 + j] = -offset[i][j];
+            by[i][6 + j] = by[3 + i][9 + j] = -of_mount[3 * i + j];
+            for (int k = 0; k < 3; ++k) by[3 + i][6 + j] -= placed[i][k] * of_mount[3 * k + j];
+        }
+    }
+    const int starts[3] = {kPose * camera, first_set(bundle) + kPose * set, first_mount(bundle) + kPose * mount};
+    const double* information = bundle.rig_information + 2 * camera;
+    for (int a = 0; a < 18; ++a) {
+        const int row = starts[a / 6] + a % 6;
+        double* of_row = &system.matrix[size_t(row) * system.size];
+        for (int i = 0; i < 6; ++i) {
+            const double weighed = information[i / 3] * by[i][a];
+            system.gradient[row] += weighed * (i < 3 ? d.turn[i] : d.shift[i - 3]);
+            for (int b = 0; b <= a; ++b) of_row[starts[b / 6] + b % 6] += weighed * by[i][b];
+            of_row[row] += damping * weighed * by[i][a];
+        }
+    }
+}
+
 void assemble(const Bundle& bundle, double damping, System& system) {
     const int size = system.size;
     run_parallel(kChunks, [&](int chunk, int) {
@@ -236,6 +302,9 @@ void assemble(const Bundle& bundle, double damping, System& system) {
         system.gradient[first + i] += priors.pull[i];
     }
     add_given_poses(bundle, damping, system);
+    if (bundle.num_sets == 0) return;
+    for (int camera = 0; camera < bundle.num_cameras; ++camera) add_rig(bundle, camera, damping, system);
+    for (int mount = 0; mount < bundle.num_mounts; ++mount) add_given_mount(bundle, mount, damping, system);
 }
 
 }  // namespace

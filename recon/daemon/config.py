@@ -32,19 +32,17 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # else in ~/.local/state/splatnode.
     checkpoint: Path | None = None
     out: Path = Path("out")  # folder of the results: each submap is a folder in it, scene-0001 and so on
-    # Keyframes of a submap, at most. When a further one fits, the next submap begins with it and the newest third, and
-    # the full one is finalized as an inactive submap; where the newest alone make no scene, the keyframe that has most
-    # in common with another is removed. Higher: fewer, larger submaps, and more time for each keyframe.
+    # Keyframes of a submap, at most. The next submap begins with a further one and the newest third; where these make
+    # no scene, the most redundant keyframe is removed. Higher: fewer, larger submaps, more time for each keyframe.
     max_views: Annotated[int, msgspec.Meta(ge=4, le=MAX_CAMERAS)] = 30
     max_gaussians: Positive = 300_000  # of a submap, at most; `reconstruction.max_gaussians` may be lower
-    # Idle finalize: after so long without a keyframe the active submap is verified and rebuilt from all its keyframes.
-    # That takes seconds for which a keyframe would have to wait: with one every two seconds there is no time for it.
+    # Idle finalize: after so long without a keyframe the active submap is verified and rebuilt from all its keyframes,
+    # for which a new keyframe waits some seconds.
     idle_finalize_s: Annotated[float, msgspec.Meta(ge=0)] = 3.0
-    # So many untracked keyframes in a row begin a new submap. Higher: a few poor keyframes begin none, but more
-    # keyframes of another place are taken before its submap begins.
+    # So many untracked keyframes in a row begin a new submap. Higher: poor keyframes begin none, but a new submap
+    # begins later.
     new_submap_after: Annotated[int, msgspec.Meta(ge=3)] = 3
-    # Time for fallbacks while a submap is finalized, all rounds together: keyframes that do not belong to it are
-    # matched in further ways. Higher: a submap of weak matches may keep more keyframes, and is final later
+    # Time for all fallbacks while a submap is finalized. Higher: more weakly matched keyframes, and final later
     fallback_timeout_s: Annotated[float, msgspec.Meta(ge=0)] = 20.0
     export_interval_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # between provisional results, while a submap grows
     # Between messages on the state of the process, which `splatnode status` shows

@@ -5,9 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import Verb, counts, import_lazily, names, positive, seconds
+from splatnode.capture.process.arguments import Verb, add_json, counts, import_lazily, names, natural, positive, seconds
 from splatnode.recon.jobs.arguments import add_max_memory, add_ray
 from splatnode.recon.shared_arguments import add_device
+
+
+def _demo_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
+    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
+    add_device(parser)
+    add_json(parser)
 
 
 def _bench_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,11 +115,18 @@ def _add_engine(parser: argparse.ArgumentParser, several: str, one: str, timeout
     )
 
 
+DEMO = Verb(
+    "demo",
+    "reconstruct the built-in capture",
+    _demo_arguments,
+    import_lazily("splatnode.recon.evaluate.command", "demo"),
+)
+
 BENCH = Verb(
     "bench",
     "measure held-out quality, poses and seconds",
     _bench_arguments,
-    import_lazily("splatnode.recon.cli", "bench"),
+    import_lazily("splatnode.recon.evaluate.command", "bench"),
 )
 
 STABILITY = Verb(

@@ -33,7 +33,7 @@ from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.submap_index import FILE
 
-_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "rig")
 
 
 def replay_map(args: argparse.Namespace, request: Request, config: ReconstructionConfig) -> int:

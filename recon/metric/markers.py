@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.calibration.board import DICTIONARIES
+from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.process.text import format_length

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.calibration.board import DICTIONARIES
+from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.registration.undistortion import radial_of
@@ -99,8 +99,7 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poses_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = 2.0  # and of each orientation about each axis
     # Standard deviation of how far given poses have drifted at the end of the way, as a share of it; 0: not at all
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.02
-    # Standard deviation of an error that all motions between photographs share, as a share of their length: the radius
-    # of wheels is not exactly what it is taken for
+    # Standard deviation of the error that all motions share, as a share of their length, as of the wheels' radius
     odometry_scale_sigma: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.01
     # Standard deviation of a motion that comes without one: in each direction, as a share of its length
     odometry_drift: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = MOTION_DRIFT

@@ -105,6 +105,9 @@ def _collect_measurements(
             found = offset
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
+    if snapshot.rig is not None and snapshot.rig.metres_per_unit is not None:
+        known = f"the given rig of {len(snapshot.rig.mounts)} cameras"
+        said.append(Measurement(snapshot.rig.metres_per_unit, snapshot.rig.scale_sigma, known))
     said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.odometry_scale_sigma)
     for (baseline_m, sigma_m), pairs in _group_stereo_pairs(config, evidence).items():
         said.append(
@@ -183,5 +186,6 @@ def _transform_snapshot(snapshot: Snapshot, by: Similarity) -> Snapshot:
         gaussians=placement.transform_gaussians(snapshot.gaussians),
         landmarks=landmarks,
         given=None,
+        rig=None if snapshot.rig is None else snapshot.rig.rescale(by.scale),
         depths={name: (depth * factor).astype(np.float16) for name, depth in snapshot.depths.items()},
     )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
+import io
 import os
 import pickle
 import re
@@ -371,11 +373,15 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         raise FileNotFoundError(2, "no such checkpoint (splatnode weights tells where it can be had)", str(path))
     if path.suffix == ".safetensors":
         return _check_tensors(_read_safetensors(path), path)
-    _check_archive(path)
+    is_archive = _check_archive(path)
     try:
         # Only plain data and this one class, which holds attributes and does nothing, are let through.
-        with ignore_file_warnings(), torch.serialization.safe_globals([argparse.Namespace]):
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
+        with (
+            ignore_file_warnings(),
+            torch.serialization.safe_globals([argparse.Namespace]),
+            contextlib.nullcontext(path) if is_archive else _FileOfItsSize(io.FileIO(path)) as file,
+        ):
+            content = torch.load(file, map_location="cpu", weights_only=True, mmap=is_archive)
     except pickle.UnpicklingError as error:
         named = re.search(r"GLOBAL ([\w.]+)", str(error))
         what = f"it wants to run {named[1]}" if named else "it is not a PyTorch checkpoint of plain data"
@@ -404,11 +410,22 @@ def _check_tensors(weights: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
     return weights
 
 
-def _check_archive(path: Path) -> None:
-    """Raises ValueError where a file of PyTorch's, which is a ZIP archive, would be unpacked to more than its bytes."""
-    if not zipfile.is_zipfile(path):
-        return
+class _FileOfItsSize(io.BufferedReader):
+    """A file that allocates no more than it holds when it is asked for more, as a pickle's lengths may ask."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        held = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
+        return super().read(held if size is None or size < 0 else min(size, held))
+
+
+def _check_archive(path: Path) -> bool:
+    """Returns whether the file is a ZIP archive, as PyTorch writes since 1.6.
+
+    Raises ValueError where it would be unpacked to more than its bytes.
+    """
     try:
+        if not zipfile.is_zipfile(path):  # which raises BadZipFile, too
+            return False
         with zipfile.ZipFile(path) as archive:
             parts = archive.infolist()
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
@@ -418,6 +435,7 @@ def _check_archive(path: Path) -> None:
         raise ValueError(
             f"{path} is packed, as no checkpoint of PyTorch is: it was not unpacked; take the official file"
         )
+    return True
 
 
 def check_names_and_shapes(

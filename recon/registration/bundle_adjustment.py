@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from splatnode.recon.core import library, pointer
 from splatnode.recon.geometry import cross_matrix, distortion, undistort_rays
+from splatnode.recon.registration.rig_constraint import NO_RIG, RigConstraint
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -97,6 +98,7 @@ class Problem:
     pixels: Array  # (O, 2) relative to the nominal principal point
     log_aspects: Array | None = None  # (G,) log of the focal length down over that across; None: pixels are square
     given: GivenPoses | None = None  # what holds the cameras; None: nothing, so that one of them is fixed
+    rig: RigConstraint | None = None  # what ties cameras that took their images together; None: nothing
 
     @property
     def aspects(self) -> Array:
@@ -299,6 +301,7 @@ class Covariance:
 
     joint: Array  # (6 C, 6 C) of the cameras' rotation vectors (radians) and translations, world to camera
     log_focals: Array  # (G,) variances; 0 where the focal length is fixed
+    rig: Array | None = None  # (6 C + 6 M, 6 C + 6 M) of the cameras and the mounts of their rig; None: there is none
 
     @property
     def cameras(self) -> Array:
@@ -316,25 +319,32 @@ def covariance(problem: Problem, prior: LensPrior, config: BundleAdjustmentConfi
     problem = _sort_by_point(problem)
     native, _arrays = _native(problem, prior, config, fixed_camera)
     count, num_lenses = len(problem.rotations), len(problem.log_focals)
-    information = np.empty((_POSE * count + _LENS * num_lenses,) * 2)
+    rig = problem.rig or NO_RIG
+    num_sets, num_mounts, of_poses = rig.num_sets, rig.num_mounts, _POSE * count + _LENS * num_lenses
+    information = np.empty((of_poses + _POSE * (num_sets + num_mounts),) * 2)
     library().core_bundle_information(ctypes.byref(native), pointer(information))
     free = np.ones(len(information), bool)
     observed = np.bincount(problem.camera_of, minlength=count) > 0
     scaled = np.zeros(len(information))
+    if problem.rig is not None:
+        observed |= problem.rig.set_of_camera >= 0
     if problem.given is None:
         free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
-        scaled = _scale_direction(problem, fixed_camera)
+        scaled = scaled if rig.holds_scale else _scale_direction(problem, fixed_camera)
     else:
         observed |= problem.given.is_held
-    free[_POSE * count :] = prior.free.ravel()
+    free[_POSE * count : of_poses] = prior.free.ravel()
     free[: _POSE * count] &= np.repeat(observed, _POSE)
+    free[of_poses + _POSE * num_sets :] = np.repeat(~rig.is_fixed, _POSE)
     (kept,) = np.nonzero(free)
     inverse = _gauge_free_inverse(information[np.ix_(kept, kept)], scaled[kept])
     full = np.zeros_like(information)
     full[np.ix_(kept, kept)] = inverse * config.noise_px**2
+    with_rig = np.r_[: _POSE * count, of_poses + _POSE * num_sets : len(full)]
     return Covariance(
         joint=full[: _POSE * count, : _POSE * count],
-        log_focals=np.diag(full)[_POSE * count :: _LENS],
+        log_focals=np.diag(full)[_POSE * count : of_poses : _LENS],
+        rig=None if problem.rig is None else full[np.ix_(with_rig, with_rig)],
     )
 
 
@@ -354,11 +364,15 @@ def _gauge_free_inverse(information: Array, free_direction: Array) -> Array:
 
 
 def _scale_direction(problem: Problem, fixed_camera: int) -> Array:
-    """(6 C + 6 G,) change of the parameters when the scene is scaled about the fixed camera, which no error sees."""
+    """Returns how the parameters change when the scene is scaled about the fixed camera, which no error sees."""
     fixed_centre = -problem.rotations[fixed_camera].T @ problem.translations[fixed_camera]
     poses = np.zeros((len(problem.rotations), _POSE))
     poses[:, 3:] = problem.translations + problem.rotations @ fixed_centre
-    return np.concatenate([poses.ravel(), np.zeros(_LENS * len(problem.log_focals))])
+    rig = problem.rig or NO_RIG
+    sets, mounts = np.zeros((rig.num_sets, _POSE)), np.zeros((rig.num_mounts, _POSE))
+    sets[:, 3:], mounts[:, 3:] = rig.set_translations + rig.set_rotations @ fixed_centre, rig.mount_translations
+    lenses = np.zeros(_LENS * len(problem.log_focals))
+    return np.concatenate([poses.ravel(), lenses, sets.ravel(), mounts.ravel()])
 
 
 def _sort_by_point(problem: Problem) -> Problem:
@@ -380,7 +394,8 @@ def _copy(problem: Problem) -> Problem:
         name: np.array(getattr(problem, name), dtype=np.float64, order="C")
         for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
     }
-    return replace(problem, **parameters, log_aspects=np.log(problem.aspects))
+    rig = None if problem.rig is None else problem.rig.copy()
+    return replace(problem, **parameters, log_aspects=np.log(problem.aspects), rig=rig)
 
 
 class _Native(ctypes.Structure):
@@ -396,6 +411,10 @@ class _Native(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("num_cameras", "num_lenses", "num_points", "fixed_camera")),
         ("robust_squared", ctypes.c_double),
         *((name, ctypes.c_void_p) for name in ("given_rotations", "given_centres", "given_information")),
+        *((f"{what}_{name}", ctypes.c_void_p) for what in ("set", "mount") for name in ("rotations", "translations")),
+        *((name, ctypes.c_void_p) for name in ("set_of_camera", "mount_of_camera", "rig_information")),
+        *((f"given_mount_{name}", ctypes.c_void_p) for name in ("rotations", "centres", "information")),
+        *((name, ctypes.c_int32) for name in ("num_sets", "num_mounts")),
     )
 
 
@@ -414,14 +433,17 @@ def _native(
         *(np.ascontiguousarray(values, dtype=np.int32) for values in indices),
         *(np.ascontiguousarray(values, dtype=np.float64) for values in observed),
     ]
-    held = _pack_known_poses(problem, config)
+    held, rig = _pack_known_poses(problem, config), problem.rig or NO_RIG
+    tied = rig.pack(len(problem.rotations), config.noise_px)
     native = _Native(
         *(pointer(array) for array in arrays),
         len(problem.rotations), len(problem.log_focals), len(problem.points),
         fixed_camera if problem.given is None else -1, config.robust_px**2,
         *(pointer(array) for array in held), *([None] * (3 - len(held))),
+        *(pointer(array) for array in tied),
+        rig.num_sets, rig.num_mounts,
     )  # fmt: skip
-    return native, [*arrays, *held]
+    return native, [*arrays, *held, *tied]
 
 
 def _pack_known_poses(problem: Problem, config: BundleAdjustmentConfig) -> list[Array]:

@@ -393,6 +393,7 @@ class Map:
             translations=self.estimate.translations[old],
             lens_of_camera=self.estimate.lens_of_camera[old],
             given=None if self.estimate.given is None else self.estimate.given.relabel(old),
+            rig=None if self.estimate.rig is None else self.estimate.rig.relabel(old),
             camera_of=new[self.estimate.camera_of],
         )
         ratios = {

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
 from splatnode.recon.matching.two_view import TwoView
@@ -20,6 +21,7 @@ from splatnode.recon.registration import (
     known_poses,
     mapping_problem,
     own_lenses,
+    rigs,
     self_calibration,
 )
 from splatnode.recon.registration.known_poses import GivenWorld
@@ -35,14 +37,16 @@ class RegistrationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     lenses: Internal[self_calibration.LensGroupingConfig] = self_calibration.LensGroupingConfig()
     mapper: Internal[incremental_mapper.MapperConfig] = incremental_mapper.MapperConfig()
-    # Given poses hold the cameras within their sigmas, where lenses are told; images that contradict one let it go.
-    # --poses-sigma sets it. Otherwise given poses are compared with the cameras that the images tell
+    # Given poses are priors of cameras with a known lens; images that contradict one reject it. --poses-sigma sets it.
+    # Otherwise they are only compared with the images' cameras
     trust_poses: bool = False
-    # How fast trusted poses drift from the first photograph on, as odometry does: the standard deviation of a step's
-    # error in each direction, and of all lengths alike, as a share; 0: each pose is absolute. --poses-drift sets it
+    # Drift of trusted poses from the first image on: standard deviation of a step's error in each direction, and of all
+    # lengths alike, as a share; 0: poses are absolute. --poses-drift sets it
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
     # And of the turn about each axis that has grown after a metre, degrees; it grows with the root of the way
     poses_drift_deg: Annotated[float, msgspec.Meta(ge=0, le=90)] = 0.0
+    # Cameras that are fixed to each other, as `--rig FILE` or a recording tells; None: what their frame sets tell
+    rig: Internal[Rig | None] = None
 
 
 Array = npt.NDArray[np.float64]
@@ -96,6 +100,13 @@ class Registration:
     median_angle_deg: float  # of the points' triangulation angles
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
     given: GivenWorld | None = None  # the world of given poses that held cameras; None: none did
+    rig: rigs.RigEstimate | None = None  # that its cameras are on; None: they are on none
+
+    @property
+    def image_part(self) -> Registration:
+        """Returns it without its rig and the cameras that the rig alone places, of which images tell nothing."""
+        placed = () if self.rig is None else self.rig.placed
+        return replace(self, cameras=tuple(each for each in self.cameras if each.index not in placed), rig=None)
 
 
 def register(
@@ -103,11 +114,13 @@ def register(
     pairs: Mapping[tuple[int, int], TwoView],
     config: RegistrationConfig,
     pause: Callable[[], None] = lambda: None,
+    tolerance_s: float = TOLERANCE_S,
 ) -> Registration | None:
     """The cameras of as many keyframes as can be registered together, or None when no two can.
 
     `pairs` holds the verified pairs by position (i < j). The result does not depend on the order of the keyframes.
-    `pause` is called between steps and may raise to abandon the work.
+    Images of different cameras are taken together where at most `tolerance_s` is between them. `pause` is called
+    between steps and may raise to abandon the work.
     """
     if not pairs:
         return None
@@ -118,7 +131,34 @@ def register(
     if built is None:
         return None
     found, grouping = built
-    return make_registration(found.relabel(order), keyframes, [grouping.scales[i] for i in rank], config)
+    scales = [grouping.scales[i] for i in rank]
+    alone = make_registration(found.relabel(order), keyframes, scales, config)
+    pause()
+    on_rig = rigs.adjust_with_rig(found, ordered, config.rig, tolerance_s)
+    if on_rig is None:
+        return alone
+    adjusted, rig = on_rig[0].relabel(order), on_rig[1].relabel(order)
+    whole = replace(adjusted, views=(*adjusted.views, *rig.placed))
+    together = make_registration(whole, keyframes, scales, config)
+    return _keep_sigmas(together, alone, rig.rescale(known_poses.distance(adjusted.estimate, adjusted.views)))
+
+
+def _keep_sigmas(together: Registration, alone: Registration, rig: rigs.RigEstimate) -> Registration:
+    """The registration on a rig, no camera of which is claimed to be better known than by images alone."""
+    before = {camera.index: camera for camera in alone.cameras}
+    cameras = [
+        camera
+        if camera.index not in before
+        else replace(
+            camera,
+            rotation_sigma_deg=max(camera.rotation_sigma_deg, before[camera.index].rotation_sigma_deg),
+            centre_sigma_rel=max(camera.centre_sigma_rel, before[camera.index].centre_sigma_rel),
+            centre_covariance=before[camera.index].centre_covariance,
+        )
+        for camera in together.cameras
+    ]
+    focal_sigma = max(together.focal_sigma, alone.focal_sigma)
+    return replace(together, cameras=tuple(cameras), focal_sigma=focal_sigma, rig=rig)
 
 
 def sort_by_content(keyframes: Sequence[Keyframe]) -> list[int]:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.rig_file import format_rig
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import make_camera_dict
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
@@ -198,6 +199,8 @@ def estimate_result_bytes(num_gaussians: int, num_photographs: int = 0) -> int:
 
 # The result folder of a snapshot, with its report and a preview.
 
+RIG = "rig.yaml"  # in the result folder: the estimated rig
+
 
 def write_result_folder(
     snapshot: Snapshot,
@@ -221,5 +224,7 @@ def write_result_folder(
         further[LANDMARKS] = encode_landmarks(snapshot.landmarks)
     if snapshot.verdict.publishable and snapshot.depths:
         further[DEPTHS] = encode_depths(snapshot.depths)
+    if snapshot.verdict.publishable and snapshot.rig is not None:
+        further[RIG] = format_rig(snapshot.rig.mounts, snapshot.scale.metric).encode()
     write_result(snapshot, out, report, preview=preview, further=further)
     return report

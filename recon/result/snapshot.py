@@ -160,6 +160,25 @@ class InGivenWorld:
 
 
 @dataclass(frozen=True, eq=False)
+class OnRig:
+    """The rig that a scene's cameras are on. Lengths are in the scene's unit."""
+
+    # Camera id, T_rig_camera (4, 4), and standard deviations of its centre and of its orientation, degrees
+    mounts: tuple[tuple[str, Array64, float, float], ...]
+    metres_per_unit: float | None  # by a given rig; None: none tells it
+    scale_sigma: float  # standard deviation of its logarithm
+
+    def rescale(self, factor: float) -> OnRig:
+        """Returns it in a world whose unit is `factor` times smaller."""
+        mounts = []
+        for name, T, sigma, sigma_deg in self.mounts:
+            moved = T.copy()
+            moved[:3, 3] *= factor
+            mounts.append((name, moved, sigma * factor, sigma_deg))
+        return replace(self, mounts=tuple(mounts), metres_per_unit=None)
+
+
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """The scene after a step of the reconstruction. The world is the first camera's frame, or that of given poses."""
 
@@ -178,6 +197,7 @@ class Snapshot:
     scale: Scale = RELATIVE  # the unit of all lengths
     given: InGivenWorld | None = None  # how it lies in the world of given poses; None: that is not known, or it does
     up: Up | None = None  # in the world; None: no IMU tells it
+    rig: OnRig | None = None  # that the cameras are on; None: they are on none
     landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered
     # By camera (h, w), one value for 2 x 2 pixels: z where a second photograph confirms it, else 0. Empty: not gathered
     depths: Mapping[str, npt.NDArray[np.float16]] = field(default_factory=dict)

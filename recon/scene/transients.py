@@ -46,8 +46,8 @@ MARGIN_PX = 3  # around it, of the reduced photograph
 class TransientMaskConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Transient objects by free-space violation: patches behind which others see the scene, so that they moved away."""
 
-    # Leave out what verified views see through, where all photographs are at hand: something that passed through one of
-    # them. It also takes some surfaces that shine, or that stereo does not know, for such a thing
+    # Leave out what verified views see through: something that passed through one image. It also takes some shiny
+    # surfaces, and some that stereo does not know
     enabled: bool = False
 
 

@@ -15,7 +15,7 @@ from splatnode.recon.occupancy.message import MapHeader, decode_map
 
 log = logging.getLogger(__name__)
 
-SILENT = "the node has said nothing of a map: set map.live in the configuration of splatnode recon"
+SILENT = "the node has said nothing of a map: set occupancy.live in the configuration of splatnode recon"
 _POLL_S = 0.25
 
 

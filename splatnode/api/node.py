@@ -82,7 +82,7 @@ class Node:
 
     @property
     def map(self) -> NodeMap:
-        """Which space is free, occupied, or not seen, where the node's configuration has `map.live`.
+        """Which space is free, occupied, or not seen, where the node's configuration has `occupancy.live`.
 
         A map is of a scene that is final, as this program has heard it last; else there is none, and `why` says so.
         Raises PermissionError where the node does not let this program in.

@@ -88,12 +88,11 @@ class _Program:
 
 
 class Publisher:
-    """Takes the place of `splatnode capture`: the program gives the images, and what it knows of each.
+    """Replaces `splatnode capture` for a program that has the images.
 
-    Keyframes wait in the spool on this disk until recon has them on its own, whether it runs already, is started later
-    or again. They have the limits of a camera's, and previews and `splatnode status` show them as a camera's. A thread
-    answers recon meanwhile. Several threads may call it; they wait for each other. As a context manager it closes
-    itself. What waits when it is closed is sent by the next one, or by `splatnode capture`.
+    Keyframes stay in the spool on this disk until recon has stored them; a thread serves recon. Previews and
+    `splatnode status` show them as a camera's. Thread-safe. As a context manager it closes itself; the next publisher,
+    or `splatnode capture`, sends what still waits.
     """
 
     def __init__(
@@ -106,10 +105,10 @@ class Publisher:
     ) -> None:
         """`config`: None, or a YAML file as `splatnode capture` takes it, without `camera`. `changes` are laid over it.
 
-        - `every_frame`: every image becomes a keyframe that is sharp, well exposed and no copy. Otherwise those that
-          add parallax or coverage do, as of a camera.
-        - `camera_id`: of images for which `publish` names none, and of this publisher: with ids of their own several
-          programs and `splatnode capture` send to one node. Up to 32 letters, digits, - and _.
+        - `every_frame`: take every image that is sharp, well exposed and no copy, not only those that add parallax or
+          coverage.
+        - `camera_id`: of this publisher, and of images without their own: programs with different ids may send to one
+          node. Up to 32 letters, digits, - and _.
         - `changes`: such as `{"network": {"directory": "run"}, "spool": {"max_frames": 50}}`.
 
         Raises ValueError where the configuration cannot be used, and OSError where another process publishes already

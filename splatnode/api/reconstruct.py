@@ -38,7 +38,8 @@ from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
-from splatnode.recon.replay_source import add_poses, apply_masks
+from splatnode.recon.replay_source import Source, add_poses, apply_masks
+from splatnode.recon.rig_choice import apply_rig
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
 
@@ -251,6 +252,7 @@ def reconstruct(
     poses: Poses | None = None,
     poses_sigma: PosesSigma | None = None,
     poses_only_check: bool = False,
+    rig: str | PathLike[str] | None = None,
     masks: Masks | None = None,
     depths: Depths | None = None,
     scale: Scale | None = None,
@@ -264,65 +266,78 @@ def reconstruct(
     threads: int | None = None,
     tell: Tell | None = None,
 ) -> Result:
-    """Reconstructs photographs: the same cameras and Gaussians, to the bit, as `splatnode replay`.
+    """Reconstructs images: the same cameras and Gaussians, to the bit, as `splatnode replay`.
 
-    A refusal is a result, too: ask `verdict.publishable`. Several threads may call this at once.
+    A rejection is a result, too: ask `verdict.publishable`. Several threads may call this at once.
 
-    - `images`: a folder, a film (a video, an image topic `"drive.mcap#/front/image"`, an episode of a LeRobot data set
-      `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
-      uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
-      than 30 photographs, keyframes are chosen.
-    - `cameras`: which cameras of one robot are used together, as `--cameras`: `"all"`, or a list of names: folders of
-      a folder, topics of an MCAP file, keys of an episode `"pusht#3"`; of listed folders or films, a name for each.
-      Frames are called `left/0001.jpg` then, and each camera has its own lens.
-    - `camera_ids`, `captured_at`: of listed images which camera took each (None: not known), and when, a `Stamp`. What
-      different cameras took together, to `frame_set_tolerance_s` of `config`, is used, or left out, as one.
-    - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
-      photographs without distortion; or a list of these, one of each photograph (None: not known); or a mapping of
-      them by photograph, by camera id, by camera with which names begin, or by pattern: `{"left": a, "right": b}`.
-      None: what EXIF tells, else it is estimated.
-    - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
-      (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
-      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees, of
-      all poses, or a mapping or list of such as `poses` is: with `intrinsics` the poses then hold the cameras, also
-      where photographs share nothing. So do poses whose file tells their sigmas. `poses_only_check`: they do not even
-      then, but are compared with the cameras that the photographs alone tell.
-    - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
-      with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
-      for one that is used whole. None: all is used.
+    - `images`: a folder, a video, an image topic `"drive.mcap#/front/image"`, an episode `"pusht#3/CAMERA"` of a
+      LeRobot data set, a list of paths in one folder, or a list of arrays (H, W, 3) uint8 RGB or PIL images. Grey
+      becomes RGB; alpha 0 is masked. Of a video, and of more than 30 images, keyframes are selected.
+    - `cameras`: the cameras of one robot, as `--cameras`: `"all"`, or names of folders, topics or keys; of listed
+      folders or videos a name for each. Each camera has its own lens; images are called `left/0001.jpg`.
+    - `camera_ids`, `captured_at`: of listed images, which camera took each (None: unknown) and when, a `Stamp`. Images
+      of different cameras within `frame_set_tolerance_s` of `config` are a frame set, used or left out as one.
+    - `intrinsics`: `Intrinsics`, or K (3, 3) in pixels of undistorted images: for all images of its aspect ratio, in a
+      list for each image (None: unknown), or in a mapping by image, camera id, name prefix or pattern:
+      `{"left": a, "right": b}`. None: EXIF's, else estimated.
+    - `poses`: T_world_camera (4, 4) in metres by image name, in a list (None: unknown), or a file as for `--poses`.
+      They give metres and the world's axes; one that does not fit is named and left out. `poses_sigma`: standard
+      deviations, metres and degrees, of all poses or in a list or mapping. With sigmas (also from the file) and
+      `intrinsics` they are priors of the cameras, unless `poses_only_check`.
+    - `rig`: a file with where the cameras stand to each other, as for `--rig`. None: a log tells, else the images do.
+    - `masks`: white (any value above 0) is used, black is ignored. A folder of masks with the images' names, one file
+      for all, or a list of arrays (H, W), paths, or None. None: all is used.
     - `depths`: of a depth camera, for metres and plain walls: a folder, a mapping by names, or a list of `DepthImage`,
-      files (16-bit PNG, .npy, .exr), or arrays (H, W), aligned: uint16 millimetres, float metres; None: not measured.
-    - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
-      places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or `splatnode.Stereo`; or a
-      list of these, which check one another. None: lengths have no unit.
+      files (16-bit PNG, .npy, .exr), or aligned arrays (H, W): uint16 millimetres, float metres; None: unknown.
+    - `scale`: the metres between two cameras, `("a.jpg", "b.jpg", 0.5)` or by places in the list, `(0, 3, 0.5)`;
+      `splatnode.Marker(0.1)`; `splatnode.Stereo`; or a list of these. None: lengths have no unit.
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
-    - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
-    - `views`: so many photographs or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
-      `only_seen`: leaves out what no two photographs confirm, and the far background.
-    - `seed`: of what is drawn by chance; None: the configuration's, 0. `threads`: at most; None: one a processor.
-    - `tell`: hears what is being done, in the calling thread: a step with `doing`, `done`, `of`, or a line of text.
-      What it raises ends the work.
+    - `config`: a mapping or a YAML file of what differs from the preset (`docs/configuration.md`).
+    - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
+    - `only_seen`: leaves out what no two images confirm, and the far background.
+    - `seed`: of random numbers. None: the configuration's, 0.
+    - `threads`: at most, of torch and of the compiled core. None: as many as there are processors.
+    - `tell`: the progress callback, in the calling thread: a step with `doing`, `done`, `of`, or a line of text. An
+      exception in it cancels the work.
 
-    Raises TypeError and ValueError where an argument is not what it must be, and FileNotFoundError.
+    Raises TypeError and ValueError for wrong arguments, and FileNotFoundError.
     """
     telling = tell or ignore_progress
     check_counts(views=views, threads=threads)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
-    source = load_frames(images, views, every_frame, telling, several)
-    source = source if masks is None else apply_masks(source, make_mask_finder(masks, images), telling)
-    source = add_depths(apply_lens(source, intrinsics, images), depths, images)
+    loaded = load_frames(images, views, every_frame, telling, several)
+    source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
+    source, chosen = apply_rig(source, chosen, rig, telling)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
     if trusted and known is not None:
-        source = add_poses(source, known, None if sigmas_of(poses_sigma) is None else chosen.metric.poses_sigmas, own)
-        known = None  # they are the photographs' own now
+        source, known = _hold_cameras(source, known, poses_sigma, chosen, own), None  # they are the photographs' own
     given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
+
+
+def _apply_given(
+    source: Source, masks: Masks | None, intrinsics: LensChoice | None, images: Images, tell: Tell
+) -> Source:
+    """The frames with their masks and lenses."""
+    masked = source if masks is None else apply_masks(source, make_mask_finder(masks, images), tell)
+    return apply_lens(masked, intrinsics, images)
+
+
+def _hold_cameras(
+    source: Source,
+    known: Mapping[str, npt.NDArray[np.float64]],
+    sigma: PosesSigma | None,
+    config: ReconstructionConfig,
+    own: Mapping[str, Sigmas],
+) -> Source:
+    """The frames with the poses that hold their cameras."""
+    return add_poses(source, known, None if sigmas_of(sigma) is None else config.metric.poses_sigmas, own)
 
 
 def build_config(

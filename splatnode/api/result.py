@@ -254,12 +254,12 @@ class Result:
     ) -> Located | NotLocated:
         """Localizes a query image, or says why it cannot: a refusal is a value.
 
-        `image` is a file or a picture, of any camera; `intrinsics` is its lens, if that is known: `Intrinsics`, or K
-        (3, 3) in its pixels. `near` is what was found of a photograph that the same camera took shortly before, or
-        T_world_camera (4, 4) about where this one was taken: there it is found faster. Where it is not there, or
-        nothing was found before, it is looked for everywhere. `Located` has `T_world_camera`, `K`, `covariance`, and
-        `claim`: how wrong it may be, with 95 %. `NotLocated` has `code`, `message` and `advice`. Raises ValueError
-        where there is no scene to look in, TypeError for other types, and FileNotFoundError.
+        - `image`: a file or an image of any camera; `intrinsics`: its lens if known, `Intrinsics` or K (3, 3).
+        - `near`: the outcome of the same camera's previous image, or T_world_camera (4, 4) near this one's: the search
+          is faster there, and continues everywhere if it fails.
+
+        `Located` has `T_world_camera`, `K`, `covariance` and the 95 % bounds `claim`; `NotLocated` has `code`,
+        `message` and `advice`. Raises ValueError without a scene, TypeError for other types, and FileNotFoundError.
         """
         from splatnode.api.locating import localize_query  # brings what matches photographs
 
@@ -302,18 +302,16 @@ class Result:
         port: int | None = None,
         opened: Callable[[str], object] = print,
     ) -> None:
-        """Shows the result in a viewer, a process of its own; returns when that is closed, or ended by Ctrl-C.
+        """Shows the result in a viewer of its own process; returns when that is closed, or at Ctrl-C.
 
-        - `viewer`: "open3d", the window of `splatnode view`; "rerun", rerun's window with the recording that
-          `splatnode export --to rrd` makes; "browser", the page of `splatnode view --web`; "viser", that of viser.
-        - `listen`: of a browser's, the numeric address of this machine at which others are let in, as "0.0.0.0": with a
-          key by "browser", without one by "viser". None: only this machine is.
-        - `port`: likewise. None: 8347, of viser 8080; 0: any that is free.
-        - `opened`: of a browser's, called with a line that has the address to open, once it can be opened.
+        - `viewer`: "open3d", "rerun", "browser" (as `splatnode view --web`) or "viser".
+        - `listen`: of "browser" (with a key) and "viser" (without), a numeric address such as "0.0.0.0" at which other
+          machines are let in. None: this machine only.
+        - `port`: of these. None: 8347, of viser 8080; 0: any free one.
+        - `opened`: of these, called with a line that has the address, once it can be opened.
 
         Raises ModuleNotFoundError where the viewer is not installed (`pip install 'splatnode[viewer]'` for Open3D,
-        `[rerun]`, `[viser]`), RuntimeError where no window can be opened or the viewer fails, ValueError where there is
-        no scene, or for other arguments.
+        `[rerun]`, `[viser]`), RuntimeError where it fails, ValueError for wrong arguments or without a scene.
         """
         from splatnode.api.window import show  # brings what finds windows
 

@@ -53,10 +53,9 @@ class Update:
 
 
 class Session:
-    """A reconstruction that grows with each photograph, as that of a node does.
+    """A reconstruction of one submap, up to some 30 keyframes, that grows as a node's does.
 
-    One place, of up to some 30 photographs: from a camera's loop most frames are not taken, because they add too
-    little. Several threads may call it; they wait for each other. As a context manager it closes itself.
+    Most frames of a camera's loop add too little and are not taken. Thread-safe. As a context manager it closes itself.
     """
 
     def __init__(
@@ -73,13 +72,10 @@ class Session:
         threads: int | None = None,
         tell: Tell | None = None,
     ) -> None:
-        """The arguments are those of `reconstruct`; `every_frame` takes all photographs that are sharp and no copies.
+        """The arguments are those of `reconstruct`, without `budget_s`.
 
-        `poses_sigma` is of all poses that `add` gets without their own. With it, or from the first pose with its own
-        on, poses hold the cameras of photographs whose lens is told, unless `poses_only_check`.
-
-        Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given. There is no
-        limit on the seconds (`budget_s`).
+        `poses_sigma` is of poses that `add` gets without their own. Poses with sigmas are priors of cameras with a
+        known lens, unless `poses_only_check`. Images without a name are called 0000.png, 0001.png, ...
         """
         check_counts(threads=threads)
         if is_stereo(scale):
@@ -120,25 +116,23 @@ class Session:
         baseline_m: float | None = None,
         depth: DepthOf = None,
     ) -> Update:
-        """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
+        """Offers the session an image: an array (H, W, 3) uint8 RGB, or a PIL image.
 
-        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the id of the camera that
-        took it, of several: photographs of different cameras share no lens. `pose` is where odometry or a tracker
-        says that its camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that
-        is, metres and degrees; default: what the session's `poses_sigma` or `config` says. Two poses or more give the
-        scene metres and their axes, and hold the cameras where their sigmas are told and the lens is. `motion` is how
-        wheels or an IMU say that the camera has moved since the photograph that was given before, whether that was
-        taken or not: T_previous_current (4, 4), metres; `motion_sigma`, metres and degrees, is of this motion alone.
-        One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
-        degrees; it gives `Result.map` its up. `right` is what the right half of a stereo camera saw at that moment,
-        rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
-        the scene metres, too. `depth` is what a depth camera measured at that moment, as `reconstruct` takes it: it
-        gives metres, and depth where images show nothing to match.
+        - `intrinsics`: this image's lens, instead of the session's. `camera`: the id of its camera, of several: they
+          share no lens.
+        - `pose`, `pose_sigma`: T_world_camera (4, 4) in metres from odometry or a tracker, all in one world; metres and
+          degrees (default: the session's). Two or more give metres and axes, and with sigmas and a known lens they are
+          priors of the cameras.
+        - `motion`, `motion_sigma`: T_previous_current (4, 4) in metres from wheels or an IMU, since the image given
+          before, taken or not; metres and degrees of this motion alone. One or more give metres.
+        - `gravity`, `gravity_sigma`: down (3,) in the camera's frame; degrees. It gives `Result.map` its up.
+        - `right`, `baseline_m`: the rectified right image of a stereo pair, of the image's size, and the distance of
+          its camera, metres. Pairs give metres.
+        - `depth`: a depth image, as for `reconstruct`. It gives metres, and depth where images have no texture.
 
-        Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
-        milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
-        right image is none, a name comes again, or the session's lens has the aspect ratio of no photograph so far,
-        and RuntimeError after `finish` or `close`.
+        Returns the outcome once the scene has grown: after seconds if the image is taken, else milliseconds. Raises
+        TypeError and ValueError for wrong arguments, a repeated name, or a session lens with the aspect ratio of no
+        image so far, and RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.apply_thread_limit(self._threads):
             work = self._open()

@@ -78,12 +78,9 @@ def _check(viewer: Viewer) -> None:
 
 def _export_rrd(folder: Path) -> Path:
     """Exports the result in the folder as `splatnode export --to rrd` does."""
-    from splatnode.recon.result.export.formats import rrd
-    from splatnode.recon.result.export.stored import StoredResult
+    from splatnode.recon.result.export.format import export_scene
 
-    path = folder / rrd.DEFAULT_NAME
-    path.write_bytes(rrd.export(StoredResult.create_from_path(folder)))
-    return path
+    return export_scene(folder, "rrd")
 
 
 def _run(command: tuple[str, ...], opened: Callable[[str], object] | None) -> None:

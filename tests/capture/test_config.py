@@ -80,7 +80,7 @@ def test_services_run_a_verb_under_a_watchdog(path):
     unit.read(path)
     service = unit["Service"]
     program, verb, *_ = service["ExecStart"].split()
-    assert program.endswith("/splatnode") and verb in {verb.name for verb in command_line.VERBS}
+    assert program.endswith("/splatnode") and verb in {verb.name for verb in command_line.list_verbs()}
     assert service["Type"] == "notify" and int(service["WatchdogSec"]) > 0
     assert service["RuntimeDirectoryMode"] == "0700"  # or the sockets would be refused
     assert service["MemoryMax"]  # the only bound on what a peer with a key can send

@@ -72,18 +72,39 @@ def _run(name: str, module: Any, args: argparse.Namespace) -> dict[str, Any]:
     known = {each.name for each in boundaries.BOUNDARIES}
     if wrong := [each for each in args.boundary if each not in known]:
         raise SystemExit(f"no boundary {', '.join(wrong)}; there are: {', '.join(sorted(known))}")
-    progress = _Progress(args.cases)
+    progress = _Progress(args.cases, _Saver(args.defects, _commit()))
     return module.main(args.seconds, args.seed, args.cases, args.boundary, progress, args.first)
 
 
-class _Progress:
-    """One line that is written over, or on no terminal one every half minute."""
+class _Saver:
+    """Writes the reproducer of each defect as soon as it is known: a night's run may be killed."""
 
-    def __init__(self, cases: int) -> None:
-        self._cases, self._started, self._told = cases, time.monotonic(), 0.0
+    def __init__(self, folder: Path, commit: str) -> None:
+        self._folder, self._commit = folder, commit
+        self._saved: set[tuple[str, int]] = set()
+
+    def __call__(self, rows: dict[str, boundaries.Row]) -> None:
+        for defect in (defect for row in rows.values() for defect in row.kept):
+            if (case := (defect.boundary, defect.number)) in self._saved:
+                continue
+            self._saved.add(case)
+            path = reproducer.save(defect, self._folder, self._commit)
+            print(
+                f"\n{defect.boundary}, case {defect.number}: {defect.problem}\n  {reproducer.REPLAY} {path}",
+                file=sys.stderr,
+                flush=True,
+            )
+
+
+class _Progress:
+    """One line that is written over, or on no terminal one every half minute; defects as they come."""
+
+    def __init__(self, cases: int, save: _Saver) -> None:
+        self._cases, self._save, self._started, self._told = cases, save, time.monotonic(), 0.0
         self._pace_s = 0.5 if sys.stderr.isatty() else 30.0
 
     def __call__(self, rows: dict[str, boundaries.Row]) -> None:
+        self._save(rows)
         now = time.monotonic()
         if now < self._told + self._pace_s:
             return

@@ -123,6 +123,38 @@ void expect(bool condition, const char* what) {
     std::exit(1);
 }
 
+// A rig of some of a bundle's cameras, with hostile numbers as the rest has.
+struct FuzzRig {
+    int num_sets, num_mounts;
+    std::vector<double> set_rotations, set_translations, mount_rotations, mount_translations, between;
+    std::vector<double> given_rotations, given_centres, given;
+    std::vector<int32_t> set_of, mount_of;
+
+    FuzzRig(Draw& draw, int cameras)
+        : num_sets(draw.whole(0, 3)), num_mounts(num_sets ? draw.whole(1, 3) : 0),
+          set_rotations(turns(draw, num_sets)), set_translations(draw.numbers(3 * size_t(num_sets))),
+          mount_rotations(turns(draw, num_mounts)), mount_translations(draw.numbers(3 * size_t(num_mounts))),
+          between(2 * size_t(cameras)), given_rotations(turns(draw, num_mounts)),
+          given_centres(draw.numbers(3 * size_t(num_mounts))), given(2 * size_t(num_mounts)),
+          set_of(cameras, -1), mount_of(cameras, -1) {
+        for (double& weight : between) weight = draw.whole(0, 2) * 50.0;
+        for (size_t mount = 0; mount < given.size(); mount += 2)  // below 0: fixed
+            given[mount] = given[mount + 1] = mount ? draw.whole(-1, 2) * 10.0 : -1.0;
+        for (int camera = 0; num_sets && camera < cameras; ++camera) {
+            if (!draw.whole(0, 2)) continue;
+            set_of[camera] = draw.whole(0, num_sets - 1);
+            mount_of[camera] = draw.whole(0, num_mounts - 1);
+        }
+    }
+
+    static std::vector<double> turns(Draw& draw, int count) {
+        auto found = draw.numbers(9 * size_t(count), 0.1);
+        for (size_t i = 0; i < found.size(); i += 9)
+            for (size_t k = 0; k < 9; k += 4) found[i + k] += 1;
+        return found;
+    }
+};
+
 void bundle(Draw& draw) {
     const int cameras = draw.whole(1, 5), lenses = draw.whole(1, cameras), points = draw.whole(0, 30);
     std::vector<int32_t> lens_of(cameras), camera_of, first_of = {0};
@@ -151,14 +183,19 @@ void bundle(Draw& draw) {
     }
     for (size_t i = 0; i < numbers; ++i)
         for (size_t j = 0; j < numbers; ++j) given[i * numbers + j] += shared[i] * shared[j];
+    FuzzRig rig(draw, cameras);
     const core::Bundle task = {rotations.data(),  translations.data(), focals.data(),    radials.data(),
                                shifts.data(),     aspects.data(),      places.data(),    lens_of.data(),
                                camera_of.data(),  first_of.data(),     pixels.data(),    means.data(),
                                information.data(), cameras,            lenses,           points,
                                draw.whole(-1, cameras - 1), draw.whole(1, 9) * 1.0,
-                               given_rotations.data(), given_centres.data(), given.data()};
+                               given_rotations.data(), given_centres.data(), given.data(),
+                               rig.set_rotations.data(), rig.set_translations.data(), rig.mount_rotations.data(),
+                               rig.mount_translations.data(), rig.set_of.data(), rig.mount_of.data(),
+                               rig.between.data(), rig.given_rotations.data(), rig.given_centres.data(),
+                               rig.given.data(), rig.num_sets, rig.num_mounts};
     core_bundle_adjust(&task, draw.whole(0, 8), 1e-6);
-    const size_t size = 6 * size_t(cameras + lenses);
+    const size_t size = 6 * size_t(cameras + lenses + rig.num_sets + rig.num_mounts);
     std::vector<double> matrix(size * size);
     core_bundle_information(&task, matrix.data());
 }

@@ -7,7 +7,6 @@ import types
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -116,7 +115,7 @@ def _kinds(plugin: type[Plugin], annotation: Any) -> str:
 
 def _plugin(path: str, plugin: type[Plugin], kind: str, value: Any, internal: bool) -> Iterator[Section]:
     """The sections of one kind; the defaults are those of the plug-in that is the default, where it is of this kind."""
-    module = import_module(f"{plugin.package}.{kind}")
+    module = plugin.load_module(kind)
     chosen = isinstance(value, Plugin) and value.kind == kind
     text = (module.__doc__ or "").split("\n\n")[0]
     default = value.config if chosen else REQUIRED

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from splatnode.capture.calibration.board import DICTIONARIES
+from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.render import Camera, Shape, Solid, cast
 from splatnode.capture.frame import Frame

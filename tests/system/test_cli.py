@@ -24,7 +24,7 @@ from splatnode.recon.result.export import ResultWriteError
 from splatnode.recon.result.export.format import list_format_names
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.verbs import EXPORT_FORMATS
+from splatnode.recon.verbs import list_export_formats
 from tests.conftest import ROOT
 
 
@@ -58,11 +58,13 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.files",
         "splatnode.capture.process.library_lines",
         "splatnode.capture.process.logs",
+        "splatnode.capture.process.plugins",
         "splatnode.capture.process.system",
         "splatnode.capture.process.terminal",
         "splatnode.capture.process.text",
         "splatnode.capture.verbs",
         "splatnode.command_line",
+        "splatnode.recon.auditing.verb",
         "splatnode.recon.batch.verb",
         "splatnode.recon.evaluate.verbs",
         "splatnode.recon.former_names",
@@ -72,9 +74,31 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.recon.shared_arguments",
         "splatnode.recon.verbs",
         "splatnode.viewer.former_names",
+        "splatnode.viewer.further",
+        "splatnode.viewer.rerun_flag",
         "splatnode.viewer.verbs",
+        "splatnode.viewer.viser_flag",
     ]
     assert heavy == "[]"
+
+
+def test_a_verb_of_the_core_loads_no_plug_in():
+    """Nor does it read where any is: what runs on a robot starts as if there were none."""
+    code = (
+        "import sys, splatnode.command_line\n"
+        "from splatnode.capture.process import plugins\n"
+        "plugins.entry_points = None\n"
+        "parser = splatnode.command_line.build_parser('recon')\n"
+        "assert parser.parse_args(['recon']).verb == 'recon'\n"
+        "print(*sorted(name for name in sys.modules if name.startswith('splatnode.') and 'verb' in name))"
+    )
+    loaded = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).split()
+    assert loaded == [
+        "splatnode.capture.verbs",
+        "splatnode.recon.replay_verb",
+        "splatnode.recon.verbs",
+        "splatnode.viewer.verbs",
+    ]
 
 
 def test_no_threads_of_a_library_spin_while_they_wait():
@@ -109,7 +133,7 @@ def test_an_error_is_one_line_and_a_code(monkeypatch, capsys, error, code):
         assert (getattr(error, "strerror", None) or str(error)) in said
 
 
-@pytest.mark.parametrize("verb", [verb.name for verb in command_line.VERBS])
+@pytest.mark.parametrize("verb", [verb.name for verb in command_line.list_verbs()])
 def test_every_verb_can_say_what_it_takes(verb, capsys):
     with pytest.raises(SystemExit) as end:
         command_line.main([verb, "--help"])
@@ -292,7 +316,7 @@ def test_bench_lists_are_parsed():
 
 
 def test_export_offers_the_formats_that_there_are():
-    assert tuple(list_format_names()) == EXPORT_FORMATS
+    assert tuple(list_format_names()) == list_export_formats()
 
 
 def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):
@@ -363,9 +387,12 @@ def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):
 
 def test_each_verb_leads_to_a_function():
     """Verbs name their functions in text, so that help loads nothing."""
-    rooms = [path for room in ("capture", "recon", "viewer", "splatnode") for path in (ROOT / room).rglob("*.py")]
+    rooms = ("capture", "recon", "viewer", "extras", "splatnode")
     named = [
-        found for path in rooms for found in re.findall(r'import_lazily\(\s*"([\w.]+)",\s*"(\w+)"', path.read_text())
+        found
+        for room in rooms
+        for path in (ROOT / room).rglob("*.py")
+        for found in re.findall(r'import_lazily\(\s*"([\w.]+)",\s*"(\w+)"', path.read_text())
     ]
     assert len(named) > 20
     assert [each for each in named if not hasattr(import_module(each[0]), each[1])] == []

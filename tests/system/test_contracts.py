@@ -45,7 +45,7 @@ WRONG = (
 @pytest.fixture
 def product(tmp_path: Path) -> Path:
     """A copy of the product and its contracts, links among the rooms included."""
-    for room in ("capture", "recon", "viewer", "splatnode"):
+    for room in ("capture", "recon", "viewer", "extras", "splatnode"):
         without = shutil.ignore_patterns("_core_*", "__pycache__", ".build-*")
         shutil.copytree(ROOT / room, tmp_path / room, symlinks=True, ignore=without)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)

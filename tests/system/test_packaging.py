@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,13 @@ def build(hook: str, project: Path, before: str = "", settings: dict[str, str] |
     assert result.returncode == 0, result.stderr
     (built,) = (project / "dist").iterdir()
     return built
+
+
+def read_groups(text: str) -> dict[str, dict[str, str]]:
+    """The entry points in a file of them, by group and name."""
+    parser = ConfigParser()
+    parser.read_string(text)
+    return {group: dict(parser[group]) for group in parser.sections()}
 
 
 @pytest.fixture
@@ -46,6 +54,11 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     page = {path.name for path in (ROOT / "viewer" / "web" / "page").iterdir()}
     assert {f"splatnode/viewer/web/page/{name}" for name in page} <= names and "main.js" in page
     assert not [name for name in names if not name.startswith(("splatnode/", "splatnode-"))]
+    (told,) = [name for name in names if name.endswith(".dist-info/entry_points.txt")]
+    metadata = read_groups(zipfile.ZipFile(wheel).read(told).decode())
+    assert metadata.pop("console_scripts") == {"splatnode": "splatnode.command_line:main"}
+    assert metadata == read_groups((ROOT / "extras" / "entry_points.txt").read_text())
+    assert "splatnode/extras/entry_points.txt" in names
 
     site = tmp_path / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
@@ -88,6 +101,7 @@ def test_the_sdist_has_the_sources_and_nothing_compiled(project):
     core = ROOT / "recon" / "core"
     sources = {path.name for pattern in ("*.cpp", "*.h", "*.py") for path in core.glob(pattern)}
     assert {f"splatnode/recon/core/{name}" for name in sources} <= names
+    assert {"splatnode/extras/entry_points.txt", "splatnode/extras/__init__.py"} <= names
     assert {"splatnode/viewer/web/page/main.js", "splatnode/py.typed", "splatnode/api/result.py"} <= names
     assert {"pyproject.toml", "constraints.txt", "run", "LICENSE", "tests/conftest.py"} <= names
     assert not [name for name in names if name.endswith((".so", ".stamp", ".pyc"))]

@@ -56,7 +56,7 @@ def test_a_link_leads_to_a_file(page):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_paths_that_a_page_names_are_there(page):
-    for path in re.findall(r"`((?:capture|recon|viewer|tests|configs|docs|splatnode)/[\w./*-]*)`", text(page)):
+    for path in re.findall(r"`((?:capture|recon|viewer|extras|tests|configs|docs|splatnode)/[\w./*-]*)`", text(page)):
         if not {"NAME", "NAME.py", "FOLDER"} & set(path.split("/")):  # a file that somebody is to write
             assert list(ROOT.glob(path.rstrip("/"))), f"{page} names {path}, which is not there"
 

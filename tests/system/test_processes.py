@@ -11,7 +11,8 @@ import pytest
 
 from tests.conftest import ROOT
 
-FILES = sorted(path for room in ("capture", "recon", "viewer", "splatnode/api") for path in (ROOT / room).rglob("*.py"))
+ROOMS = ("capture", "recon", "viewer", "extras", "splatnode/api")
+FILES = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
 FILES += sorted((ROOT / "splatnode").glob("*.py"))
 STARTS = {
     "capture/process/python.py",  # the one way

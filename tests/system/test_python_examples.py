@@ -33,17 +33,17 @@ PROGRAMS = dict(
 )
 # What a program prints, by its title; each title of the page has its row.
 PRINTED = {
-    "Photographs in, cameras and a scene out": r"All 4 photographs were placed\..*\nview_000\.png \[.*\n(view_.*\n){3}",
-    "What came back": r"(?s)\[\[.*\(\d+, 3\) float32 0\.\d+\n\[\] \d",
+    "Photos in, cameras and a scene out": r"All 4 photographs were placed\..*\nview_000\.png \[.*\n(view_.*\n){3}",
+    "The result": r"(?s)\[\[.*\(\d+, 3\) float32 0\.\d+\n\[\] \d",
     "Metres, and a known lens": r"True 295\.15\n",
-    "A view from where no camera was": r"[1-9][\d.]* \d\d% of it two photographs have seen\n",
-    "Where a further photograph was taken": r"(?s)\[.*\] 0\.\d+ 0\.\d+\nrefused: NOT_FOUND: .*\n",
-    "Where a camera that moves is now": r"(placed at .*\n){10}",
-    "A refusal is a value": r"TOO_FEW_VIEWS 1 usable photograph: .*\n0 0\n",
-    "A camera's loop": r"(?s)0000\.png first view.* OK 3\n.*All \d photographs were placed\. .* True\n",
-    "A running node": r"(?s)kitchen OK 2\nthe live camera: .*\nfree space: the node has said nothing of a map",
-    "Images of your own program": r"(?s)wrist_\d+\.\d+ keyframe first view.*\d+ wait .* answered: False\n",
-    "Threads, and how far it is": r"<splatnode.Result OK: 4 .* <splatnode.Result OK: 4 .*\n.* \.\.\. .*\n",
+    "Render a new view": r"[1-9][\d.]* \d\d% of it two photographs have seen\n",
+    "Localize a query image": r"(?s)\[.*\] 0\.\d+ 0\.\d+\nrefused: NOT_FOUND: .*\n",
+    "Localize a moving camera": r"(placed at .*\n){10}",
+    "A rejection is a value": r"TOO_FEW_VIEWS 1 usable photograph: .*\n0 0\n",
+    "A camera loop": r"(?s)0000\.png first view.* OK 3\n.*All \d photographs were placed\. .* True\n",
+    "Listen to a node": r"(?s)kitchen OK 2\nthe live camera: .*\nfree space: the node has said nothing of a map",
+    "Send images to a node": r"(?s)wrist_\d+\.\d+ keyframe first view.*\d+ wait .* answered: False\n",
+    "Threads and progress": r"<splatnode.Result OK: 4 .* <splatnode.Result OK: 4 .*\n.* \.\.\. .*\n",
     "Save and load": r"(<splatnode.Result OK: 4 cameras, \d+ Gaussians, 0 left out> ?){2}\n",
     "Into other tools": r"(?s)\['images/view_000\.png', .*PINHOLE 320 240",
 }

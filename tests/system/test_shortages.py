@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tests.conftest import ROOT
 
-ROOMS = ("capture", "recon", "viewer")
+ROOMS = ("capture", "recon", "viewer", "extras")
 ASKS = {"is_shortage", "may_be_shortage", "raise_shortage", "outlast"}
 WIDE = {"OSError", "Exception", "BaseException", "FFmpegError", "ZMQError"}
 HARMLESS = {

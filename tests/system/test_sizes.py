@@ -9,7 +9,7 @@ from tests.conftest import ROOT
 
 MAX_FILE_LINES = 800
 MAX_FUNCTION_LINES = 80
-ROOMS = ("capture", "recon", "viewer", "splatnode")
+ROOMS = ("capture", "recon", "viewer", "extras", "splatnode")
 
 
 def long_files(root: Path) -> list[str]:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-ROOMS = ("capture", "recon", "viewer", "splatnode")
+ROOMS = ("capture", "recon", "viewer", "extras", "splatnode")
 _OWN = {  # templates, and widths, of the program's own that are no constants where they are filled in
     "capture/cli.py": {"longest"},
     "recon/evaluate/report.py": {"digits", "measure.digits"},

@@ -502,6 +502,7 @@ def make_reconstruction_message(
     registration, evidence = estimate.registration, estimate.evidence
     if registration is None or evidence is None:
         raise ValueError("only an estimate with cameras and evidence is kept")
+    registration = registration.image_part  # a rig places its cameras again when all are registered anew
     cameras = [flatten_dataclass(camera) for camera in registration.cameras]
     kept = {field.name: getattr(registration, field.name) for field in fields(registration)}
     record = ReconstructionRecord(

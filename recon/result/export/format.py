@@ -1,4 +1,7 @@
-"""What an export format is. A new one is a new module of recon.result.export.formats, and nothing else."""
+"""What an export format is. A new one is a new module of recon.result.export.formats, and nothing else.
+
+Further ones are installed beside the core: an entry point of `splatnode.export_formats` names the module of each.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Protocol, cast
 
+from splatnode.capture.process import plugins
 from splatnode.recon.result.export import formats
 from splatnode.recon.result.export.prepare import EVERYTHING, Selection
 from splatnode.recon.result.export.result import write_beside
@@ -34,14 +38,20 @@ class Format(Protocol):
 
 def list_format_names() -> list[str]:
     """The formats that there are, in the order of the alphabet. None of them is imported."""
-    return sorted(module.name for module in iter_modules(formats.__path__))
+    return sorted({*_list_own_names(), *plugins.entry_points(plugins.EXPORT_FORMATS)})
+
+
+def _list_own_names() -> list[str]:
+    return [module.name for module in iter_modules(formats.__path__)]
 
 
 def load_format(name: str) -> Format:
     """The format called `name`. Raises ValueError where there is none."""
     if name not in list_format_names():
         raise ValueError(f"the format must be one of {', '.join(list_format_names())}; got {name!r}")
-    return cast(Format, import_module(f"{formats.__name__}.{name}"))
+    if name in _list_own_names():
+        return cast(Format, import_module(f"{formats.__name__}.{name}"))
+    return plugins.entry_points(plugins.EXPORT_FORMATS)[name].load()
 
 
 # export_scene: a result, or a scene file, in another format.

@@ -11,6 +11,7 @@ from pkgutil import iter_modules
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process import plugins
 from splatnode.capture.process.text import guard_untrusted
 from splatnode.recon.result.export import formats
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
@@ -91,9 +92,10 @@ def read_gaussians(path: Path, sources: Path | None = None) -> GaussianArrays:
     Their source frames are unknown but where `sources` has them.
     Raises SceneFileError where the file is truncated or is something else, OSError where it cannot be read.
     """
-    decode = _load_decoders().get(path.suffix.lower())
+    decoders = _load_decoders(path.suffix.lower())
+    decode = decoders.get(path.suffix.lower())
     if decode is None:
-        raise SceneFileError(f"{path.name} must end with {', '.join(_load_decoders())}")
+        raise SceneFileError(f"{path.name} must end with {', '.join(decoders)}")
     # NumPy warns of a NaN that signals, and of what is too large, before it is looked for and left out.
     with guard_untrusted(SceneFileError, path.name), np.errstate(all="ignore"):
         gaussians = decode(read_scene_file(path), path.name)
@@ -111,9 +113,12 @@ def read_cameras(path: Path) -> tuple[CameraEstimate, ...]:
     return decode_cameras(read_json_file(path), path.name)
 
 
-def _load_decoders() -> dict[str, Callable[[bytes, str], GaussianArrays]]:
-    """Loads the decoders by suffix. A format can be read if its module has `decode`."""
+def _load_decoders(suffix: str) -> dict[str, Callable[[bytes, str], GaussianArrays]]:
+    """Loads the decoders by suffix: those here, and that of `suffix`. A format can be read if it has `decode`."""
     modules = {name: import_module(f"{formats.__name__}.{name}") for _, name, _ in iter_modules(formats.__path__)}
+    further = plugins.entry_points(plugins.EXPORT_FORMATS)
+    if (name := suffix.removeprefix(".")) in further and name not in modules:
+        modules[name] = further[name].load()
     return {f".{name}": module.decode for name, module in sorted(modules.items()) if hasattr(module, "decode")}
 
 

@@ -1,4 +1,4 @@
-"""What befalls software on robots, done to the real processes: `python -m tests.bench faults --times 20`.
+"""Faults, from kill -9 to a wrong key, done to the real processes: `python -m tests.bench faults --times 20`.
 
 Each fault is tried so many times, each time in a node of its own that replays six small photographs. Good is a trial
 after which all of them are in a finished scene, nothing lies about half written, and the exit codes are right. A fault

@@ -1,4 +1,5 @@
-"""One scene out of many: `python -m tests.bench merge castle_p30 --per-second 1 --max-views 12`.
+"""Merged scenes against the scenes that they were made of:
+`python -m tests.bench merge castle_p30 --per-second 1 --max-views 12`.
 
 The photographs of a scene, without those that are held out, are replayed through the real processes, which make a chain
 of scenes of them. These are merged. Each scene is scored on the held-out photographs that lie between two of its own,

@@ -1,4 +1,4 @@
-"""A node under siege: `python -m tests.bench siege --minutes 60 --over ipc`.
+"""A hostile client on every socket: `python -m tests.bench siege --minutes 60 --over ipc`.
 
 The real processes follow a walk through the built-in place, eight pictures a second, over and over. Quiet phases and
 hostile ones alternate; in a hostile one a client besieges the node's sockets (tests/bench/node/besieger.py): over ipc

@@ -1,4 +1,5 @@
-"""Weeks in small: `python -m tests.bench soak IMAGES --minutes 60` replays a folder over and over, 30 frames a second.
+"""An hour of replay at 30 frames a second:
+`python -m tests.bench soak IMAGES --minutes 60` replays a folder over and over, 30 frames a second.
 
 Every few seconds: memory and open descriptors of capture and recon; in the end, what both say of themselves. The
 latency of a preview is the time from its sending to its arrival here. Memory is flat where the median of the last

@@ -1,4 +1,5 @@
-"""What more buys: `python -m tests.bench budgets [SCENE:VIEWS ...] --starts FOLDER --out budgets.json`.
+"""What limits on iterations, Gaussians, size and time cost:
+`python -m tests.bench budgets [SCENE:VIEWS ...] --starts FOLDER --out budgets.json`.
 
 From the same cameras and points, scenes within rising limits of each kind, and the one without limits at each of its
 checkpoints. Told: whether quality ever falls when a limit rises, and what the scene was worth at every moment. Limits

@@ -4,6 +4,9 @@ For each scene, number of images (3, 6, 12), kind of `recon/evaluate/stability/l
 told, EXIF right and unchanged, lens given for all), cameras and verdict are estimated from a window that overlaps well,
 and compared with the truth. Wrong is a camera beyond 2.5 times a bound, or beyond 5 degrees or 10 % of the distance
 without the word rough. A trial counts as answered where it is published and not wrong.
+
+`--judge FILE --fitted-to RESULT ...` runs nothing: it judges the trials of FILE by numbers that are fitted to the
+samples of the results (those of `python -m tests.bench fit`) without the trial's scene, in a minute.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -26,6 +29,15 @@ from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.dataset import load_scene
 from splatnode.recon.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
+from splatnode.recon.evaluate.stability.fitting.fit import fit_models
+from splatnode.recon.evaluate.stability.fitting.samples import (
+    Sample,
+    exceeds_bounds,
+    is_published,
+    load_results,
+    make_trial_samples,
+    read_samples,
+)
 from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, AssumptionBreak, set_intrinsics
 from splatnode.recon.evaluate.stability.perturbations import (
     TrialImage,
@@ -45,6 +57,7 @@ from splatnode.recon.fallbacks.run import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.preparation import load_prior, prepare
+from splatnode.recon.verification.error_model import VerdictModel
 
 STEP_DEG = 12.0
 
@@ -216,16 +229,49 @@ def table(trials: Sequence[Trial]) -> Iterator[str]:
         yield f"{kind:24s} {setting:8s} {format_answers(rows, clean, 'clean')}"
 
 
+def judge_without_scene(trials: Sequence[dict[str, Any]], samples: Sequence[Sample]) -> list[dict[str, object]]:
+    """Judges each trial by numbers that were fitted without its scene; pairs have numbers of their own."""
+    known: dict[tuple[str, bool], VerdictModel] = {}
+    judged: list[dict[str, object]] = []
+    for trial in trials:
+        published = wrong = False
+        for sample in make_trial_samples([dict(trial)]):
+            key = sample.scene, sample.is_pair
+            if key not in known:
+                others = [each for each in samples if each.is_pair == sample.is_pair and each.scene != sample.scene]
+                known[key] = fit_models(others)
+            published = is_published(sample, known[key])
+            wrong = published and exceeds_bounds(sample, known[key])
+        names = {name: trial[name] for name in ("scene", "count", "kind", "setting")}
+        judged.append({**names, "published": published, "wrong": wrong})
+    return judged
+
+
+def write_judged(trials: Path, results: Sequence[Path], out: Path) -> None:
+    """Writes the judged trials of a file."""
+    judged = judge_without_scene(load_results(trials)["trials"], read_samples(list(results)))
+    names = " ".join(path.name for path in results)
+    command = f"python -m tests.bench lens_assumptions --judge {trials.name} --fitted-to {names} --out {out.name}"
+    lines = ",\n".join(json.dumps(each) for each in judged)
+    out.write_text(f'{{"command": {json.dumps(command)}, "trials": [\n{lines}\n]}}\n')
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("scenes", type=Path, nargs="*")
     parser.add_argument("--out", type=Path, required=True, help="JSON file; FILE.jsonl beside it grows meanwhile")
+    parser.add_argument("--judge", type=Path, help="a file of trials to be judged without their scenes; runs nothing")
+    parser.add_argument(
+        "--fitted-to", type=Path, nargs="+", default=(), help="the samples that --judge fits numbers to"
+    )
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--settings", nargs="+", default=SETTINGS)
     parser.add_argument("--sample", type=int, help="kinds for each scene, number of images and setting, at most")
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
+    if arguments.judge:
+        return write_judged(arguments.judge, arguments.fitted_to, arguments.out)
     journal = arguments.out.with_suffix(".jsonl")
     of_scene = partial(
         run_scene,

@@ -1,4 +1,5 @@
-"""What Gaussians buy: `python -m tests.bench parsimony [SCENE:VIEWS ...] --out parsimony.json [--chart parsimony.png]`.
+"""What more and fewer Gaussians buy:
+`python -m tests.bench parsimony [SCENE:VIEWS ...] --out parsimony.json [--chart parsimony.png]`.
 
 Each set of photographs is registered once, and scenes are made from the same cameras and points: of the size that
 splatnode chooses; of a quarter to four times of it; with a Gaussian a pixel; and, of the size that was chosen, by

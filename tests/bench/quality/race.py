@@ -1,4 +1,4 @@
-"""The race on sets that nothing was tuned on: `python -m tests.bench race --out DIR [--seeds N] [--methods A,B]`.
+"""The race against other recipes, case by case: `python -m tests.bench race --out DIR [--seeds N] [--methods A,B]`.
 
 race_cases.json names the sets: scenes that no default or preset was chosen on, and other windows of photographs of
 scenes on which some were. Presets run against the recipes of others, as published and in a start with our filled depths

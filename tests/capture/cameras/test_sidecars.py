@@ -75,12 +75,12 @@ def test_an_image_waits_for_its_file_and_is_dropped_where_none_comes(tmp_path):
     (tmp_path / "a.jpg").write_bytes(photograph())
     late = threading.Timer(0.2, lambda: (tmp_path / "a.json").write_text(json.dumps(TOLD)))
     late.start()
-    watching = watch(tmp_path, sidecars=True, give_up_s=5.0)
+    watching = watch(tmp_path, sidecars=True, file_timeout_s=5.0)
     assert next(watching).camera_id == "left"
     late.join()
     (tmp_path / "b.jpg").write_bytes(photograph(1))
     (tmp_path / "a.jpg").unlink()
-    dropped = next(watch(tmp_path, sidecars=True, give_up_s=0.3))
+    dropped = next(watch(tmp_path, sidecars=True, file_timeout_s=0.3))
     assert isinstance(dropped, DroppedFrame) and "b.json is not there" in dropped.reason
 
 

@@ -207,7 +207,7 @@ def test_what_is_not_there_is_told_with_what_is(made):
         load_source(Request(made))
 
 
-@pytest.mark.parametrize("path", ["/etc/{video_key}", "../{chunk_index}", "{nothing}", "{file_index:x9}"])
+@pytest.mark.parametrize("path", ["/etc/{video_key}", "../{chunk_index}", "{nothing}", "{file_index:x9}", ".", ""])
 def test_a_video_path_leads_nowhere_else(copy, path):
     info = json.loads((copy / "meta" / "info.json").read_text())
     (copy / "meta" / "info.json").write_text(json.dumps({**info, "video_path": path}))

@@ -103,7 +103,7 @@ def test_verbs_print_by_this_module_alone():
         "probe.py",
         "window_trial.py",
     }  # all but the first run by themselves
-    files = [path for room in ("capture", "recon", "viewer") for path in (ROOT / room).rglob("*.py")]
+    files = [path for room in ("capture", "recon", "viewer", "extras") for path in (ROOT / room).rglob("*.py")]
     printed = [
         f"{path}: {ast.unparse(node)}"
         for path in files

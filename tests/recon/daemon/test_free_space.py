@@ -74,7 +74,7 @@ def test_a_restarted_node_sends_the_map_again_and_none_where_it_is_not_configure
                 peer.server.offer(frame)
             first = peer.wait(finished(3), "a final scene")
             peer.wait_for_acknowledgements()
-            assert "map.live" in node.wait_for_map(0.5).why
+            assert "occupancy.live" in node.wait_for_map(0.5).why
         with running(replace(config, occupancy=OccupancyConfig(live=True, voxel=0.05))):
             told = map_when(peer, node, lambda told: told.occupancy is not None)
             saved = splatnode.load(config.out / "scene-0001").map(voxel=0.05)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
@@ -95,3 +96,27 @@ def test_plain_weights_of_both_kinds_are_read(tmp_path):
     for name in ("a.pth", "a.safetensors"):
         found = read_weights(tmp_path / name)
         assert all(torch.equal(found[key], value) for key, value in weights.items())
+
+
+def test_a_length_in_a_pickle_allocates_no_more_than_the_file_holds(tmp_path):
+    path = tmp_path / "a.pth"
+    header = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}q\x00."
+    path.write_bytes(header + b"\x80\x02}X" + (2**31 - 1).to_bytes(4, "little") + b"name")
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match="not a PyTorch checkpoint"):
+            read_weights(path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 26  # of 2 GB that the file asks for
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_archive_over_several_disks_is_refused(tmp_path):
+    path = tmp_path / "a.pth"
+    torch.save({"a": torch.zeros(3)}, path)
+    data = path.read_bytes()
+    at = data.rindex(b"PK\x05\x06")
+    locator = b"PK\x06\x07" + (0).to_bytes(4, "little") + (0).to_bytes(8, "little") + (7).to_bytes(4, "little")
+    path.write_bytes(data[:at] + locator + data[at:])
+    with pytest.raises(ValueError, match="damaged or not a PyTorch checkpoint"):
+        read_weights(path)

@@ -21,6 +21,7 @@ from splatnode.capture.messaging.messages import (
     Request,
     decode_frame,
 )
+from splatnode.capture.messaging.network import REQUEST_LIMITS
 from splatnode.capture.messaging.pubsub import Answer, Want
 from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, read_message
 from splatnode.capture.messaging.wire import Limits, WireError, decode
@@ -78,8 +79,9 @@ def _read_map(parts: Any, folder: Path) -> object:
     return map_from(decode(parts, MapHeader, _LIMITS))
 
 
-def _decoding(schema: Any) -> Callable[[Any, Path], object]:
-    return lambda parts, folder: decode(parts, schema, _LIMITS)
+def _decoding(schema: Any, limits: Limits = _LIMITS) -> Callable[[Any, Path], object]:
+    """Of a message whose arrays nobody reads."""
+    return lambda parts, folder: decode(parts, schema, limits).header
 
 
 def _photograph(rng: random.Random, header: Any) -> list[messages.Row]:
@@ -247,16 +249,36 @@ def _read_preview(parts: Any, folder: Path) -> object:
 
 _MESSAGES = (
     Boundary("keyframes", _draw_frame, _read_frame, _FRAMES, 10, 6, mutants=4, tidy=False),
-    Boundary("keyframe requests", _of(Request), _decoding(Request), _WIRE, 10, 4, mutants=4, tidy=False),
-    Boundary("keyframe answers", _of(ConsumerStatus), _decoding(ConsumerStatus), _WIRE, 10, 1, mutants=4, tidy=False),
+    Boundary(
+        "keyframe requests", _of(Request), _decoding(Request, REQUEST_LIMITS), _WIRE, 10, 4, mutants=4, tidy=False
+    ),
+    Boundary(
+        "keyframe answers",
+        _of(ConsumerStatus),
+        _decoding(ConsumerStatus, REQUEST_LIMITS),
+        _WIRE,
+        10,
+        1,
+        mutants=4,
+        tidy=False,
+    ),
     Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1, mutants=4, tidy=False),
     Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3, mutants=4, tidy=False),
     Boundary("maps", _of(MapHeader, _states), _read_map, _WIRE, 20, 1, mutants=4, tidy=False),
     Boundary("recon's heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2, mutants=4, tidy=False),
     Boundary("capture's heartbeats", _of(CaptureStatus), _decoding(CaptureStatus), _WIRE, 10, 1, mutants=4, tidy=False),
     Boundary("any heartbeats", _of(CaptureStatus), _decoding(Heartbeat), _WIRE, 10, 1, mutants=4, tidy=False),
-    Boundary("commands", _of(Command | Answer), _decoding(Command | Answer), _WIRE, 10, 2, mutants=4, tidy=False),
-    Boundary("states", _of(Want), _decoding(Want), _WIRE, 10, 2, mutants=4, tidy=False),
+    Boundary(
+        "commands",
+        _of(Command | Answer),
+        _decoding(Command | Answer, REQUEST_LIMITS),
+        _WIRE,
+        10,
+        2,
+        mutants=4,
+        tidy=False,
+    ),
+    Boundary("states", _of(Want), _decoding(Want, REQUEST_LIMITS), _WIRE, 10, 2, mutants=4, tidy=False),
 )
 _FILES = (
     Boundary("photographs", images.image, _read_photograph, _IMAGES, 100, 3, mutants=2, tidy=False),

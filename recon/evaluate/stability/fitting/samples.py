@@ -82,7 +82,7 @@ def read_samples(paths: list[Path]) -> list[Sample]:
             windows = (make_window_sample(row) for row in rows if row.method == OURS and row.evidence is not None)
             found += [replace(window, told=told) for window in windows]
         elif "trials" in content:
-            found += list(_make_trial_samples(content["trials"]))
+            found += list(make_trial_samples(content["trials"]))
         else:
             raise ValueError(f"{path} must be a windows.json or a stability.json, it has {', '.join(content)}")
     return found
@@ -96,7 +96,8 @@ def make_window_sample(row: WindowRow) -> Sample:
     return Sample(row.scene, row.count, True, whole, _is_still(row.published, row.verdict), evidence, errors)
 
 
-def _make_trial_samples(trials: list[dict]) -> Iterator[Sample]:
+def make_trial_samples(trials: list[dict]) -> Iterator[Sample]:
+    """Yields the sample of each trial of ours that has evidence."""
     for trial in trials:
         if trial["method"] == OURS and trial.get("evidence") is not None:
             evidence = _parse_evidence(trial["evidence"])

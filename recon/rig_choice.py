@@ -1,0 +1,87 @@
+"""Which rig a reconstruction is given, with its lenses: that of a file, or what a recording tells of its cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.frame import Frame
+from splatnode.capture.lens_file import Lenses, describe_image
+from splatnode.capture.multi_camera import CameraSet
+from splatnode.capture.process.terminal import Tell
+from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.rig import Rig
+from splatnode.capture.rig_file import read_rig
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.replay_source import Source
+
+# Standard deviations of a camera's pose by a log's static transforms, which are drawn more often than calibrated
+DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = 0.005, 0.5
+_TRUSTED = ("given", "calibration")  # sources of a lens that a rig's does not replace
+
+
+def apply_rig(
+    given: Source, config: ReconstructionConfig, file: str | PathLike[str] | None, tell: Tell
+) -> tuple[Source, ReconstructionConfig]:
+    """The frames with the lenses of their rig, and the configuration with it: that of a file, or of their recording.
+
+    Raises as `choose_rig` and `add_rig_lenses`.
+    """
+    rig = choose_rig(None if file is None else Path(file), given.cameras, tell)
+    return (given, config) if rig is None else (add_rig_lenses(given, rig), hold_rig(config, rig))
+
+
+def choose_rig(file: Path | None, cameras: CameraSet | None, tell: Tell) -> Rig | None:
+    """The rig of a file, else that of the static transforms of the one log of all cameras; None: neither tells one.
+
+    Raises UnusableRig where the file gives none. `tell` hears what the log tells, or why it tells nothing.
+    """
+    if file is not None:
+        return read_rig(file)
+    try:
+        told = None if cameras is None else cameras.find_rig()
+    except ValueError as error:
+        tell(f"no rig is known before, the images tell: {error}")
+        return None
+    if told is None:
+        return None
+    tell(
+        f"the static transforms of the recording tell where its {len(told.cameras)} cameras stand, "
+        f"within {100 * DRAWN_SIGMA_M:g} cm and {DRAWN_SIGMA_DEG:g} degrees (--rig FILE in place of these)"
+    )
+    return Rig(tuple(replace(each, sigma_m=DRAWN_SIGMA_M, sigma_deg=DRAWN_SIGMA_DEG) for each in told.cameras))
+
+
+def hold_rig(config: ReconstructionConfig, rig: Rig) -> ReconstructionConfig:
+    """The configuration with a rig that is given."""
+    return msgspec.structs.replace(config, registration=msgspec.structs.replace(config.registration, rig=rig))
+
+
+def add_rig_lenses(given: Source, rig: Rig) -> Source:
+    """The frames, each whose lens is neither given nor calibrated with the lens that the rig has of its camera.
+
+    Raises ValueError where fewer than two of the rig's cameras took frames, or a lens is of none of their aspect ratio.
+    """
+    frames = [each for each in given.frames if isinstance(each, Frame)]
+    _check_names(rig, frames)
+    lensless = [each for each in frames if each.intrinsics is None or each.intrinsics.source not in _TRUSTED]
+    used = {each.camera_id for each in lensless}
+    lenses = Lenses({each.camera_id: each.intrinsics for each in rig.cameras
+                     if each.intrinsics is not None and each.camera_id in used})  # fmt: skip
+    lenses.check(map(describe_image, lensless))
+    added = {each.name: lenses.apply(each) for each in lensless}
+    return replace(given, frames=tuple(added.get(each.name, each) for each in given.frames))
+
+
+def _check_names(rig: Rig, frames: list[Frame]) -> None:
+    there = {frame.camera_id for frame in frames} - {""}
+    if frames and sum(camera.camera_id in there for camera in rig.cameras) < 2:
+        known = ", ".join(camera.camera_id for camera in rig.cameras)
+        raise ValueError(
+            f"a rig must name two or more of the cameras of the images; it has {sanitize_text(known, 200)}, and the "
+            f"images are of {sanitize_text(', '.join(sorted(there)), 200) or 'no cameras that are named'}. Name the "
+            "cameras as the rig does: --cameras A,B with a folder or a film of each in their order"
+        )
