@@ -74,7 +74,7 @@ class DepthImage:
     unit_m: float = MILLIMETRE  # metres of a step: 0.001 where values are millimetres, 1 where they are metres
     intrinsics: Intrinsics | None = None  # of the depth camera; None: the frame's, if it has any
     T_camera_depth: tuple[float, ...] = ALIGNED  # row by row, metres: where the depth camera is beside the frame's
-    noise: DepthNoise = NOISES[USUAL_KIND]
+    noise: DepthNoise = NOISES[USUAL_KIND]  # how unsure each depth is
     confidence: npt.NDArray[np.uint8] | None = field(default=None, repr=False)  # (H, W), 0: not believed; 255: wholly
 
     def __post_init__(self) -> None:

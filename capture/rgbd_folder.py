@@ -35,7 +35,7 @@ class RgbdFolderError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class RgbdFolder:
-    """Where photographs and their depth images lie."""
+    """The files of photographs and of their depth images."""
 
     layout: str  # TUM RGB-D, ScanNet or Record3D
     photographs: Path  # the folder with the photographs
@@ -63,7 +63,7 @@ class RgbdFolder:
 
 
 def find_rgbd_folder(folder: Path) -> RgbdFolder | None:
-    """What lies in `folder`, if it is in one of the layouts; None of another one. Raises RgbdFolderError, OSError."""
+    """The files in `folder`, if it is in one of the layouts; None of another one. Raises RgbdFolderError, OSError."""
     if not folder.is_dir():
         return None
     if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():

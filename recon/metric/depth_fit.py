@@ -165,7 +165,7 @@ def _average(values: Array, sigmas: Array) -> tuple[float, float]:
 
 
 def _find_shift(samples: _Samples, scale: float) -> tuple[tuple[float, float], float]:
-    """By which pixels at REFERENCE_PX depths fit the points best, and how much better the log likelihood is there."""
+    """The shift, pixels at REFERENCE_PX, that fits the points best, and by how much the log likelihood is better."""
     steps = np.arange(-_SEARCH_PX, _SEARCH_PX + 1, _STEP_PX)
     costs, counts = np.full((len(steps), len(steps)), np.inf), np.zeros((len(steps), len(steps)))
     for i, down in enumerate(steps):

@@ -27,7 +27,7 @@ def estimate_scale_from_depth(
     depths: Mapping[str, CameraDepth],
     others: Sequence[Measurement],
 ) -> tuple[list[Measurement | str], tuple[DepthCheck, ...]]:
-    """What the depth images of each camera say of the unit, or why they do not; and the judgement on each camera's.
+    """The unit by the depth images of each camera, or why there is none; and the judgement on each camera's.
 
     `others` is what further sources measured. Where these agree, and depths have another unit by MAX_DEVIATION standard
     deviations, the depth camera is named with its error, and gives no unit.

@@ -20,7 +20,7 @@ from splatnode.recon.metric.stereo import StereoPair, make_own_pair
 
 @dataclass(frozen=True, eq=False)
 class CameraDepth:
-    """What a depth camera measured, and which camera it is beside; empty: there is one."""
+    """A depth image, and the id of the camera that it is beside; empty: there is one."""
 
     camera_id: str
     depth: DepthImage

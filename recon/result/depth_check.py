@@ -20,7 +20,7 @@ class DepthCode(Enum):
 class DepthCheck:
     """The judgement on the depth images of one camera."""
 
-    code: DepthCode
+    code: DepthCode  # FITS, or what is wrong
     message: str  # one sentence
     camera_id: str = ""  # empty: there is one camera
     num_points: int = 0  # of the images, that were compared

@@ -225,7 +225,7 @@ class Result:
 
     @property
     def depth_checks(self) -> tuple[DepthCheck, ...]:
-        """What the images say of depth images that came with them, one for each camera; none came: empty."""
+        """The judgement of the images on each camera's depth images; empty where none came."""
         return self._snapshot.depth_checks
 
     @property
