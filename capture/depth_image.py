@@ -163,7 +163,7 @@ def make_depth_image(
         if array.size and int(array.max()) > 65_535:
             raise ValueError(f"a depth image of whole numbers must be within 65535, got {int(array.max())}")
         array = array.astype(np.uint16)
-    kept = np.ascontiguousarray(array, np.uint16 if whole else np.float32)
+    kept = np.ascontiguousarray(array, np.uint16) if whole else np.ascontiguousarray(array, np.float32)
     matrix = np.eye(4) if T_camera_depth is None else np.asarray(T_camera_depth, np.float64)
     if matrix.shape != (4, 4):
         raise ValueError(f"T_camera_depth must be (4, 4), got {matrix.shape}")

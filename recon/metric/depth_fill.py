@@ -97,7 +97,7 @@ def warp_depth(depth: DepthImage, lens: Intrinsics, K: Map, shape: tuple[int, in
     across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(across - K[0, 2]) / K[0, 0], (down - K[1, 2]) / K[1, 1], np.ones_like(across)], -1)
     if np.array_equal(T_camera_depth, np.eye(4)):
-        pixels = project(rays.reshape(-1, 3), own).reshape(height, width, 2)
+        pixels = project(rays.reshape(-1, 3).astype(np.float64), own).reshape(height, width, 2)
         return MeasuredDepth(*_sample(z, sigma, pixels))
     return _splat(z, sigma, own, T_camera_depth, K, shape)
 
@@ -119,7 +119,7 @@ def _sample(z: Map, sigma: Map, pixels: Map) -> tuple[Map, Map]:
 def _splat(z: Map, sigma: Map, own: Intrinsics, T_camera_depth: Map, K: Map, shape: tuple[int, int]) -> MeasuredDepth:
     """Each measured point where the camera sees it, the nearest first; on a grid so coarse that it has no gaps."""
     rows, columns = np.nonzero(z > 0)
-    rays = unproject(np.column_stack([columns, rows]) + 0.5, own)
+    rays = unproject(np.column_stack([columns, rows]).astype(np.float64) + 0.5, own)
     points = rays / rays[:, 2:] * z[rows, columns][:, None] @ T_camera_depth[:3, :3].T + T_camera_depth[:3, 3]
     size = max(1.0, 1.5 * K[0, 0] / own.fx)  # pixels of the image for one of the depth image
     height, width = (int(np.ceil(side / size)) for side in shape)

@@ -53,7 +53,9 @@ def _fit_planes(values: Map, known: Mask, side: int) -> tuple[Map, Map, Map]:
     weight = known.astype(np.float64)
 
     def total(each: Map) -> Map:
-        return cv2.boxFilter(each * weight, cv2.CV_64F, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        window, kind = (side, side), cv2.CV_64F
+        summed = cv2.boxFilter(each * weight, kind, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(summed, np.float64)
 
     count = total(np.ones_like(values))
     many = np.maximum(count, 1.0)
