@@ -80,12 +80,11 @@ def unseen_scenes() -> str:
     methods = [name for name in found["rows"][0] if name != "scene"]
     rows = [(row["scene"], *(f"{row[m][0]:.1f} / {part(row[m][1], 3)}" for m in methods)) for row in found["rows"]]
     best = found["after_best_gain"]
-    ours, theirs = (best[name] for name in ("balanced", "InstantSplat-XL"))
-    notes = bullets(
-        f"{best['scene']} after the best gain for each held-out image: `balanced` {ours[0]:.1f} dB / "
-        f"{part(ours[1], 3)} / {part(ours[2], 3)} with {ours[3]} Gaussians, InstantSplat-XL {theirs[0]:.1f} dB / {part(theirs[1], 3)} / "
-        f"{part(theirs[2], 3)} with {theirs[3]}."
+    described = (
+        f"{name} {psnr:.1f} dB / {part(ssim, 3)} / {part(lpips, 3)} with {count} Gaussians"
+        for name, (psnr, ssim, lpips, count) in ((f"`{name}`", best[name]) for name in ("balanced", "InstantSplat-XL"))
     )
+    notes = bullets(f"{best['scene']} after the best gain for each held-out image: {', '.join(described)}.")
     header = (f"{found['views']} views, PSNR / SSIM", *methods)
     return f"{table(header, rows)}\n\n{notes}"
 
