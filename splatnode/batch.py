@@ -24,7 +24,7 @@ def recordings(
     Sources are folders of photographs, videos, MCAP files, LeRobot data sets, folders that hold such, and lists (.txt).
     What lies in the folder `results`, if one is given, is none. Raises FileNotFoundError, ValueError.
     """
-    from splatnode.recon.batch.batch import recordings as found
+    from splatnode.extras.batch.batch import recordings as found
 
     there = found([Path(source) for source in sources], None if results is None else Path(results))
     return [{"name": each.name, "source": each.source} for each in there]
@@ -49,11 +49,11 @@ def reconstruct_dataset(
     Each row takes one core. Like all of Ray Data this is lazy: the work begins when the rows are read. What fails is a
     row with the verdict FAILED. Raises ModuleNotFoundError without ray.
     """
-    from splatnode.recon.batch import cluster
-    from splatnode.recon.batch.command import replay
-    from splatnode.recon.batch.remote import Job
-    from splatnode.recon.jobs.child import Limits
-    from splatnode.recon.jobs.version import own_version
+    from splatnode.extras.batch import cluster
+    from splatnode.extras.batch.command import replay
+    from splatnode.extras.batch.remote import Job
+    from splatnode.extras.jobs.child import Limits
+    from splatnode.extras.jobs.version import own_version
 
     where = str(results) if "://" in str(results) else str(Path(results).resolve())
     job = Job(partial(replay, tuple(options)), where, Limits(max_memory_mb, timeout_s), own_version())

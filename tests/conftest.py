@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 # Where results come from long sums in the compiled core: CI runs these a second time with another order of additions.
 NUMERICAL = (
-    "recon/evaluate/rivals",
+    "extras/evaluate/rivals",
     "recon/frames",
     "recon/matching",
     "recon/optimize",

@@ -347,7 +347,7 @@ class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     max_shift: float = 0.5  # of the principal point, over the longer side: it is in the picture, or was before a crop
     max_log_aspect: float = 0.7  # of the focal length across over that down: 2
     max_radial: float = 0.5  # the first coefficient of a lens that bends lines; beyond, it is a fisheye
-    max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (recon/evaluate/stability/case.py)
+    max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (extras/evaluate/stability/case.py)
     max_centre_percent: float = 10.0  # likewise
 
 

@@ -14,8 +14,8 @@ from msgspec import structs
 from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
+from splatnode.extras.evaluate.methods import extract_start_config, find_start
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.methods import extract_start_config, find_start
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize.optimizer import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss

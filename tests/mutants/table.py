@@ -39,7 +39,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "capture",
-        "capture/logged/messages.py",
+        "extras/logged/messages.py",
         ("OpenCV's principal point is half a pixel off", "cx - x + 0.5, cy - y + 0.5,", "cx - x, cy - y,"),
     ),
     *_list_mutants(
@@ -340,7 +340,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/methods.py",
+        "extras/evaluate/methods.py",
         (
             "paper: point render ends at 1.0 instead of .8",
             "point_render.Config(0.25, 0.1, 0.8,",
@@ -360,12 +360,12 @@ MUTANTS = (
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/outcome.py",
+        "extras/evaluate/rivals/outcome.py",
         ("a rival's model of two cameras is published", "MIN_CAMERAS = 3", "MIN_CAMERAS = 2"),
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/colmap.py",
+        "extras/evaluate/rivals/colmap.py",
         (
             "COLMAP: each photograph its own camera",
             "one_camera = pycolmap.CameraMode.PER_FOLDER",
@@ -375,7 +375,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/colmap_3dgs.py",
+        "extras/evaluate/rivals/colmap_3dgs.py",
         ("3DGS: Gaussians of a third of the opacity", "_OPACITY = 0.1", "_OPACITY = 0.03"),
         ("3DGS: scales a tenth as fast", "log_scales=5e-3,", "log_scales=5e-4,"),
         (
@@ -386,7 +386,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/colmap_fsgs.py",
+        "extras/evaluate/rivals/colmap_fsgs.py",
         ("FSGS: the threshold of 3DGS", "min_gradient=5e-4", "min_gradient=2e-4"),
     ),
     *_list_mutants(
@@ -396,17 +396,17 @@ MUTANTS = (
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/cf_3dgs.py",
+        "extras/evaluate/rivals/cf_3dgs.py",
         ("CF-3DGS: a twentieth of the steps to the next pose", "motion: int = 200", "motion: int = 10"),
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/nerfmm.py",
+        "extras/evaluate/rivals/nerfmm.py",
         ("NeRF--: the focal length starts at half the image", "Focal(1.0)", "Focal(0.5)"),
     ),
     *_list_mutants(
         "recipes",
-        "recon/evaluate/rivals/nope_nerf.py",
+        "extras/evaluate/rivals/nope_nerf.py",
         (
             "NoPe-NeRF: depth counts a tenth",
             "_DEPTH, _CLOUD, _SURFACE = 0.04, 1.0, 1.0",
@@ -416,7 +416,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "recon/evaluate/protocol.py",
+        "extras/evaluate/protocol.py",
         ("the interpolated start is the true pose", 'if settings.start == "interpolated":', "if False:"),
         (
             "test pose: the last, not the best",
@@ -451,7 +451,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "recon/evaluate/stability/case.py",
+        "extras/evaluate/stability/case.py",
         (
             "claim: right is within 5 degrees",
             "RIGHT_ROTATION_DEG, RIGHT_SPREAD_PCT = 2.0, 5.0",
@@ -475,12 +475,12 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "recon/evaluate/regions.py",
+        "extras/evaluate/regions.py",
         ("regions: seen once counts as seen twice", '"two": (2,)', '"two": (1, 2)'),
     ),
     *_list_mutants(
         "scoring",
-        "recon/evaluate/camera_errors.py",
+        "extras/evaluate/camera_errors.py",
         (
             "centre error is the largest and not the root mean square",
             "math.sqrt(float(((moved - target) ** 2).sum(1).mean()))",
@@ -489,7 +489,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "recon/evaluate/stability/windows/windows.py",
+        "extras/evaluate/stability/windows/windows.py",
         (
             "windows: wrong cameras of a rough answer do not count",
             "if not self.cameras or any(camera.is_wrong(self.verdict == ROUGH) for camera in self.cameras):",
@@ -498,7 +498,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "recon/evaluate/stability/windows/campaign.py",
+        "extras/evaluate/stability/windows/campaign.py",
         (
             "windows: the coverage counts refused cameras",
             "cameras = [camera for row in rows if row.published for camera in row.cameras]",
@@ -507,7 +507,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "fit",
-        "recon/evaluate/stability/fitting/fit.py",
+        "extras/evaluate/stability/fitting/fit.py",
         (
             "leave-one-scene-out leaves nothing out",
             "fit_models([sample for sample in samples if sample.scene != scene])",
@@ -545,7 +545,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "fit",
-        "recon/evaluate/stability/fitting/samples.py",
+        "extras/evaluate/stability/fitting/samples.py",
         (
             "cameras of two worlds are no gross error",
             "return not self.is_one_world or any(\n            error.centre_pct",

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.extras.evaluate.dataset import load_scene, load_split
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
-from splatnode.recon.evaluate.dataset import load_scene, load_split
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import registration
 from splatnode.recon.result.verdict import Code, Verdict

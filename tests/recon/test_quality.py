@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.extras.evaluate.methods import continue_reconstruction, find_start
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
-from splatnode.recon.evaluate.methods import continue_reconstruction, find_start
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot

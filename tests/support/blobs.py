@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import torch
 
-from splatnode.recon.evaluate.dataset import Split
-from splatnode.recon.evaluate.protocol import Settings, create_empty_networks
+from splatnode.extras.evaluate.dataset import Split
+from splatnode.extras.evaluate.protocol import Settings, create_empty_networks
 from splatnode.recon.geometry import Similarity, exp_se3
 from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.calibration.board import Board
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import lens as lenses
+from splatnode.extras.calibration.board import Board
 
 Array = npt.NDArray[np.float64]
 

@@ -7,11 +7,12 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from splatnode.capture.cameras import building, synthetic
-from splatnode.capture.diorama.building import walk
+from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.render import cast, look_at
 from splatnode.capture.diorama.scene import PALETTES, Builder, table
 from splatnode.capture.frame import Frame
+from splatnode.extras.building import walk
+from splatnode.extras.cameras import building
 from tests.support.synthetic import renumbered
 
 # R_camera_side (3, 3): ahead, right, left, down, up, back.

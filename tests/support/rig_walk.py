@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.cameras import building
-from splatnode.capture.diorama.building import walk
 from splatnode.capture.frame import Clock, Frame, Intrinsics, Stamp
+from splatnode.extras.building import walk
+from splatnode.extras.cameras import building
 
 Array = npt.NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from splatnode.recon.evaluate.dataset import EvaluationScene, TrueCamera
-from splatnode.recon.evaluate.stability.perturbations import ScenesByMotion, TrialScene
+from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
+from splatnode.extras.evaluate.stability.perturbations import ScenesByMotion, TrialScene
 
 K = np.array([[200.0, 0.0, 120.0], [0.0, 200.0, 90.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 240, 180

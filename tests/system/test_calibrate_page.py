@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import re
 
-from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.estimate import MODELS
-from splatnode.capture.calibration.verb import CALIBRATE
+from splatnode.extras.calibration.board import Board
+from splatnode.extras.calibration.estimate import MODELS
+from splatnode.extras.calibration.verb import CALIBRATE
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "calibrate.md").read_text(encoding="utf-8")

@@ -51,7 +51,6 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     )
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
-        "splatnode.capture.calibration.verb",
         "splatnode.capture.former_names",
         "splatnode.capture.process.arguments",
         "splatnode.capture.process.config_text",
@@ -64,20 +63,21 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.text",
         "splatnode.capture.verbs",
         "splatnode.command_line",
-        "splatnode.recon.auditing.verb",
-        "splatnode.recon.batch.verb",
-        "splatnode.recon.evaluate.verbs",
+        "splatnode.extras.auditing.verb",
+        "splatnode.extras.batch.verb",
+        "splatnode.extras.calibration.verb",
+        "splatnode.extras.evaluate.verbs",
+        "splatnode.extras.jobs.arguments",
+        "splatnode.extras.viewers.rerun_flag",
+        "splatnode.extras.viewers.viser_flag",
         "splatnode.recon.former_names",
-        "splatnode.recon.jobs.arguments",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.replay_verb",
         "splatnode.recon.shared_arguments",
         "splatnode.recon.verbs",
         "splatnode.viewer.former_names",
         "splatnode.viewer.further",
-        "splatnode.viewer.rerun_flag",
         "splatnode.viewer.verbs",
-        "splatnode.viewer.viser_flag",
     ]
     assert heavy == "[]"
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.batch.batch import BatchRecording
-from splatnode.recon.batch.command import replay
-from splatnode.recon.jobs.call import pack_call
-from splatnode.recon.jobs.calls import Task, engine, run_here
-from splatnode.recon.jobs.child import Child, Limits, wait_for_end
-from splatnode.recon.jobs.version import own_version
+from splatnode.extras.batch.batch import BatchRecording
+from splatnode.extras.batch.command import replay
+from splatnode.extras.jobs.call import pack_call
+from splatnode.extras.jobs.calls import Task, engine, run_here
+from splatnode.extras.jobs.child import Child, Limits, wait_for_end
+from splatnode.extras.jobs.version import own_version
 from splatnode.viewer.probe import probe_window
 from splatnode.viewer.splash import splash
 from tests.support.hostile_folder import make_hostile, program, variables

@@ -22,7 +22,7 @@ assert not [name for name in sys.modules if name.startswith("torch.")]
     "module",
     [
         "splatnode.capture.cli",
-        "splatnode.capture.cameras.building",
+        "splatnode.extras.cameras.building",
         "splatnode.capture.cameras.synthetic",
         "recon",
         "splatnode.recon.result.snapshot",

@@ -17,15 +17,15 @@ FILES += sorted((ROOT / "splatnode").glob("*.py"))
 STARTS = {
     "capture/process/python.py",  # the one way
     "capture/process/start.py",  # what is run there first
-    "recon/jobs/launch.py",  # becomes the command that it was given
+    "extras/jobs/launch.py",  # becomes the command that it was given
     "recon/core/trial.py",  # the Python of a clean environment, isolated
 }
 UNPICKLES = {
-    "recon/jobs/call.py",  # from a folder of this user alone, or from Ray
-    "recon/jobs/called.py",  # from a folder of this user alone
-    "recon/evaluate/runner.py",  # from a temporary folder of this user alone
-    "recon/evaluate/stability/windows/campaign.py",  # arguments of a call
-    "recon/evaluate/stability/windows/windows.py",  # arguments of a call
+    "extras/jobs/call.py",  # from a folder of this user alone, or from Ray
+    "extras/jobs/called.py",  # from a folder of this user alone
+    "extras/evaluate/runner.py",  # from a temporary folder of this user alone
+    "extras/evaluate/stability/windows/campaign.py",  # arguments of a call
+    "extras/evaluate/stability/windows/windows.py",  # arguments of a call
     "recon/networks/lpips.py",  # arrays and nothing else
 }
 _STARTERS = {"system", "popen", "fork_exec", "posix_spawn", "posix_spawnp"}

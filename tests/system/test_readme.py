@@ -23,7 +23,7 @@ def says(*phrases: str, on: str) -> None:
 
 
 def test_how_the_rivals_are_cut_down():
-    from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, nerfmm
+    from splatnode.extras.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, nerfmm
     from splatnode.recon.optimize.control import adaptive
 
     assert colmap_3dgs.OPTIMIZE.iterations == colmap_fsgs.OPTIMIZE.iterations == nerfmm.OPTIMIZE.iterations == 1500

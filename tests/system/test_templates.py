@@ -15,7 +15,7 @@ from tests.conftest import ROOT
 ROOMS = ("capture", "recon", "viewer", "extras", "splatnode")
 _OWN = {  # templates, and widths, of the program's own that are no constants where they are filled in
     "capture/cli.py": {"longest"},
-    "recon/evaluate/report.py": {"digits", "measure.digits"},
+    "extras/evaluate/report.py": {"digits", "measure.digits"},
     "recon/result/snapshot.py": {"max(decimals, 0)"},
     "recon/verification/rejections.py": {"refusal.message.format", "refusal.advice.format"},
 }

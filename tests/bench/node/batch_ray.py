@@ -34,7 +34,7 @@ from typing import Any
 import msgspec
 
 from splatnode.capture.process.terminal import say
-from splatnode.recon.batch.batch import LEDGER
+from splatnode.extras.batch.batch import LEDGER
 from tests.bench.node.batch_simulation import lines, verdict, verdicts
 from tests.bench.node.simulated_batch import OUT, TALLY, end_of, recordings
 from tests.bench.node.trial import expect
@@ -43,7 +43,7 @@ from tests.bench.node.windows_on_disk import write_built_in, write_windows
 from tests.conftest import ROOT
 
 LONGEST_SLEEP_S = 1.0
-_AT_WORK = b"ray::_applied"  # how Ray calls a worker that runs a recording: by the function of recon/jobs/ray.py
+_AT_WORK = b"ray::_applied"  # how Ray calls a worker that runs a recording: by the function of extras/jobs/ray.py
 _LOOK_EVERY_S = 0.1
 _PATIENCE_S = 7200.0
 _TRIES = 5  # of a cluster's start: Ray waits 30 s for a node, and the machine may have other work, too

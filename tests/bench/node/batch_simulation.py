@@ -22,9 +22,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from splatnode.recon.batch.batch import FAILED, LEDGER
-from splatnode.recon.batch.command import EXIT_SOME_FAILED
-from splatnode.recon.batch.report import CSV
+from splatnode.extras.batch.batch import FAILED, LEDGER
+from splatnode.extras.batch.command import EXIT_SOME_FAILED
+from splatnode.extras.batch.report import CSV
 from tests.bench.node.simulated_batch import OUT, TALLY, end_of, recordings
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.cameras import building
 from splatnode.capture.status import heartbeats
+from splatnode.extras.cameras import building
 from splatnode.recon.result.export import read_cameras
 from tests.bench.node.building_cost import Sample, cost_row, folder_mb
 from tests.bench.node.building_score import camera_rows, loop_row, maps

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from splatnode.capture.cameras import building
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
+from splatnode.extras.cameras import building
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, TrueCamera
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, TrueCamera
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import Snapshot

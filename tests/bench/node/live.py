@@ -22,9 +22,9 @@ import numpy as np
 from splatnode.capture.config import PreviewHeader
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot

@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.merging.command import write_map
 from splatnode.recon.merging.submap import Submap, load_submaps
 from splatnode.recon.rasterize.dispatch import rasterize

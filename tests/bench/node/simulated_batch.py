@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from splatnode.recon.batch.batch import BatchRecording
-from splatnode.recon.batch.command import run_batch
+from splatnode.extras.batch.batch import BatchRecording
+from splatnode.extras.batch.command import run_batch
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 
 OUT, TALLY = "out", "tally"  # in the folder: the batch, and a line for each time that a recording began

@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.status import heartbeats
+from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.camera_errors import compare_cameras
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.export import read_cameras, read_gaussians

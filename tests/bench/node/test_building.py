@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.capture.cameras import building
+from splatnode.extras.cameras import building
 from splatnode.recon.geometry import Similarity
 from tests.bench.node.building_cost import Sample, cost_row, per_keyframe
 from tests.bench.node.building_score import camera_rows, loop_row, maps

@@ -24,9 +24,9 @@ from typing import Any
 import cv2
 import msgspec
 
-from splatnode.capture.cameras import building
 from splatnode.capture.messaging.keys import create_keys, expect_server
 from splatnode.capture.status import heartbeats
+from splatnode.extras.cameras import building
 from tests.bench.node import on_the_way
 from tests.bench.node.building import scored
 from tests.bench.node.on_the_way import Way

@@ -27,11 +27,11 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.process.terminal import say
-from splatnode.recon.auditing.audit import MeasuredMotion, measure_motion, twist
+from splatnode.extras.auditing.audit import MeasuredMotion, measure_motion, twist
+from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.locating.localize import Localization, localize_with_inliers, prepare_query_image
 from splatnode.recon.result.snapshot import Landmarks

@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split
+from splatnode.extras.evaluate.methods import Start, extract_start_config, find_start
+from splatnode.extras.evaluate.protocol import PerceptualNetworks
+from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import Reconstruction, estimate_depth
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split
-from splatnode.recon.evaluate.methods import Start, extract_start_config, find_start
-from splatnode.recon.evaluate.protocol import PerceptualNetworks
-from splatnode.recon.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import load_prior
 from splatnode.recon.registration.undistortion import corner_shift, undistort_keyframes, undistort_pixels

@@ -16,8 +16,8 @@ from itertools import pairwise
 
 from msgspec.structs import replace
 
+from splatnode.extras.evaluate.methods import continue_reconstruction
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.evaluate.methods import continue_reconstruction
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Scoring, load_case, parsed, parser_of
 

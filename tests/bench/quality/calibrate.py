@@ -19,17 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.calibration.board import Board
-from splatnode.capture.calibration.collect import (
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses import lens as lenses
+from splatnode.extras.calibration.board import Board
+from splatnode.extras.calibration.collect import (
     CORNERS,
     ENOUGH,
     Gathering,
     describe_missing_coverage,
     describe_uncertainty,
 )
-from splatnode.capture.calibration.estimate import choose, pixel_sigmas
-from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses import lens as lenses
+from splatnode.extras.calibration.estimate import choose, pixel_sigmas
 from tests.support.board_photographs import Photographer, waved
 
 WIDTH, HEIGHT = 960, 720

@@ -21,9 +21,9 @@ import numpy.typing as npt
 from torch import Tensor
 
 from splatnode.capture.frame import Intrinsics
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, compute_mean, evaluate, psnr, ssim
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, compute_mean, evaluate, psnr, ssim
 from splatnode.recon.geometry import angles_deg
 from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize.cpu import rasterize

@@ -22,9 +22,9 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.lenses.wide_pinhole import wide_pinhole
+from splatnode.extras.evaluate.dataset import Split, load_scene
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.dataset import Split, load_scene
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.pipeline import run
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.staged import write_file, write_files

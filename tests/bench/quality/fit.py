@@ -16,7 +16,7 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.recon.evaluate.stability.fitting.fit import (
+from splatnode.extras.evaluate.stability.fitting.fit import (
     fit_models,
     fit_without_each_scene,
     format_module,
@@ -24,10 +24,10 @@ from splatnode.recon.evaluate.stability.fitting.fit import (
     pair_held_out_models,
     rejudge_rows,
 )
-from splatnode.recon.evaluate.stability.fitting.samples import load_results, read_samples
-from splatnode.recon.evaluate.stability.windows import campaign
-from splatnode.recon.evaluate.stability.windows.campaign import format_report, summarise
-from splatnode.recon.evaluate.stability.windows.windows import COUNTS, WindowRow
+from splatnode.extras.evaluate.stability.fitting.samples import load_results, read_samples
+from splatnode.extras.evaluate.stability.windows import campaign
+from splatnode.extras.evaluate.stability.windows.campaign import format_report, summarise
+from splatnode.extras.evaluate.stability.windows.windows import COUNTS, WindowRow
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.verification.error_model import VerdictModel, VerdictModels
 

@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.extras.evaluate.methods import find_start
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate, load_networks
+from splatnode.extras.evaluate.protocol import Row as Scored
+from splatnode.extras.evaluate.regions import Counts
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
-from splatnode.recon.evaluate.methods import find_start
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate, load_networks
-from splatnode.recon.evaluate.protocol import Row as Scored
-from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -24,10 +24,10 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import say
+from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior

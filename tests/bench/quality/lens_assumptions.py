@@ -1,9 +1,9 @@
 """Images that break what is assumed of lenses: `python -m tests.bench lens_assumptions SCENE ... --out FILE`.
 
-For each scene, number of images (3, 6, 12), kind of `recon/evaluate/stability/lens_assumptions.py` and setting (nothing
-told, EXIF right and unchanged, lens given for all), cameras and verdict are estimated from a window that overlaps well,
-and compared with the truth. Wrong is a camera beyond 2.5 times a bound, or beyond 5 degrees or 10 % of the distance
-without the word rough. A trial counts as answered where it is published and not wrong.
+For each scene, number of images (3, 6, 12), kind of `extras/evaluate/stability/lens_assumptions.py` and setting
+(nothing told, EXIF right and unchanged, lens given for all), cameras and verdict are estimated from a window that
+overlaps well, and compared with the truth. Wrong is a camera beyond 2.5 times a bound, or beyond 5 degrees or 10 % of
+the distance without the word rough. A trial counts as answered where it is published and not wrong.
 
 `--judge FILE --fitted-to RESULT ...` runs nothing: it judges the trials of FILE by numbers that are fitted to the
 samples of the results (those of `python -m tests.bench fit`) without the trial's scene, in a minute.
@@ -25,12 +25,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.dataset import load_scene
-from splatnode.recon.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
-from splatnode.recon.evaluate.stability.fitting.fit import fit_models
-from splatnode.recon.evaluate.stability.fitting.samples import (
+from splatnode.extras.evaluate.dataset import load_scene
+from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
+from splatnode.extras.evaluate.stability.fitting.fit import fit_models
+from splatnode.extras.evaluate.stability.fitting.samples import (
     Sample,
     exceeds_bounds,
     is_published,
@@ -38,21 +36,29 @@ from splatnode.recon.evaluate.stability.fitting.samples import (
     make_trial_samples,
     read_samples,
 )
-from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, AssumptionBreak, set_intrinsics
-from splatnode.recon.evaluate.stability.perturbations import (
+from splatnode.extras.evaluate.stability.lens_assumptions import (
+    COUNTS,
+    KINDS,
+    SETTINGS,
+    AssumptionBreak,
+    set_intrinsics,
+)
+from splatnode.extras.evaluate.stability.perturbations import (
     TrialImage,
     TrialScene,
     find_neighbour_sets,
     find_parallel_sets,
 )
-from splatnode.recon.evaluate.stability.trial import ensure_registration, list_registered_cameras
-from splatnode.recon.evaluate.stability.windows.windows import (
+from splatnode.extras.evaluate.stability.trial import ensure_registration, list_registered_cameras
+from splatnode.extras.evaluate.stability.windows.windows import (
     OURS,
     PieceKey,
     load_plain_features,
     match_keyframes,
     select_keys,
 )
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.fallbacks.run import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects

@@ -20,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split
+from splatnode.extras.evaluate.methods import Start, extract_start_config, find_start
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split
-from splatnode.recon.evaluate.methods import Start, extract_start_config, find_start
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import exposure as scene_exposure

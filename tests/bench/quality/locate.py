@@ -35,10 +35,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, load_scene, load_split
 from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.evaluate.dataset import EvaluationScene, TrueCamera, load_scene, load_split
 from splatnode.recon.fallbacks.run import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.geometry import align_cameras

@@ -29,8 +29,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
+from splatnode.extras.evaluate.camera_errors import compare_cameras
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.markers import MarkerDetection, estimate_scale_from_markers

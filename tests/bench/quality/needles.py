@@ -35,9 +35,9 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
+from splatnode.extras.evaluate.methods import Start, continue_reconstruction, find_start
+from splatnode.extras.evaluate.protocol import Settings
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.evaluate.methods import Start, continue_reconstruction, find_start
-from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.geometry import Similarity, align_cameras
 from splatnode.recon.result.export import sanitize_gaussians
 from splatnode.recon.result.levels_of_detail import remove_unconfirmed

@@ -29,12 +29,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
-from splatnode.capture.cameras import building, synthetic
-from splatnode.capture.diorama.building import walk
-from splatnode.capture.diorama.building.building import CHAIR_ROOM, MIRROR_ROOM, interior
-from splatnode.capture.diorama.building.plan import ZONES
+from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.render import Camera, Solid
 from splatnode.capture.frame import Frame
+from splatnode.extras.building import walk
+from splatnode.extras.building.building import CHAIR_ROOM, MIRROR_ROOM, interior
+from splatnode.extras.building.plan import ZONES
+from splatnode.extras.cameras import building
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import Similarity, align_cameras

@@ -19,9 +19,9 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
+from splatnode.extras.evaluate.methods import Start, continue_reconstruction
+from splatnode.extras.evaluate.protocol import Settings
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.evaluate.methods import Start, continue_reconstruction
-from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.optimize.control import prune, relocate
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.export.formats.spz import encode_spz

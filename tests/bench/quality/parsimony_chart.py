@@ -14,7 +14,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from splatnode.recon.evaluate.charts import find_pareto_front
+from splatnode.extras.evaluate.charts import find_pareto_front
 
 SELF, PIXEL, RIVAL = "chosen", "pixel", "mcmc"
 MEASURES = {"psnr": 1, "ssim": 1, "lpips": -1}  # and whether more is better

@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
+from splatnode.extras.evaluate.stability.case import measure_camera_errors
+from splatnode.extras.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.evaluate.camera_errors import compare_cameras
-from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
-from splatnode.recon.evaluate.stability.case import measure_camera_errors
-from splatnode.recon.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.frames.keyframe import Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import match

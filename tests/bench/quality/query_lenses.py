@@ -29,9 +29,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
+from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads
-from splatnode.recon.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.locating.localize import localize_image
 from splatnode.recon.locating.outcome import Located, NotLocated

@@ -23,13 +23,13 @@ import msgspec
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.arguments import names, positive
 from splatnode.capture.process.terminal import say
+from splatnode.extras.evaluate import methods
+from splatnode.extras.evaluate.methods import Start, continue_reconstruction, extract_start_config
+from splatnode.extras.evaluate.protocol import INTERPOLATED_START, PerceptualNetworks, Settings, load_networks
+from splatnode.extras.evaluate.report import Bench, redraw
+from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
+from splatnode.extras.jobs.calls import Engine, engine
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.methods import Start, continue_reconstruction, extract_start_config
-from splatnode.recon.evaluate.protocol import INTERPOLATED_START, PerceptualNetworks, Settings, load_networks
-from splatnode.recon.evaluate.report import Bench, redraw
-from splatnode.recon.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
-from splatnode.recon.jobs.calls import Engine, engine
 from splatnode.recon.rasterize.dispatch import Device, DeviceUnavailable, choose_device, make_rasterizer
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
+from splatnode.extras.evaluate.charts import INK, choose_style, encode_png, style_axes
+from splatnode.extras.evaluate.protocol import Row
+from splatnode.extras.evaluate.report import OURS, WHOLE, Measure
 from splatnode.recon.config import PRESETS
-from splatnode.recon.evaluate.charts import INK, choose_style, encode_png, style_axes
-from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.report import OURS, WHOLE, Measure
 
 TICKS = (0.5, 1.0, 2.0, 4.0, 8.0)  # of time, over ours
 SMALLEST, LARGEST = 25.0, 330.0  # bubble areas, in points^2

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process.terminal import say
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
+from splatnode.extras.evaluate.methods import Start, continue_reconstruction
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate, load_networks
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split, load_scene, load_split
-from splatnode.recon.evaluate.methods import Start, continue_reconstruction
-from splatnode.recon.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate, load_networks
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -20,14 +20,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatnode.recon.clock import Clock
-from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.stability.case import ROUGH, MatrixRow, classify_outcome, score_cameras
-from splatnode.recon.evaluate.stability.matrix import ROWS
-from splatnode.recon.evaluate.stability.perturbations import Sampler, load_scenes_by_motion, load_trial_scenes
-from splatnode.recon.evaluate.stability.trial import ensure_registration, list_registered_cameras
-from splatnode.recon.evaluate.stability.windows import campaign
-from splatnode.recon.evaluate.stability.windows.windows import (
+from splatnode.extras.evaluate.stability.case import ROUGH, MatrixRow, classify_outcome, score_cameras
+from splatnode.extras.evaluate.stability.matrix import ROWS
+from splatnode.extras.evaluate.stability.perturbations import Sampler, load_scenes_by_motion, load_trial_scenes
+from splatnode.extras.evaluate.stability.trial import ensure_registration, list_registered_cameras
+from splatnode.extras.evaluate.stability.windows import campaign
+from splatnode.extras.evaluate.stability.windows.windows import (
     OURS,
     PieceKey,
     Window,
@@ -36,6 +34,8 @@ from splatnode.recon.evaluate.stability.windows.windows import (
     select_keys,
     select_moving_scenes,
 )
+from splatnode.recon.clock import Clock
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 

@@ -24,12 +24,12 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.lens import unproject
 from splatnode.capture.lenses.undistort import undistort_frame
 from splatnode.capture.process.terminal import say
+from splatnode.extras.evaluate.dataset import TrueCamera, load_scene
+from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, score_cameras
+from splatnode.extras.evaluate.stability.perturbations import TrialImage, TrialScene
+from splatnode.extras.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.dataset import TrueCamera, load_scene
-from splatnode.recon.evaluate.stability.case import ROUGH, CameraError, score_cameras
-from splatnode.recon.evaluate.stability.perturbations import TrialImage, TrialScene
-from splatnode.recon.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 from tests.bench.quality.lens_assumptions import find_answered, format_answers, window

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from splatnode.recon.evaluate.protocol import Settings
+from splatnode.extras.evaluate.protocol import Settings
 from tests.bench.quality.parsimony import configurations, write
 from tests.bench.quality.parsimony_chart import (
     PIXEL,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 
+from splatnode.extras.evaluate.methods import extract_start_config
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.methods import extract_start_config
 from tests.bench.quality import race
 
 

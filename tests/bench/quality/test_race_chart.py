@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.report import LPIPS, PSNR
+from splatnode.extras.evaluate.protocol import Row
+from splatnode.extras.evaluate.report import LPIPS, PSNR
 from tests.bench.quality import race_chart
 
 

@@ -17,11 +17,11 @@ import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.lens import project, unproject
+from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split
+from splatnode.extras.evaluate.protocol import PerceptualNetworks
+from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.camera_errors import CameraErrors, compare_cameras
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split
-from splatnode.recon.evaluate.protocol import PerceptualNetworks
-from splatnode.recon.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.pipeline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.real_sets import measure

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split
-from splatnode.recon.evaluate.methods import Start, extract_start_config, find_start
-from splatnode.recon.evaluate.protocol import PerceptualNetworks
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split
+from splatnode.extras.evaluate.methods import Start, extract_start_config, find_start
+from splatnode.extras.evaluate.protocol import PerceptualNetworks
 from splatnode.recon.scene import exposure
 from tests.bench.quality.light import ON, changed, drawn, gain_errors
 from tests.bench.quality.real_sets import measure

@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split
+from splatnode.extras.evaluate.methods import extract_start_config, find_start
+from splatnode.extras.evaluate.protocol import PerceptualNetworks
+from splatnode.extras.evaluate.stability.perturbations import apply_vignetting
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.dataset import EvaluationScene, Split
-from splatnode.recon.evaluate.methods import extract_start_config, find_start
-from splatnode.recon.evaluate.protocol import PerceptualNetworks
-from splatnode.recon.evaluate.stability.perturbations import apply_vignetting
 from splatnode.recon.scene import exposure
 from tests.bench.quality.real_sets import last, measure, timed
 

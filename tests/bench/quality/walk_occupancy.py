@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.capture.cameras import building
+from splatnode.extras.cameras import building
 from splatnode.recon.merging.command import write_maps
 from splatnode.recon.merging.submap import Submap
 from splatnode.recon.occupancy.command import read_to_map

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatnode.command_line import build_parser
 from splatnode.command_line import main as splatnode
-from splatnode.recon.evaluate.dataset import load_scene
+from splatnode.extras.evaluate.dataset import load_scene
 
 SCENES = Path("../shared/scenes")
 

@@ -19,8 +19,8 @@ from collections import Counter
 from pathlib import Path
 
 from splatnode.capture.process.terminal import say
-from splatnode.recon.evaluate.report import describe_processor
-from splatnode.recon.evaluate.stability.perturbations import load_trial_scenes
+from splatnode.extras.evaluate.report import describe_processor
+from splatnode.extras.evaluate.stability.perturbations import load_trial_scenes
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT
 

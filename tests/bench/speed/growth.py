@@ -16,8 +16,8 @@ import tempfile
 from pathlib import Path
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.evaluate.demo import write_training_images
-from splatnode.recon.evaluate.report import describe_machine
+from splatnode.extras.evaluate.demo import write_training_images
+from splatnode.extras.evaluate.report import describe_machine
 
 ROOT = Path(__file__).resolve().parents[3]
 RESULTS = ROOT / "tests" / "bench" / "results" / "growth.json"

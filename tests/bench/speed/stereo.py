@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.extras.priors.patchmatchnet import WEIGHTS, load_network
+from splatnode.extras.priors.patchmatchnet.stereo import NetworkStereo
 from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors.classical import DepthEstimator
 from splatnode.recon.priors.multi_view_consistency import DepthMap
-from splatnode.recon.priors.patchmatchnet import WEIGHTS, load_network
-from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
 from splatnode.recon.priors.stereo import (
     SparsePoints,
     StereoConfig,

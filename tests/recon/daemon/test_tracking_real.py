@@ -9,10 +9,10 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Frame, reduce_image
+from splatnode.extras.evaluate.dataset import load_scene, load_split
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.relocalization import Tracker, compute_landmarks, scale_intrinsics
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
-from splatnode.recon.evaluate.dataset import load_scene, load_split
 from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.preparation import prepare

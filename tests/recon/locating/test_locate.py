@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture.cameras import building
 from splatnode.capture.frame import Intrinsics
+from splatnode.extras.cameras import building
 from splatnode.recon import opencv_poses
 from splatnode.recon.locating import pose_candidates
 from splatnode.recon.locating.localize import LocalizationConfig, localize_image, localize_query, prepare_query_image

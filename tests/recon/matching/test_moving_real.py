@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from splatnode.extras.evaluate.dataset import load_scene
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.dataset import load_scene
 from splatnode.recon.matching import dynamic_objects
 from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import prepare

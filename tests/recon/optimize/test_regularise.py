@@ -9,8 +9,8 @@ import pytest
 import torch
 from msgspec import structs
 
+from splatnode.extras.evaluate.methods import CONFIGS
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.evaluate.methods import CONFIGS
 from splatnode.recon.networks.vit import Crop
 from splatnode.recon.optimize import losses
 from splatnode.recon.optimize.pseudo_views import PseudoView

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
+from splatnode.extras.evaluate.dataset import TrueCamera
+from splatnode.extras.evaluate.stability.case import make_frames, make_world, score_cameras
+from splatnode.extras.evaluate.stability.lens_assumptions import KINDS, correct_keystone, set_intrinsics, zoom_image
+from splatnode.extras.evaluate.stability.perturbations import TrialImage
+from splatnode.extras.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.evaluate.dataset import TrueCamera
-from splatnode.recon.evaluate.stability.case import make_frames, make_world, score_cameras
-from splatnode.recon.evaluate.stability.lens_assumptions import KINDS, correct_keystone, set_intrinsics, zoom_image
-from splatnode.recon.evaluate.stability.perturbations import TrialImage
-from splatnode.recon.evaluate.stability.trial import list_registered_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.registration import bundle_adjustment, self_calibration
 from splatnode.recon.registration.registration import register

@@ -10,8 +10,8 @@ import pytest
 import torch
 from msgspec import structs
 
+from splatnode.extras.evaluate.methods import continue_reconstruction, find_start
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.evaluate.methods import continue_reconstruction, find_start
 from splatnode.recon.optimize import training
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.initialization import initialize_gaussians

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.conftest import ROOT
-from tests.reference.measured import ages, cameras, live, race, robustness, scenes
+from tests.reference.measured import ages, cameras, live, race, robustness, roles, scenes
 
 BLOCKS: dict[str, Callable[[], str]] = {
-    block.__name__: block for room in (scenes, race, cameras, robustness, live, ages) for block in room.BLOCKS
+    block.__name__: block for room in (scenes, race, cameras, robustness, live, roles, ages) for block in room.BLOCKS
 }
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n)(.*?)(^<!-- end -->)", re.DOTALL | re.MULTILINE)
 

@@ -9,8 +9,8 @@ from statistics import median
 
 import numpy as np
 
-from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.report import OURS, SHOWN, WHOLE, Margin, compute_margins, read_bench
+from splatnode.extras.evaluate.protocol import Row
+from splatnode.extras.evaluate.report import OURS, SHOWN, WHOLE, Margin, compute_margins, read_bench
 from tests.bench.quality import race_chart
 from tests.reference.measured.raw import RESULTS, bullets, part, require, table
 

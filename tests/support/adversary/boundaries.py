@@ -28,13 +28,13 @@ from splatnode.capture.messaging.wire import Limits, WireError, decode
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.status import CaptureStatus, Heartbeat
+from splatnode.extras.evaluate.colmap_model import EvaluationFileError
+from splatnode.extras.evaluate.dataset import load_scene
 from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
 from splatnode.recon.daemon.node import Command
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.evaluate.colmap_model import EvaluationFileError
-from splatnode.recon.evaluate.dataset import load_scene
 from splatnode.recon.occupancy.message import MapHeader
 from splatnode.recon.occupancy.message import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
@@ -197,7 +197,7 @@ _CAPTURE = {
 }
 _RECON = {"network": {"first_port": 5000}, "checkpoint": "state", "reconstruction": {"seed": 1, "max_gaussians": 9}}
 _MESSAGING, _EXPORT = "splatnode.capture.messaging", "splatnode.recon.result.export"
-_TRUE, _CAPTURE_ROOM = "splatnode.recon.evaluate", "splatnode.capture"
+_TRUE, _CAPTURE_ROOM = "splatnode.extras.evaluate", "splatnode.capture"
 _WIRE = Reader((WireError,), (f"{_MESSAGING}.wire", f"{_MESSAGING}.values"))
 _FRAMES = Reader((WireError,), (*_WIRE.modules, f"{_MESSAGING}.keyframe_messages"))
 _PREVIEWS = Reader((WireError,), ("splatnode.capture.config", f"{_MESSAGING}.jpeg"))

@@ -26,9 +26,9 @@ from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import is_printable, sanitize_name
 from splatnode.command_line import build_parser
-from splatnode.recon.batch import batch
-from splatnode.recon.batch.batch import BatchRecording, read_list
-from splatnode.recon.jobs.child import End
+from splatnode.extras.batch import batch
+from splatnode.extras.batch.batch import BatchRecording, read_list
+from splatnode.extras.jobs.child import End
 from splatnode.recon.result import submap_index
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.export.result import read_digests
@@ -298,7 +298,7 @@ def _draw_key(rng: random.Random) -> bytes:
     )
 
 
-_BATCH, _WEB = "splatnode.recon.batch", "splatnode.viewer.web"
+_BATCH, _WEB = "splatnode.extras.batch", "splatnode.viewer.web"
 _WHOLE = Reader((SceneFileError,), ("splatnode.recon.result.submap_index",))
 _REPORTS = Reader((), (f"{_BATCH}.answer",))
 _LEDGERS = Reader((batch.OtherBatch,), (f"{_BATCH}.ledger",))

@@ -10,17 +10,17 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture import exif, image_header
-from splatnode.capture.cameras import mcap
 from splatnode.capture.exif import exif_time
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.image_file import ORIENTATION, check_whole, measure_values, upright_size
 from splatnode.capture.image_header import UnusableImage
 from splatnode.capture.lens_file import UnusableLens, read_lens
-from splatnode.capture.lerobot import data_set
-from splatnode.capture.logged.messages import CALIBRATIONS, PICTURES, Calibration, UnusableMessage, lens, rgb
 from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
 from splatnode.capture.pose_files import PosesFileError, read_poses
 from splatnode.capture.process.text import guard_untrusted
+from splatnode.extras.cameras import mcap
+from splatnode.extras.lerobot import data_set
+from splatnode.extras.logged.messages import CALIBRATIONS, PICTURES, Calibration, UnusableMessage, lens, rgb
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.npz_files import decode_depths, decode_landmarks
 from tests.support.adversary import archives, images, lenses, logs, poses, stored
@@ -143,9 +143,9 @@ _LENSES = Reader((UnusableLens,), _modules("lens_file"))
 _POSES = Reader((PosesFileError,), _modules("poses_file", "colmap_images"))
 _EXIF = Reader((), _modules("exif", "exif_time"))
 _HEADERS = Reader((UnusableImage,), _modules("image_header", "jpeg2000", "heif_file"))
-_LOGGED = Reader((UnusableMessage,), ("splatnode.capture.logged.messages",))
-_MCAP = Reader((ValueError,), ("splatnode.capture.cameras.mcap", "splatnode.capture.logged.mcap"))
-_DATA_SETS = Reader((data_set.UnusableDataSet,), ("splatnode.capture.lerobot.data_set",))
+_LOGGED = Reader((UnusableMessage,), ("splatnode.extras.logged.messages",))
+_MCAP = Reader((ValueError,), ("splatnode.extras.cameras.mcap", "splatnode.extras.logged.mcap"))
+_DATA_SETS = Reader((data_set.UnusableDataSet,), ("splatnode.extras.lerobot.data_set",))
 _MASKS = Reader((UnusableMask,), _modules("masks"))
 _LANDMARKS = Reader((SceneFileError,), (f"{_RESULT}.landmarks_file", f"{_RESULT}.npz_file"))
 _DEPTHS = Reader((SceneFileError,), (f"{_RESULT}.depth_file",))

@@ -12,6 +12,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
+from splatnode.extras.evaluate.camera_errors import compare_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.atlas import loop_closure as module
 from splatnode.recon.daemon.atlas.loop_closure import (
@@ -27,7 +28,6 @@ from splatnode.recon.daemon.atlas.loop_closure import (
 )
 from splatnode.recon.daemon.atlas.pose_graph import EdgeKind, make_loop_edge
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.preparation import prepare
 from splatnode.recon.result.verdict import Code

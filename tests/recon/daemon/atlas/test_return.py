@@ -14,13 +14,13 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.status import heartbeats
+from splatnode.extras.evaluate.camera_errors import compare_cameras
 from splatnode.recon.daemon.atlas import loop_closure as module
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message
 from splatnode.recon.daemon.checkpoint import checkpoint, records
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.finalizer import InactiveSubmaps
 from splatnode.recon.daemon.submap_index import SubmapIndex
-from splatnode.recon.evaluate.camera_errors import compare_cameras
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare

@@ -1,0 +1,549 @@
+"""The protocol: what a reconstruction scores on the views that it has not seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.extras.evaluate.dataset import EvaluationScene, Split
+from splatnode.extras.evaluate.regions import (
+    UNKNOWN,
+    Appearance,
+    Counts,
+    ErrorMaps,
+    Rasterize,
+    RegionScore,
+    compute_error_maps,
+    compute_region_scores,
+    make_appearance,
+)
+from splatnode.recon.frames import screening
+from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.geometry import align_cameras, exp_se3, twist_gradient
+from splatnode.recon.networks.lpips import Lpips, load_lpips
+from splatnode.recon.optimize import photometric_losses
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.scene.exposure import SATURATED, relative_illumination
+
+# Held-out photographs as a scene shows them: without the distortion that was taken out of its own photographs.
+
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+
+def select_one_lens(cameras: Sequence[CameraEstimate]) -> Sequence[CameraEstimate]:
+    """Those whose photographs had a distortion taken out, if they are most; else those whose had none."""
+    bent = [camera for camera in cameras if camera.lens is not None]
+    return bent if 2 * len(bent) > len(cameras) else [camera for camera in cameras if camera.lens is None]
+
+
+def undistort_view(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, Mask]:
+    """A photograph (H, W, 3), and where it is used (H, W), without the distortion of `lens`; None: as they are.
+
+    Raises ValueError where `lens` folds its picture over.
+    """
+    if lens is None:
+        return image, mask
+    frame = undistort_frame(Frame(0, "photograph", 0, image, lens, mask=mask))
+    return frame.image, np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask
+
+
+def undistort_counts(lens: Intrinsics | None, counts: Counts) -> Counts | None:
+    """How many photographs show each pixel (H, W) of a photograph, without the distortion of `lens`.
+
+    UNKNOWN where pixels that differ in it are mixed. None for a fisheye, whose picture gets another shape.
+    """
+    if lens is None:
+        return counts
+    if lens.model == "fisheye":
+        return None
+    blank, straight = np.zeros((*counts.shape, 3), np.uint8), np.full_like(counts, UNKNOWN)
+    for count in np.unique(counts):
+        straight[undistort_view(lens, blank, counts == count)[1]] = count
+    return straight
+
+
+def average_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:
+    """(3, 3) K for an image `width` x `height`: mean focal lengths and principal point, relative to the image sizes."""
+    longer = np.array([max(camera.width, camera.height) for camera in cameras])
+    Ks = np.stack([camera.K for camera in cameras])
+    fx, fy = (float((Ks[:, i, i] / longer).mean()) * max(width, height) for i in (0, 1))
+    cx = float((Ks[:, 0, 2] / [camera.width for camera in cameras]).mean()) * width
+    cy = float((Ks[:, 1, 2] / [camera.height for camera in cameras]).mean()) * height
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+# Held-out photographs as they are scored: which pixels of them count.
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutView:
+    name: str
+    photograph: Tensor  # (H, W, 3) in [0, 1]
+    used: Tensor  # (H, W) False where a mask hides it
+    shown: tuple[slice, slice]  # rows and columns without a black rim
+
+    @property
+    def comparison_mask(self) -> Tensor | None:
+        """(h, w) which pixels count of what is shown; None: all."""
+        used = self.used[self.shown]
+        return None if used.all() else used
+
+
+def load_held_out_views(
+    scene: EvaluationScene, split: Split, lens: Intrinsics | None, longer_side: int
+) -> Iterator[HeldOutView]:
+    """The test views with a true camera, without the distortion of `lens`; none of which a mask hides all."""
+    names = [name for name in split.test if name in scene.cameras]
+    given = [undistort_view(lens, *scene.load_masked_image(name)) for name in names]
+    photographs = [resize_image(image, longer_side) for image, _ in given]
+    rims = screening.valid_masks(photographs)
+    for name, photograph, valid, (_, mask) in zip(names, photographs, rims, given, strict=True):
+        used = torch.from_numpy(resize_mask(mask, *photograph.shape[:2]))
+        shown = screening.valid_rectangle(valid)
+        if used[shown].any():
+            yield HeldOutView(name, torch.from_numpy(photograph).float() / 255.0, used, shown)
+
+
+# How much two images differ. Images are (H, W, 3) in [0, 1].
+
+
+def psnr(image: Tensor, truth: Tensor, used: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, for a peak of 1; at most 100, which equal images get.
+
+    `used` (H, W) says which pixels count; None: all.
+    """
+    _check_same_shape(image, truth)
+    squares = (image.double() - truth.double()) ** 2
+    error = torch.mean(squares if used is None else squares[used])
+    return float(-10.0 * torch.log10(error.clamp(min=1e-10)))
+
+
+def ssim(image: Tensor, truth: Tensor) -> float:
+    """Structural similarity (Wang et al. 2004) as the 3DGS code defines it, so that figures compare.
+
+    An 11x11 Gaussian window of sigma 1.5 in each colour channel, zeros beyond the border, biased variances; the mean
+    over all pixels and channels, 1 for equal images.
+    """
+    _check_same_shape(image, truth)
+    return float(photometric_losses.ssim(image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)).mean())
+
+
+def _check_same_shape(image: Tensor, truth: Tensor) -> None:
+    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"images must both be (H, W, 3), got {tuple(image.shape)} and {tuple(truth.shape)}")
+
+
+def fit_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
+    """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so.
+
+    What is white in `truth` may have been brighter, and does not count; where nothing does, the gain is 1.
+    """
+    told = used[..., None] & (truth < SATURATED / 255.0)
+    seen, known = image * told, truth * told
+    squares = (seen * seen).sum((0, 1))
+    fitting = (seen * known).sum((0, 1)) / squares.clamp_min(1e-12)
+    return torch.where(squares > 0, fitting, 1.0).clamp_min(1e-3)
+
+
+# The networks that tell how alike two images look; without their weights nothing is measured.
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptualNetworks:
+    """The perceptual metrics for which there are weights."""
+
+    alex: Lpips | None
+    vgg: Lpips | None
+
+    @property
+    def quickest(self) -> PerceptualNetworks:
+        """Without VGG, which takes twenty times as long as AlexNet, where the other serves."""
+        return self if self.alex is None else PerceptualNetworks(self.alex, None)
+
+
+def load_networks(weights_dir: Path | None = None) -> PerceptualNetworks:
+    return PerceptualNetworks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
+
+
+def create_empty_networks() -> PerceptualNetworks:
+    """For who measures nothing that needs them."""
+    return PerceptualNetworks(None, None)
+
+
+# Where the search for a held-out view's pose starts if its true pose may not be used, as publications do it.
+
+Array = npt.NDArray[np.float64]
+
+
+def interpolate_pose(name: str, order: Sequence[str], cameras: Mapping[str, Array]) -> Array:
+    """(4, 4) T_world_camera between the estimated cameras of the photographs before and after `name` in `order`.
+
+    The centre moves evenly along the line between the two, and the rotation evenly about one axis, by the place of
+    `name` between them; before the first and after the last it is that camera's. Raises ValueError where no photograph
+    of `order` has a camera.
+    """
+    place = order.index(name)
+    known = [index for index, each in enumerate(order) if each in cameras and index != place]
+    if not known:
+        raise ValueError(f"cameras must have at least one of the {len(order)} photographs, has {sorted(cameras)[:3]}")
+    before = max((index for index in known if index < place), default=min(known))
+    after = min((index for index in known if index > place), default=max(known))
+    first, second = cameras[order[before]], cameras[order[after]]
+    share = 0.0 if before == after else (place - before) / (after - before)
+    turn = cv2.Rodrigues(first[:3, :3].T @ second[:3, :3])[0]
+    T = np.eye(4)
+    T[:3, :3] = first[:3, :3] @ cv2.Rodrigues(share * turn)[0]
+    T[:3, 3] = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    return T
+
+
+# Test-pose optimisation: the search for a test image's camera in a finished scene, which stays as it is.
+
+
+_BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-12  # of Adam (Kingma and Ba 2015)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPose:
+    T_world_camera: Array  # (4, 4)
+    loss: float  # mean absolute difference to the image
+
+
+def find_test_pose(
+    scene: Appearance,
+    image: Tensor,  # (H, W, 3) in [0, 1]
+    T_world_camera: Array,  # (4, 4) where the search starts
+    K: Array,  # (3, 3) of `image`
+    *,
+    steps: int,
+    levels: int = 1,
+    learning_rate: float = 0.003,
+    final: float = 0.01,  # the share of it that is left of the learning rate at the end
+    used: Tensor | None = None,  # (H, W) where the image is compared; None: everywhere
+) -> FoundPose:
+    """Equation 18: the pose from which the frozen scene looks most like the image, in mean absolute difference.
+
+    Adam moves a twist at the current pose, with a learning rate that falls exponentially (on a view of fountain_p11,
+    120 steps of it found what 500 steps of InstantSplat's cosine found). The best pose seen is returned, never one
+    worse than the start. `learning_rate` is in radians, and for the translation in parts of the scene's depth, so that
+    both move the image by similar amounts in a world without scale. With `levels` > 1 the steps are shared between
+    resolutions that double up to the image's own, which widens the basin and needs more of them. Raises ValueError for
+    steps or levels below 1.
+    """
+    if steps < 1 or levels < 1:
+        raise ValueError(f"steps and levels must be at least 1, got {steps} and {levels}")
+    start = torch.from_numpy(np.ascontiguousarray(T_world_camera, np.float64))
+    units = torch.ones(6, dtype=torch.float64)
+    units[:3] = scene.depth(T_world_camera)
+    first, second = torch.zeros(6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)  # Adam's moments
+
+    T, best_T, best_loss = start, start, math.inf
+    for step in range(steps):
+        level = step * levels // steps
+        reduced = _downsample_inputs(image, K, used, 2 ** (levels - 1 - level))
+        loss, gradient = _loss_and_gradient(scene, T, *reduced)
+        if level == levels - 1 and loss < best_loss:
+            best_T, best_loss = T, loss
+        slope = twist_gradient(T, gradient) * units
+        first = _BETA1 * first + (1 - _BETA1) * slope
+        second = _BETA2 * second + (1 - _BETA2) * slope**2
+        unbiased = first / (1 - _BETA1 ** (step + 1)), second / (1 - _BETA2 ** (step + 1))
+        rate = learning_rate * final ** (step / steps)
+        # The moments live in the camera's own frame, which turns with it: each step is a twist at the current pose.
+        T = T @ exp_se3(-rate * unbiased[0] / (unbiased[1].sqrt() + _EPSILON) * units)
+    for candidate in (T, start):
+        loss, _ = _loss_and_gradient(scene, candidate, image, torch.from_numpy(K), used)
+        if loss < best_loss:
+            best_T, best_loss = candidate, loss
+    return FoundPose(best_T.numpy(), best_loss)
+
+
+def _loss_and_gradient(
+    scene: Appearance, T_world_camera: Tensor, image: Tensor, K: Tensor, used: Tensor | None
+) -> tuple[float, Tensor]:
+    """The mean absolute difference, and its gradient (4, 4) with respect to the pose alone."""
+    T = T_world_camera.to(image).requires_grad_()
+    loss = scene.difference(image, T, K.to(image), used)
+    (gradient,) = torch.autograd.grad(loss, T)
+    return float(loss.detach()), gradient.double()
+
+
+def _downsample_inputs(
+    image: Tensor, K: Array, used: Tensor | None, factor: int
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The image area-resampled by 1 / `factor`, its K, and where it is compared."""
+    height, width = image.shape[:2]
+    size = max(1, round(height / factor)), max(1, round(width / factor))
+    ratios = torch.tensor([size[1] / width, size[0] / height, 1.0], dtype=torch.float64)
+    if size != (height, width):
+        image = functional.interpolate(image.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
+        used = None if used is None else _downsample_mask(used, size)
+    return image, torch.from_numpy(K) * ratios[:, None], used
+
+
+def _downsample_mask(used: Tensor, size: tuple[int, int]) -> Tensor:
+    """Pixels of which all is used; where there are none, those of which anything is."""
+    share = functional.interpolate(used.float()[None, None], size=size, mode="area")[0, 0]
+    whole = share > 0.999
+    return whole if whole.any() else share > 0
+
+
+STAGES = ("poses", "points", "optimise")
+FAILED = "FAILED"  # in place of a verdict's code
+_FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # learning rates of the test-pose search, in radians and parts of the depth
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How held-out views are scored; part of every benchmark's record."""
+
+    longer_side: int = 512  # pixels
+    alignment_steps: int = 120
+    alignment_levels: int = 1
+    continued_steps: int = 60  # from the pose that was found in another moment of the same run, at full size
+    start: Literal["true", "interpolated"] = "true"  # of the search
+    # A render gets, a channel, the gain that fits the photograph best: how that was exposed is nobody's to know
+    best_gain: bool = False
+
+
+INTERPOLATED_START = Settings(alignment_steps=300, alignment_levels=3, start="interpolated")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Which reconstruction a row is about, and what it cost. `seconds` has STAGES and "total"; None: not measured."""
+
+    method: str
+    seed: int
+    checkpoint: int | None  # the iterations at which this row was asked for; None: the end of the run
+    seconds: Mapping[str, float | None]
+    peak_rss_mb: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of bench.json. What was not measured is None."""
+
+    scene: str
+    views: int
+    method: str
+    seed: int
+    checkpoint: int | None  # the iterations at which this row was asked for; None: the end of the run
+    final: bool
+    iterations: int | None = None
+    psnr: float | None = None  # dB, mean over the test views, as are the next four
+    psnr_with_rim: float | None = None  # over whole photographs, with the black rims that undistortion left
+    ssim: float | None = None
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
+    rotation_error_deg: float | None = None
+    rotation_pair_error_deg: float | None = None
+    centre_error_pct: float | None = None
+    focal_error_pct: float | None = None
+    ate_instantsplat: float | None = None
+    seconds: Mapping[str, float | None]  # None: not measured, or others had a part of its cores
+    cores: int | None = None  # that it could use while it was timed
+    processor: str | None = None
+    others: float | None = None  # the share of the cores' time that others took meanwhile
+    peak_rss_mb: float | None
+    num_gaussians: int | None = None
+    num_cameras: int | None = None  # of the training views, those with an estimated pose
+    scene_bytes: int | None = None
+    regions: Mapping[str, RegionScore] = field(default_factory=dict)  # by regions.REGIONS; empty: not measured
+    verdict: str  # a verdict's code; FAILED where the run ended without a result
+    error: str | None = None  # why it did
+
+
+Show = Callable[[str, Tensor, Tensor], None]  # name of a test view, photograph, render; both (H, W, 3) in [0, 1]
+Poses = MutableMapping[str, npt.NDArray[np.float64]]  # T_world_camera (4, 4) by the name of a test view
+
+
+def ignore_render(name: str, truth: Tensor, image: Tensor) -> None:
+    """For a caller that wants no renders."""
+
+
+def evaluate(
+    snapshot: Snapshot,
+    scene: EvaluationScene,
+    split: Split,
+    run: Run,
+    *,
+    rasterize: Rasterize,
+    networks: PerceptualNetworks,
+    settings: Settings,
+    show: Show = ignore_render,
+    found: Poses | None = None,
+    shown: Mapping[str, Counts] | None = None,
+) -> Row:
+    """Scores a snapshot on the scene's test views. The truth is used here and nowhere earlier.
+
+    `show` gets the name of each test view, its photograph and what the scene looks like from there. `found` holds the
+    test views' poses that another moment of the same run was given, from which the search then goes on; where it lacks
+    one, it gets it. `shown` tells of test views how many training photographs show each pixel (shown.py), at the size
+    at which they are scored: then the row has scores by region.
+
+    A snapshot whose verdict forbids publishing it has no scene and is scored on nothing; its cameras are compared all
+    the same, which tells whether the refusal was needed.
+    """
+    estimated = [camera for camera in snapshot.cameras if camera.name in scene.cameras]
+    errors = _compare_cameras(estimated, scene)
+    appearance = make_appearance(snapshot, rasterize)
+    found = {} if found is None else found
+    cameras = select_one_lens(snapshot.cameras)
+    falloff = snapshot.falloffs.get(cameras[0].name, 0.0) if cameras else 0.0
+    seen = appearance, cameras, estimated, falloff
+    views = _score_test_views(*seen, scene, split, networks, settings, show, found, shown or {})
+    return Row(
+        scene=scene.name,
+        views=len(split.train),
+        method=run.method,
+        seed=run.seed,
+        checkpoint=run.checkpoint,
+        final=run.checkpoint is None,
+        iterations=snapshot.iterations,
+        psnr=compute_mean([view.psnr for view in views]),
+        psnr_with_rim=compute_mean([view.psnr_with_rim for view in views]),
+        ssim=compute_mean([view.ssim for view in views]),
+        lpips_alex=compute_mean([view.lpips_alex for view in views]),
+        lpips_vgg=compute_mean([view.lpips_vgg for view in views]),
+        rotation_error_deg=errors.rotation_deg,
+        rotation_pair_error_deg=errors.rotation_pair_deg,
+        centre_error_pct=errors.centre_pct,
+        focal_error_pct=errors.focal_pct,
+        ate_instantsplat=errors.ate_instantsplat,
+        seconds=run.seconds,
+        peak_rss_mb=run.peak_rss_mb,
+        num_gaussians=0 if appearance is None else appearance.num_gaussians,
+        num_cameras=len(snapshot.cameras),
+        scene_bytes=0 if appearance is None else appearance.num_bytes,
+        regions=compute_region_scores([view.maps for view in views if view.maps is not None]),
+        verdict=snapshot.verdict.code.value,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewScore:
+    psnr: float
+    psnr_with_rim: float
+    ssim: float
+    lpips_alex: float | None
+    lpips_vgg: float | None
+    maps: ErrorMaps | None  # None: nothing tells which training photographs show the pixels
+
+
+def _score_test_views(
+    appearance: Appearance | None,
+    cameras: Sequence[CameraEstimate],
+    estimated: Sequence[CameraEstimate],
+    falloff: float,
+    scene: EvaluationScene,
+    split: Split,
+    networks: PerceptualNetworks,
+    settings: Settings,
+    show: Show,
+    found: Poses,
+    counts: Mapping[str, Counts],
+) -> list[_ViewScore]:
+    """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
+
+    The search starts from the pose that was `found` before, or else from the true one, carried into the estimated world
+    by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view
+    can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
+    undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
+    and not at all in the search, in PSNR and in the scores by region. A distortion that was taken out of the training
+    photographs is taken out of these, too. Where their vignetting was taken out, renders get it. A view of which masks
+    leave nothing is left out.
+    """
+    if appearance is None or len(estimated) < 2:
+        return []
+    true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
+    true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
+    scores = []
+    for view in load_held_out_views(scene, split, cameras[0].lens, settings.longer_side):
+        name, whole, used = view.name, view.photograph, view.used
+        rows, columns = view.shown
+        height, width = whole.shape[:2]
+        whole_K = average_intrinsics(cameras, width, height)
+        truth = whole[rows, columns]
+        light = torch.from_numpy(relative_illumination(falloff, width, height))[..., None]
+        K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
+        if name in found:
+            start, steps, levels, rate = found[name], settings.continued_steps, 1, _CONTINUED_RATE
+        else:
+            start = true_to_estimated.camera(scene.cameras[name].T_world_camera)
+            if settings.start == "interpolated":
+                start = interpolate_pose(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
+            steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
+        target = (truth / light[rows, columns]).clamp(0.0, 1.0)
+        if settings.best_gain:
+            begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
+            target = target / fit_gains(target, begun, used[rows, columns])
+        T_world_camera = find_test_pose(
+            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.comparison_mask
+        ).T_world_camera
+        found.setdefault(name, T_world_camera)
+        with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
+        if settings.best_gain:
+            with_rim = with_rim * fit_gains(truth, with_rim[rows, columns], used[rows, columns])
+        with_rim = with_rim.clamp(0.0, 1.0)
+        show(name, truth, with_rim[rows, columns])
+        known = undistort_counts(cameras[0].lens, counts[name]) if name in counts else None
+        scores.append(_score_view(with_rim, whole, used, view.shown, networks, known))
+    return scores
+
+
+def _score_view(
+    with_rim: Tensor,
+    whole: Tensor,
+    used: Tensor,
+    shown: tuple[slice, slice],
+    networks: PerceptualNetworks,
+    counts: Counts | None,
+) -> _ViewScore:
+    """A render against a photograph, both (H, W, 3), where `used` (H, W) says so, within the rows and columns shown."""
+    whole = torch.where(used[..., None], whole, with_rim)
+    image, truth = with_rim[shown], whole[shown]
+    maps = None
+    if counts is not None:
+        judged = np.where(used.numpy(), counts, np.uint8(UNKNOWN))[shown]
+        maps = compute_error_maps(image, truth, judged, networks.alex)
+    return _ViewScore(
+        psnr=psnr(image, truth, used[shown]),
+        psnr_with_rim=psnr(with_rim, whole, used),
+        ssim=ssim(image, truth),
+        lpips_alex=networks.alex(image, truth) if networks.alex else None,
+        lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
+        maps=maps,
+    )
+
+
+def _compare_cameras(estimated: Sequence[CameraEstimate], scene: EvaluationScene) -> CameraErrors:
+    true = [scene.cameras[camera.name] for camera in estimated]
+    return compare_cameras(
+        np.array([camera.T_world_camera for camera in estimated]).reshape(-1, 4, 4),
+        np.array([camera.T_world_camera for camera in true]).reshape(-1, 4, 4),
+        np.array([camera.K_photographed for camera in estimated]).reshape(-1, 3, 3),
+        np.array([t.K_for(camera.width, camera.height) for t, camera in zip(true, estimated, strict=True)]).reshape(
+            -1, 3, 3
+        ),
+    )
+
+
+def compute_mean(values: Sequence[float | None]) -> float | None:
+    """Returns the mean of the values that were measured; None where none was."""
+    measured = [value for value in values if value is not None]
+    return float(np.mean(measured)) if measured else None

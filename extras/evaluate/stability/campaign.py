@@ -1,0 +1,140 @@
+"""All trials of a plan, some at a time; what is on the disk already is not run again."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import msgspec
+
+from splatnode.extras.evaluate.colmap_model import read_json
+from splatnode.extras.evaluate.report import check_same_cores, describe_machine
+from splatnode.extras.evaluate.runner import Journal
+from splatnode.extras.evaluate.stability.case import MatrixRow, TrialCase
+from splatnode.extras.evaluate.stability.perturbations import Sampler, ScenesByMotion
+from splatnode.extras.evaluate.stability.report import make_report
+from splatnode.extras.evaluate.stability.trial import FAILED, Trial, judge_trial, run_trial
+from splatnode.extras.jobs.call import pack_call
+from splatnode.extras.jobs.calls import Engine, Task, work_folder
+from splatnode.extras.jobs.child import Limits
+from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.folder import hold_result_folder
+
+logger = logging.getLogger(__name__)
+
+Key = tuple[int, str, int, str]
+
+
+@dataclass(frozen=True)
+class Plan:
+    rows: tuple[MatrixRow, ...]
+    seeds: tuple[int, ...]
+    methods: tuple[str, ...]
+    timeout_s: float = 120.0  # of one trial, from the start of its process on
+    max_memory_mb: float | None = None  # of one trial
+
+
+@dataclass(frozen=True, eq=False)
+class _TrialContext:
+    """A trial that is under way; its case is without photographs."""
+
+    row: int
+    name: str
+    seed: int
+    method: str
+    case: TrialCase
+
+
+def run_campaign(plan: Plan, places: ScenesByMotion, out: Path, command: str, engine: Engine) -> list[dict]:
+    """Runs what is missing in `out`/stability.json and returns all its trials.
+
+    What came to an end is on the disk at once, in a journal beside the file, which is rewritten every few seconds.
+    Raises ValueError where the file is of other scenes, or of trials with another number of cores: rates and seconds
+    over both would mean nothing.
+    """
+    path = out / "stability.json"
+    scenes = [place.name for kind in (places.walked, places.forward, places.turned) for place in kind]
+    trials = _resume_trials(path, scenes, engine.cores_each)
+    whole = partial(_write, path, plan, trials, {"scenes": scenes, "machine": describe_machine(), "command": command})
+    with hold_result_folder(out), work_folder(out) as folder:
+        if not path.exists():
+            whole()  # which scenes the journal is of
+        with Journal(out / "stability.jsonl", whole) as kept:
+            known = set(map(_make_key, trials))
+            trials += [trial for trial in kept.recover_records() if _make_key(trial) not in known]
+            present = set(map(_make_key, trials))
+            todo = [job for job in _list_jobs(plan) if (job[0].number, job[0].name, *job[1:]) not in present]
+            for trial in _run_jobs(plan, places, todo, engine, folder):
+                trials.append(asdict(trial))
+                kept.add(trials[-1])
+                logger.info(f"stability {len(trials)}/{len(present) + len(todo)}: {_format_trial(trial)}")
+    return trials
+
+
+def _write(path: Path, plan: Plan, trials: Sequence[Mapping], circumstances: Mapping) -> None:
+    ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_make_key(t)))
+    write_files(path.parent, {path.name: json_bytes({"trials": ordered, **make_report(ordered), **circumstances})})
+
+
+def _format_trial(trial: Trial) -> str:
+    took = "not timed" if trial.seconds is None else f"{trial.seconds:.1f} s"
+    answered = f"{trial.verdict}, {trial.outcome}, {'no answer' if trial.verdict == FAILED else took}"
+    return f"row {trial.row} {trial.name}, seed {trial.seed}, {trial.method}: {answered}"
+
+
+def plan_order(plan: Plan, method: str) -> int:
+    """The methods in the order of the plan, those of earlier runs after them."""
+    return plan.methods.index(method) if method in plan.methods else len(plan.methods)
+
+
+def _list_jobs(plan: Plan) -> list[tuple[MatrixRow, int, str]]:
+    """Seed after seed, so that a campaign that is stopped has tried every row."""
+    return [(row, seed, method) for seed in plan.seeds for row in plan.rows for method in plan.methods]
+
+
+def _run_jobs(
+    plan: Plan, places: ScenesByMotion, todo: Sequence[tuple[MatrixRow, int, str]], engine: Engine, folder: Path
+) -> Iterator[Trial]:
+    """Trials as they are done."""
+    tasks = (_make_task(places, *job) for job in todo)
+    limits = Limits(plan.max_memory_mb, plan.timeout_s)
+    for about, answer in engine.answers(partial(next, tasks, None), limits, folder):
+        yield judge_trial(about.case, about.row, about.name, about.seed, about.method, answer)
+
+
+def _make_task(places: ScenesByMotion, row: MatrixRow, seed: int, method: str) -> Task:
+    """The photographs go to the process, and the truth stays here."""
+    case = row.make(Sampler(places, row.name, seed))
+    call = pack_call(partial(run_trial, dataclasses.replace(case, worlds=()), method))
+    return Task(
+        _TrialContext(row.number, row.name, seed, method, dataclasses.replace(case, source=list, probe=None)), call
+    )
+
+
+class _Trials(msgspec.Struct, frozen=True):
+    scenes: list[str]
+    trials: list[dict]
+    machine: dict
+
+
+def _resume_trials(path: Path, scenes: Sequence[str], cores_each: int) -> list[dict]:
+    if not path.exists():
+        return []
+    content = read_json(path, _Trials, "the stability.json of a campaign")
+    if content.scenes != list(scenes):
+        raise ValueError(
+            f"{path} is of the scenes {', '.join(content.scenes)}, now there are {', '.join(scenes)}; "
+            "give another folder with --out DIR, or the same scenes"
+        )
+    before = content.machine.get("threads")  # on which each trial ran, before a trial said so itself
+    known = [trial.get("cores") or before for trial in content.trials if trial.get("seconds") is not None]
+    check_same_cores([cores for cores in known if cores], cores_each, path)
+    return content.trials
+
+
+def _make_key(trial: Mapping) -> Key:
+    return trial["row"], trial["name"], trial["seed"], trial["method"]

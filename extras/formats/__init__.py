@@ -1,0 +1,1 @@
+"""Export formats of other viewers: Foxglove and rerun."""

@@ -1,0 +1,125 @@
+"""An MCAP file for Foxglove: for each photograph its camera, calibration and picture, and the scene as points.
+
+The times are those of capture where all photographs have one of the same clock; else the frames are a second apart. The
+world is the first camera's frame: y is down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.extras.formats.foxglove import (
+    Message,
+    encode_base64,
+    encode_mcap,
+    make_calibration,
+    make_pose,
+    make_time,
+)
+from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.stored_snapshot import encode_image, load_full_snapshot
+
+DEFAULT_NAME = "scene.mcap"
+
+_NS = 1_000_000_000
+_WORLD, _CAMERA = "world", "camera"
+_UINT8, _FLOAT32 = 1, 7  # Foxglove's numbers of types
+_INFO, _WARNING = 2, 3  # and of levels
+_SCHEMAS = {  # by topic
+    "/tf": "FrameTransforms",
+    "/camera/pose": "PoseInFrame",
+    "/camera/calibration": "CameraCalibration",
+    "/camera/image": "CompressedImage",
+    "/gaussians": "PointCloud",
+    "/landmarks": "PointCloud",
+    "/verdict": "Log",
+}
+
+
+def export(result: StoredResult) -> bytes:
+    """Raises ModuleNotFoundError without the package mcap."""
+    from mcap.writer import Writer  # an extra
+
+    return encode_mcap(Writer, _make_messages(load_full_snapshot(result)), _SCHEMAS)
+
+
+def _make_messages(snapshot: Snapshot) -> list[Message]:
+    """In the order of time. What holds for the whole scene comes with its first photograph."""
+    times = _choose_times(snapshot.cameras)
+    began = min(times, default=0)
+    found = _make_scene_messages(snapshot, began)
+    for ns, camera in sorted(zip(times, snapshot.cameras, strict=True), key=lambda each: each[0]):
+        found += _make_image_messages(camera, encode_image(camera, snapshot.images), ns)
+    return found
+
+
+def _choose_times(cameras: Sequence[CameraEstimate]) -> list[int]:
+    stamps = [camera.captured_at for camera in cameras if camera.captured_at is not None]
+    if len(stamps) == len(cameras) and len({stamp.clock for stamp in stamps}) == 1:
+        return [stamp.ns for stamp in stamps]
+    return [camera.frame_id * _NS for camera in cameras]
+
+
+def _make_scene_messages(snapshot: Snapshot, ns: int) -> list[Message]:
+    verdict, gaussians, landmarks = snapshot.verdict, snapshot.gaussians, snapshot.landmarks
+    said = " ".join(part for part in (f"{verdict.code.value}:", verdict.message, verdict.advice) if part)
+    said += f" Lengths are {snapshot.scale.sentence}."
+    level = _INFO if verdict.publishable else _WARNING
+    log = {"timestamp": make_time(ns), "level": level, "message": said, "name": "splatnode", "file": "", "line": 0}
+    found: list[Message] = [("/verdict", ns, log)]
+    if len(gaussians):
+        alpha = np.rint(255 * gaussians.opacities).astype(np.uint8)
+        found.append(
+            ("/gaussians", ns, _make_cloud(gaussians.means, np.column_stack([compute_base_rgb(gaussians), alpha]), ns))
+        )
+    if landmarks is not None:
+        found.append(("/landmarks", ns, _make_cloud(landmarks.points, None, ns)))
+    return found
+
+
+def _make_image_messages(camera: CameraEstimate, jpeg: bytes | None, ns: int) -> list[Message]:
+    stamp, placed = make_time(ns), make_pose(camera.T_world_camera)
+    transform = {
+        "timestamp": stamp,
+        "parent_frame_id": _WORLD,
+        "child_frame_id": _CAMERA,
+        "translation": placed["position"],
+        "rotation": placed["orientation"],
+    }
+    found: list[Message] = [
+        ("/tf", ns, {"transforms": [transform]}),
+        ("/camera/pose", ns, {"timestamp": stamp, "frame_id": _WORLD, "pose": placed}),
+        ("/camera/calibration", ns, make_calibration(camera, ns, _CAMERA)),
+    ]
+    if jpeg is not None:
+        image = {"timestamp": stamp, "frame_id": _CAMERA, "data": encode_base64(jpeg), "format": "jpeg"}
+        found.append(("/camera/image", ns, image))
+    return found
+
+
+def _make_cloud(points: npt.NDArray, rgba: npt.NDArray[np.uint8] | None, ns: int) -> dict[str, object]:
+    names = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    colours = [] if rgba is None else [("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")]
+    packed = np.empty(len(points), np.dtype(names + colours))
+    for axis, (name, _) in enumerate(names):
+        packed[name] = points[:, axis]
+    for channel, (name, _) in enumerate(colours):
+        packed[name] = rgba[:, channel] if rgba is not None else 0
+    offsets = packed.dtype.fields or {}
+    fields = [
+        {"name": name, "offset": offsets[name][1], "type": _FLOAT32 if kind == "<f4" else _UINT8}
+        for name, kind in names + colours
+    ]
+    return {
+        "timestamp": make_time(ns),
+        "frame_id": _WORLD,
+        "pose": make_pose(np.eye(4)),
+        "point_stride": packed.dtype.itemsize,
+        "fields": fields,
+        "data": encode_base64(packed.tobytes()),
+    }

@@ -1,0 +1,103 @@
+"""A process that others are copies of: this module makes a copy of its process for each call.
+
+What a call imports is imported here once, so that a copy has it at once; with torch that saves seconds. Each line of
+standard input is a folder with a call and the cores for it, in JSON. Each line of standard output is the number of a
+process that began, or that and its exit code, below 0 a signal, when it has ended.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import selectors
+import signal
+import socket
+import sys
+import traceback
+from pathlib import Path
+from typing import IO, NoReturn
+
+from splatnode.capture.process.files import check_owner_only
+from splatnode.extras.jobs.call import CALL, LOG
+from splatnode.extras.jobs.called import RAISED, module_of, run_call
+from splatnode.extras.jobs.launch import end_with
+
+
+def main() -> None:
+    """Ends when standard input does."""
+    told = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what an import prints is no answer
+    ends, woken = socket.socketpair()
+    for end in (ends, woken):
+        end.setblocking(False)
+    signal.set_wakeup_fd(woken.fileno())
+    signal.signal(signal.SIGCHLD, lambda *_: None)  # none is lost, and the descriptor wakes
+    with selectors.DefaultSelector() as selector:
+        selector.register(0, selectors.EVENT_READ)
+        selector.register(ends, selectors.EVENT_READ)
+        rest = b""
+        while True:
+            ready = {key.fileobj for key, _ in selector.select()}
+            if ends in ready:
+                with contextlib.suppress(BlockingIOError):
+                    ends.recv(1024)
+                _tell_ends(told)
+            if 0 in ready:
+                read = os.read(0, 65536)
+                if not read:
+                    return
+                *lines, rest = (rest + read).split(b"\n")
+                for line in lines:
+                    folder, cores = json.loads(line)
+                    _tell(told, _copy(Path(folder), cores))
+
+
+def _copy(folder: Path, cores: list[int]) -> int:
+    """The number of the copy that makes the call of `folder` on `cores`."""
+    with contextlib.suppress(Exception), (folder / CALL).open("rb") as call:  # the copy tells what fails
+        check_owner_only(folder)
+        importlib.import_module(module_of(call))
+    me = os.getpid()
+    if (pid := os.fork()) == 0:
+        _become(folder, cores, me)
+    with contextlib.suppress(OSError):  # the copy has done so, or has ended
+        os.setpgid(pid, pid)
+    return pid
+
+
+def _become(folder: Path, cores: list[int], template: int) -> NoReturn:
+    code = RAISED
+    try:
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        os.setpgid(0, 0)
+        end_with(template)
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, cores)
+        log, nothing = os.open(folder / LOG, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), os.open(os.devnull, os.O_RDONLY)
+        for descriptor, stream in ((nothing, 0), (log, 1), (log, 2)):
+            os.dup2(descriptor, stream)
+        code = run_call(folder)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except BaseException:
+        os.write(2, traceback.format_exc().encode(errors="backslashreplace"))
+    finally:
+        os._exit(code)
+
+
+def _tell_ends(told: IO[str]) -> None:
+    with contextlib.suppress(ChildProcessError):  # there is none any more
+        while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+            _tell(told, ended[0], os.waitstatus_to_exitcode(ended[1]))
+
+
+def _tell(told: IO[str], *numbers: int) -> None:
+    told.write(" ".join(map(str, numbers)) + "\n")
+    told.flush()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Priors beside the core's: each matches photographs, or gives depth, by a network."""
