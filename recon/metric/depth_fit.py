@@ -26,11 +26,12 @@ REFERENCE_PX = 640.0  # longer side of a depth image in whose pixels shifts coun
 LEAST_POINTS = 30  # with a depth, of all images of a camera together
 _MOST_POINTS = 20_000  # that are compared; of more, an even choice
 _POINTS_AS_ONE = 10.0  # neighbours are wrong alike
+_CELL_PX = 17.0  # pixels at REFERENCE_PX within which they share their errors
 _POINT_SIGMA = 0.005  # of a triangulated point's depth, as a share
 _ROUNDS, _HUBER, _CUT = 10, 1.5, 3.0  # of the robust mean; standard deviations
 _SEARCH_PX, _STEP_PX = 10, 1  # of the shift that is looked for, pixels at REFERENCE_PX
 _LEAST_SHIFT_PX = 2.0  # pixels at REFERENCE_PX: what edges of depth are off by without anybody's fault
-_LEAST_GAIN = 12.0  # by which the log likelihood is better at another pixel, where the shift is named
+_LEAST_GAIN = 4.0  # standard deviations by which depths fit better at another pixel, where the shift is named
 _LEAST_SHARE = 0.7  # of the points that have a depth somewhere: a shift must keep so many
 _LEAST_AGREEING = 0.5  # share of the points whose depths agree: of fewer, the depth camera saw something else
 _AGREEING_SIGMAS = 4.0
@@ -88,6 +89,16 @@ class _Samples:
             ratio[own] = np.log(z) - self.log_z[own]
             sigma[own] = np.hypot(its_sigma / z, _POINT_SIGMA)
         return ratio, sigma
+
+    def count_cells(self, scale: float) -> int:
+        """How many places of all images have a depth and points: those of a place are one, since they share its error.
+
+        A place is as large as the window that depths were smoothed in.
+        """
+        ratio, _ = self.look((0.0, 0.0), scale)
+        known = np.isfinite(ratio)
+        cells = np.floor(self.pixels[known] / (_CELL_PX * scale)).astype(np.int64)
+        return len(np.unique(np.column_stack([self.view_of[known], cells]), axis=0))
 
 
 def fit_depth_images(views: Sequence[DepthView]) -> tuple[DepthFit, ...]:
@@ -165,26 +176,32 @@ def _average(values: Array, sigmas: Array) -> tuple[float, float]:
 
 
 def _find_shift(samples: _Samples, scale: float) -> tuple[tuple[float, float], float]:
-    """The shift, pixels at REFERENCE_PX, that fits the points best, and by how much the log likelihood is better."""
+    """The shift, pixels at REFERENCE_PX, that fits the points best, and by how many standard deviations it fits better.
+
+    Depths at another pixel have other errors, so that the best of many shifts is a little better by chance. How sure
+    the difference is, the points themselves tell by their scatter.
+    """
     steps = np.arange(-_SEARCH_PX, _SEARCH_PX + 1, _STEP_PX)
-    costs, counts = np.full((len(steps), len(steps)), np.inf), np.zeros((len(steps), len(steps)))
-    for i, down in enumerate(steps):
-        for j, across in enumerate(steps):
-            ratio, sigma = samples.look((float(across), float(down)), scale)
-            known = np.isfinite(ratio)
-            counts[i, j] = known.sum()
-            if counts[i, j] >= LEAST_POINTS:
-                off = (ratio[known] - np.median(ratio[known])) / sigma[known]
-                costs[i, j] = float(np.minimum(off**2, _CUT**2).mean())
-    costs[counts < _LEAST_SHARE * counts.max()] = np.inf
-    middle = len(steps) // 2
-    best = np.unravel_index(int(np.argmin(costs)), costs.shape)
-    if not np.isfinite(costs[middle, middle]):
-        return (0.0, 0.0), 0.0
-    # A noise that is told too small makes every difference larger: the least cost tells what it is.
-    spread = max(1.0, float(costs[best]))
-    gain = 0.5 * counts[middle, middle] * float(costs[middle, middle] - costs[best]) / spread / _POINTS_AS_ONE
-    return (float(steps[best[1]]), float(steps[best[0]])), gain
+    here = _compute_costs(samples, (0.0, 0.0), scale)
+    best, best_cost, most = (0.0, 0.0), float(np.nanmean(here)), int(np.isfinite(here).sum())
+    for down in steps:
+        for across in steps:
+            costs = _compute_costs(samples, (float(across), float(down)), scale)
+            if np.isfinite(costs).sum() >= max(LEAST_POINTS, _LEAST_SHARE * most) and np.nanmean(costs) < best_cost:
+                best, best_cost = (float(across), float(down)), float(np.nanmean(costs))
+    better = here - _compute_costs(samples, best, scale)
+    better = better[np.isfinite(better)]
+    spread = float(better.std()) / np.sqrt(max(samples.count_cells(scale), 1)) if len(better) else 0.0
+    return best, float(better.mean()) / spread if spread > 0 else 0.0
+
+
+def _compute_costs(samples: _Samples, shift: tuple[float, float], scale: float) -> Array:
+    """(M,) the squared deviations of each point, at most those of _CUT sigmas; NaN where it has no depth."""
+    ratio, sigma = samples.look(shift, scale)
+    known = np.isfinite(ratio)
+    if not known.any():
+        return ratio
+    return np.minimum(((ratio - np.median(ratio[known])) / sigma) ** 2, _CUT**2)
 
 
 def _judge(

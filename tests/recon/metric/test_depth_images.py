@@ -71,8 +71,18 @@ def test_a_shift_of_four_pixels_is_named_and_its_depth_left_out(shift):
     assert "not aligned" in found.check.message and "Align depth to colour" in found.check.message
 
 
-def test_a_camera_that_is_noisier_than_it_says_is_not_called_misaligned():
-    assert fit(DepthCamera(noise_px=0.6)).check.code is DepthCode.FITS
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_that_is_noisier_than_it_says_is_not_called_misaligned(seed):
+    few = [replace(view, points=view.points[::4]) for view in views(DepthCamera(noise_px=0.6, seed=seed))]
+    (found,) = fit_depth_images(few)
+    assert found.check.code is DepthCode.FITS
+
+
+def test_some_hundred_points_suffice_to_name_a_shift():
+    (found,) = fit_depth_images(
+        [replace(view, points=view.points[::8]) for view in views(DepthCamera(shift_px=(4.0, 0.0)))]
+    )
+    assert found.check.num_points < 800 and found.check.code is DepthCode.SHIFTED
 
 
 def test_depths_of_something_else_contradict_the_images():
