@@ -18,7 +18,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_in
-from splatnode.capture.process.system import outlast
+from splatnode.capture.process.system import outlast, raise_shortage
 from splatnode.capture.process.text import guard_untrusted, sanitize_name, sanitize_text
 
 log = logging.getLogger(__name__)
@@ -169,8 +169,8 @@ def _first_size(folder: Path) -> tuple[int, int] | None:
         try:
             if path.is_file() and (size := upright_size(read_image_file(path))) is not None:
                 return size
-        except (UnusableImage, OSError):
-            continue
+        except (UnusableImage, OSError) as error:
+            raise_shortage(error)
     return None
 
 

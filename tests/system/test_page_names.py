@@ -136,7 +136,7 @@ def test_no_sentence_of_the_program_has_a_former_name():
         rf"(?<![\w.-])(?:{'|'.join(map(re.escape, sorted(list_former_words(), reverse=True)))})(?![\w.-])"
     )
     found = []
-    for room in ("splatnode/api", "capture", "recon", "viewer"):
+    for room in ("splatnode/api", "capture", "recon", "viewer", "extras"):
         for path in (ROOT / room).rglob("*.py"):
             if path.name == "former_names.py":
                 continue
