@@ -545,7 +545,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "fit",
-        "extras/evaluate/stability/fitting/samples.py",
+        "extras/evaluate/stability/fitting/fit.py",
         (
             "cameras of two worlds are no gross error",
             "return not self.is_one_world or any(\n            error.centre_pct",

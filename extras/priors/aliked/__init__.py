@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatnode.capture.process.config_keys import Internal
-from splatnode.extras.priors.aliked.matcher import AlikedMatcher
-from splatnode.extras.priors.aliked.network import load_aliked
+from splatnode.extras.priors.aliked.network import AlikedMatcher, load_aliked
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.extras.priors.patchmatchnet.network import PatchmatchNet
-from splatnode.extras.priors.patchmatchnet.stereo import NetworkStereo
+from splatnode.extras.priors.patchmatchnet.network import NetworkStereo, PatchmatchNet
 from splatnode.recon.networks import weights as networks_weights
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors import classical

@@ -12,17 +12,15 @@ import pytest
 from splatnode.extras.evaluate.stability.case import CameraError
 from splatnode.extras.evaluate.stability.fitting import fit
 from splatnode.extras.evaluate.stability.fitting.fit import (
+    Sample,
     count_judgements,
+    exceeds_bounds,
     fit_models,
     fit_without_each_scene,
     format_module,
-    pair_held_out_models,
-)
-from splatnode.extras.evaluate.stability.fitting.samples import (
-    Sample,
-    exceeds_bounds,
     is_published,
     is_wrong,
+    pair_held_out_models,
     read_samples,
 )
 from splatnode.recon.verification.error_model import VerdictModels

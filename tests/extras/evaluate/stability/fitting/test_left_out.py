@@ -11,7 +11,7 @@ import pytest
 
 from splatnode.extras.evaluate.stability.case import ROUGH, CameraError
 from splatnode.extras.evaluate.stability.fitting import fit
-from splatnode.extras.evaluate.stability.fitting.samples import (
+from splatnode.extras.evaluate.stability.fitting.fit import (
     Sample,
     exceeds_bounds,
     is_wrong,
