@@ -4,33 +4,23 @@ It makes the sdist and the wheels in `dist`. What this machine can run is instal
 checkout, where it makes the demo's scene: its wheel, and the sdist with a compiler and without one. Wheels for Linux
 must need no newer system than their names say, as auditwheel sees it."""
 
-
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
+import sys
+import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process import python
-
-from __future__ import annotations
-
-import shutil
-import subprocess
-import sys
-import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-
-from splatnode.capture.process import python
 from splatnode.recon.core.compile import TARGETS, find_compiler, find_zig, machine
 from splatnode.recon.core.wheels import FROM_COPY, ROOT, build_wheel, parse_arguments
-
 
 _OURS = ("PYTHON", "SPLATNODE", "VIRTUAL_ENV")  # how variables begin that would tell the environment of this one
 _LAST = 2000  # characters of what a program said that failed

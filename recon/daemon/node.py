@@ -7,18 +7,6 @@ main      recon.scene, recon.depth, recon.map, recon.status, recon.control; the 
 
 It says that a disk is nearly full while it can still write: before a keyframe or a result is refused."""
 
-
-from __future__ import annotations
-
-import logging
-
-from splatnode.capture.process.files import shortage
-from splatnode.capture.process.logs import event
-from splatnode.capture.process.system import is_shortage
-from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.result.report import estimate_result_bytes
-
 from __future__ import annotations
 
 import argparse
@@ -42,11 +30,12 @@ from splatnode.capture.messaging.network import (
 from splatnode.capture.messaging.pubsub import Answer, CommandServer, MarkProblemsSeen, Publisher, StateServer, ask
 from splatnode.capture.messaging.wire import Name, Numbering
 from splatnode.capture.process.config import load_config
-from splatnode.capture.process.files import state_directory
+from splatnode.capture.process.files import shortage, state_directory
 from splatnode.capture.process.logs import Problems, event, is_logged, use_structured_lines
 from splatnode.capture.process.system import (
     ServiceManager,
     handle_first_signal,
+    is_shortage,
     make_sure_of_room,
     raise_file_limit,
     resident_mb,
@@ -69,8 +58,8 @@ from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.staged import finish_interrupted_write
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record, make_depth_header
+from splatnode.recon.result.report import estimate_result_bytes
 from splatnode.recon.result.snapshot import CameraEstimate
-
 
 log = logging.getLogger(__name__)
 
@@ -126,8 +115,6 @@ def remove_keyframe(args: argparse.Namespace) -> int:
     say(answer.message)
     return EXIT_GOOD if answer.done else EXIT_UNKNOWN_NAME
 
-
-log = logging.getLogger(__name__)
 
 SERVE_S = 0.05  # between looks at what the threads have produced
 _SOCKETS = 8  # that it binds: of states two

@@ -3,40 +3,27 @@
 The optimiser is Adam (Kingma and Ba 2015, algorithm 1): of all Gaussians at once, whose rows come and go, and of a
 tangent vector."""
 
-
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
-
-import torch
-from torch import Tensor
-
-from splatnode.recon.core import library
-from splatnode.recon.geometry import matrices_from_quats
-from splatnode.recon.rasterize import dispatch
-from splatnode.recon.scene.scene import Gaussians
-
-from __future__ import annotations
-
-from collections.abc import Collection, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatnode.recon.geometry import exp_se3, twist_gradient
+from splatnode.recon.core import library
+from splatnode.recon.geometry import exp_se3, matrices_from_quats, twist_gradient
 from splatnode.recon.optimize import ensemble, photometric_losses, regularizers
 from splatnode.recon.optimize.control.control import Control, OptimizerStep
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.regularizers import Regularizer
 from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
+from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.rasterize.reference import Render
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, compute_fit_masks

@@ -6,20 +6,9 @@ they took together. A camera whose images do not keep their relative poses, or h
 what COLMAP reads must have the poses that were estimated.
 Source of the formats: COLMAP's page on its output; the binary files as pycolmap 4.2 writes them."""
 
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-
-import numpy as np
-import numpy.typing as npt
-
-from splatnode.recon.result.snapshot import CameraEstimate
-
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import dataclass
 from struct import pack
 
@@ -31,7 +20,6 @@ from splatnode.recon.result.export.quaternions import quats_from_matrices
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale
-
 
 _TURNED, _MOVED = 1e-4, 1e-4  # radians, and parts of the spread of all cameras, by which relative poses may differ
 
