@@ -16,7 +16,7 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.extras.evaluate.stability.fitting.fit import (
+from splatnode.extras.evaluate.stability.fitting import (
     fit_models,
     fit_without_each_scene,
     format_module,

@@ -27,7 +27,7 @@ import numpy as np
 
 from splatnode.extras.evaluate.dataset import load_scene
 from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
-from splatnode.extras.evaluate.stability.fitting.fit import (
+from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     exceeds_bounds,
     fit_models,

@@ -11,12 +11,14 @@ import pytest
 import torch
 
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, load_scene
-from splatnode.extras.priors.aliked import WEIGHTS, Config, load
-from splatnode.extras.priors.aliked.network import (
+from splatnode.extras.priors.aliked import (
+    WEIGHTS,
     Aliked,
     AlikedMatcher,
+    Config,
     DeformableConv,
     detect_keypoints,
+    load,
     load_aliked,
     match_mutual,
     sample_maps,

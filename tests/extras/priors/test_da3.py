@@ -15,7 +15,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.priors.da3.prior import (
+from splatnode.extras.priors.da3 import (
     Config,
     Da3Prior,
     DepthAnything3,

@@ -1,6 +1,7 @@
 """The verdict on each scene by numbers that were fitted without it: what the headline figures are.
 
-The samples are registrations with known truth, as windows.json and stability.json keep them, published or not."""
+The samples are registrations with known truth, as windows.json and stability.json keep them, published or not.
+"""
 
 from __future__ import annotations
 

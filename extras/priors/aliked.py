@@ -2,7 +2,8 @@
 
 "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable Transformation" (Zhao et al. 2023),
 section III. Parameters are called as in the authors' checkpoints. Its keypoints are added to a keyframe's points, which
-its matches then name."""
+its matches then name.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +18,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.networks.vit import crop, crop_image
-from splatnode.recon.networks.weights import load_network, read_weights
+from splatnode.recon.networks.weights import find, load_network, read_weights
+from splatnode.recon.priors import classical
+from splatnode.recon.priors.classical import ClassicalPrior
 
 # Deformable sampling: a convolution and a descriptor whose samples are shifted by what they see.
 
@@ -267,3 +271,18 @@ def match_mutual(descriptors1: Tensor, descriptors2: Tensor) -> Tensor:
     squared = (1.0 - best[chosen]).clamp_min(1e-12)
     order = (squared[:, 0] / squared[:, 1]).argsort(stable=True)
     return torch.stack([chosen, forth[chosen]], 1)[order]
+
+
+WEIGHTS = ("aliked/aliked-n16.pth",)
+
+
+class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
+    weights: Path | None = None  # file of N16 or T16; None: N16's, where `splatnode weights` puts them
+    longer_side: Internal[int] = 800  # of the network's images, pixels; none is enlarged
+    num_keypoints: Internal[int] = 2000  # of an image, at most
+
+
+def load(config: Config) -> ClassicalPrior:
+    """Raises WeightsError or FileNotFoundError without weights, ValueError where they are not ALIKED N16's or T16's."""
+    network = load_aliked(config.weights or find(*WEIGHTS))
+    return ClassicalPrior(config, matcher=AlikedMatcher(network, config.longer_side, config.num_keypoints))

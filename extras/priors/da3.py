@@ -1,7 +1,8 @@
 """Depth Anything 3 as a prior: it proposes matches, and gives depth once it was told the verified cameras.
 
 The network (Lin et al. 2025) takes any number of photographs, and cameras where they are known; it gives depth,
-confidence and cameras. Written from the paper; modules carry the names of the published checkpoint."""
+confidence and cameras. Written from the paper; modules carry the names of the published checkpoint.
+"""
 
 from __future__ import annotations
 

@@ -5,12 +5,14 @@
 at these depths, and scores them; three networks learn where to look, which source to believe and how alike features
 have to be. Written from the paper; modules carry the names of the published checkpoint. Pixel centres are at whole
 numbers in the network, its sampling and scoring. Depth maps are checked against each other like those of our own
-stereo."""
+stereo.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,7 +21,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from splatnode.recon.priors import multi_view_consistency, stereo
+from splatnode.recon.networks import weights as networks_weights
+from splatnode.recon.networks.weights import find
+from splatnode.recon.priors import classical, multi_view_consistency, stereo
+from splatnode.recon.priors.classical import ClassicalPrior
 from splatnode.recon.priors.multi_view_consistency import DepthMap
 from splatnode.recon.priors.patchmatch import Planes, make_level
 from splatnode.recon.priors.stereo import SparsePoints, StereoView
@@ -487,3 +492,20 @@ def _slope(inverse_depth: Float32, axis: int) -> Float32:
     total = np.pad(change, ((0, 0), (1, 0))) + np.pad(change, ((0, 0), (0, 1)))
     count = np.pad(smooth, ((0, 0), (1, 0))) * 1 + np.pad(smooth, ((0, 0), (0, 1)))
     return np.moveaxis(total / np.maximum(count, 1), -1, axis).astype(np.float32)
+
+
+WEIGHTS = ("patchmatchnet/patchmatchnet_dtu.pth",)
+
+
+class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
+    weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
+
+
+def load(config: Config) -> ClassicalPrior:
+    """Raises WeightsError or FileNotFoundError without weights, ValueError where they are not PatchmatchNet's."""
+    return ClassicalPrior(config, NetworkStereo(load_network(config.weights or find(*WEIGHTS))).estimate_depth_maps)
+
+
+def load_network(path: Path) -> PatchmatchNet:
+    """Raises ValueError where the file is damaged or another network's, and FileNotFoundError."""
+    return networks_weights.load_network(PatchmatchNet, networks_weights.read_weights(path), path, "PatchmatchNet")
