@@ -1,10 +1,12 @@
 """What an export format is. A new one is a new module of recon.result.export.formats, and nothing else.
 
-Further ones are installed beside the core: an entry point of `splatnode.export_formats` names the module of each."""
-
+Further ones are installed beside the core: an entry point of `splatnode.export_formats` names the module of each.
+The verb export is here, too.
+"""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -12,17 +14,11 @@ from pkgutil import iter_modules
 from typing import Protocol, cast
 
 from splatnode.capture.process import plugins
+from splatnode.capture.process.terminal import say, show_waiting
 from splatnode.recon.result.export import formats
-from splatnode.recon.result.export.prepare import EVERYTHING, Selection
+from splatnode.recon.result.export.prepare import EVERYTHING, Box, Selection
 from splatnode.recon.result.export.result import write_beside
 from splatnode.recon.result.export.stored import StoredResult
-
-from __future__ import annotations
-
-import argparse
-
-from splatnode.capture.process.terminal import say, show_waiting
-from splatnode.recon.result.export.prepare import Box, Selection
 
 
 class Format(Protocol):
