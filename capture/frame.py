@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import cv2
 import msgspec
@@ -17,6 +17,9 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
+
+if TYPE_CHECKING:
+    from splatnode.capture.depth_image import DepthImage
 
 # What a stereo camera's right half saw at the moment of a frame: the source of metres that a robot carries with it.
 
@@ -266,6 +269,7 @@ class Frame:
     exposure: ExposureSettings | None = None  # as its camera or its EXIF tells; None: nobody knows
     camera: str = ""  # make, model and lens, as EXIF tells: different ones share no lens; empty: unknown
     camera_id: str = ""  # of several cameras, which one: what a robot or a folder calls it; empty: there is one
+    depth: DepthImage | None = field(default=None, repr=False)  # of a depth camera beside its camera; None: none
 
     def __post_init__(self) -> None:
         for text in ("name", "camera", "camera_id"):
@@ -280,6 +284,8 @@ class Frame:
             raise ValueError(f"mask must be {self.image.shape[:2]} bool, got {self.mask.shape} {self.mask.dtype}")
         if self.right is not None and self.right.image.shape != self.image.shape[:2]:
             raise ValueError(f"the right image must be {self.image.shape[:2]}, got {self.right.image.shape}")
+        if self.depth is not None:
+            self.depth.check_beside(self.width, self.height)
         if not self.name:
             raise ValueError("a frame must have a name")
         for what, number in (("frame_id", self.frame_id), ("stamp_ns", self.stamp_ns)):
@@ -337,10 +343,11 @@ def make_frame(
     exposure: ExposureSettings | None = None,
     camera: str = "",
     camera_id: str = "",
+    depth: DepthImage | None = None,
 ) -> Frame | DroppedFrame:
     """Makes a Frame of what a camera or a file gave; drops it, with the reason, where it is out of a Frame's bounds."""
     try:
-        came = given_pose, motion, gravity, right, exposure, camera, camera_id
+        came = given_pose, motion, gravity, right, exposure, camera, camera_id, depth
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")

@@ -203,6 +203,21 @@ def decode_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | N
         return _attach_exif(image, header.exif)._replace(mask=mask)
 
 
+def decode_values(data: bytes, max_pixels: int = MAX_PIXELS) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+    """(H, W) or (H, W, C) the values that a file stores, of 8 or 16 bits, as of a depth image: nothing is turned.
+
+    Raises UnusableImage.
+    """
+    with guard_untrusted(UnusableImage):
+        header = read_header(data)
+        if header.width * header.height > max_pixels:
+            raise UnusableImage(f"{header.width} x {header.height}: more than {max_pixels} pixels; make it smaller")
+        values = _decode_as(header, cv2.IMREAD_UNCHANGED)
+        if values.shape[:2] != (header.height, header.width):
+            raise UnusableImage(f"damaged: it states {header.width} x {header.height} pixels, and has {values.shape}")
+        return values
+
+
 def measure_values(data: bytes, max_pixels: int = MAX_PIXELS) -> Extent | None:
     """The extent of the values of an image file of 16 bits; None of another one, or one that cannot be decoded."""
     try:

@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import msgspec
@@ -20,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
+from splatnode.capture.depth_image import MOST_PIXELS, DepthImage, DepthMeta, describe_depth, read_depth
 from splatnode.capture.frame import (
     Baseline,
     DroppedFrame,
@@ -29,7 +31,7 @@ from splatnode.capture.frame import (
     make_frame,
 )
 from splatnode.capture.frame_meta import FrameMeta, describe_frame, read_frame_fields
-from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
+from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, decode_values, read_image_file
 from splatnode.capture.process.files import read_bounded, sync_folder
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast
@@ -55,12 +57,24 @@ class _Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sha256: str
 
 
+class _Depth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A frame's depth image: a file of the same folder, of 16 bits, or of the four bytes of each float as channels.
+
+    A second file has its confidence.
+    """
+
+    meta: DepthMeta
+    files: Annotated[tuple[str, ...], msgspec.Meta(min_length=1, max_length=2)]
+    sha256s: Annotated[tuple[str, ...], msgspec.Meta(min_length=1, max_length=2)]
+
+
 class _Line(FrameMeta, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
     name: str  # these two are told apart from what is damaged below
     stamp_ns: int
     file: str
     sha256: str
     right: _Right | UnsetType = UNSET
+    depth: _Depth | UnsetType = UNSET
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -102,7 +116,8 @@ class Recorder:
         path = self.folder / f"{self.frames:06d}{'.jpg' if content.startswith(_JPEG) else '.png'}"
         digest = _write(path, content)
         right = UNSET if item.right is None else self._write_right(item.right)
-        self._append(_Line(file=path.name, sha256=digest, right=right, **describe_frame(item)))
+        depth = UNSET if item.depth is None else self._write_depth(item.depth)
+        self._append(_Line(file=path.name, sha256=digest, right=right, depth=depth, **describe_frame(item)))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
             self._sync()
@@ -110,6 +125,13 @@ class Recorder:
     def _write_right(self, right: RightImage) -> _Right:
         path = self.folder / f"{self.frames:06d}-right.png"
         return _Right(right.baseline, path.name, _write(path, _png(right.image)))
+
+    def _write_depth(self, depth: DepthImage) -> _Depth:
+        values = depth.values if depth.values.dtype == np.uint16 else _float_bytes(depth.values)
+        pictures = {"depth": values} if depth.confidence is None else {"depth": values, "confidence": depth.confidence}
+        paths = [self.folder / f"{self.frames:06d}-{what}.png" for what in pictures]
+        digests = [_write(path, _png(each)) for path, each in zip(paths, pictures.values(), strict=True)]
+        return _Depth(describe_depth(depth), tuple(path.name for path in paths), tuple(digests))
 
     def _append(self, line: _Line | _DroppedLine) -> None:
         self._index.write(msgspec.json.encode(line) + b"\n")
@@ -126,11 +148,16 @@ def _file_of(frame: Frame) -> bytes:
     return _png(cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR).astype(np.uint8, copy=False))
 
 
-def _png(image: npt.NDArray[np.uint8]) -> bytes:
-    """Encodes an image (H, W, 3) BGR, or (H, W), as PNG."""
+def _float_bytes(values: npt.NDArray) -> npt.NDArray[np.uint8]:
+    """(H, W, 4) the bytes of floats (H, W), the lowest first."""
+    return np.ascontiguousarray(values, "<f4").view(np.uint8).reshape(*values.shape, 4)
+
+
+def _png(image: npt.NDArray) -> bytes:
+    """Encodes an image (H, W, 3) BGR, (H, W, 4) or (H, W), as PNG."""
     written, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not written:
-        raise AssertionError("PNG takes every uint8 image")
+        raise AssertionError("PNG takes every image of 8 or 16 bits")
     return png.tobytes()
 
 
@@ -175,12 +202,20 @@ class FrameRecording:
             return DroppedFrame(line.name, line.reason)
         try:
             content, image, right = outlast(lambda: self._images(line, max_pixels), line.name)
+            depth = outlast(lambda: self._depth(line, max_pixels), line.name)
         except UnusableImage as error:
             return DroppedFrame(line.name, str(error))
         except OSError as error:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         return make_frame(
-            frame_id, line.name, line.stamp_ns, image, encoded=content, right=right, **read_frame_fields(line)
+            frame_id,
+            line.name,
+            line.stamp_ns,
+            image,
+            encoded=content,
+            right=right,
+            depth=depth,
+            **read_frame_fields(line),
         )
 
     def _images(self, line: _Line, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8], RightImage | None]:
@@ -190,6 +225,22 @@ class FrameRecording:
             return content, image, None
         beside = self._image(line.right.file, line.right.sha256, max_pixels)[1]
         return content, image, RightImage(grey(beside), line.right.baseline)
+
+    def _depth(self, line: _Line, max_pixels: int) -> DepthImage | None:
+        """The line's depth image; None where it has none. Raises UnusableImage, OSError."""
+        if line.depth is UNSET:
+            return None
+        arrays = []
+        for file, sha256 in zip(line.depth.files, line.depth.sha256s, strict=False):
+            content = read_image_file(self.folder / file, max_pixels)
+            values = decode_values(content, min(max_pixels, MOST_PIXELS))
+            if hashlib.sha256(content).hexdigest() != sha256:
+                raise UnusableImage(f"{file} is not the file that was recorded")
+            arrays.append(values.view("<f4")[..., 0] if values.ndim == 3 and values.shape[2] == 4 else values)
+        try:
+            return read_depth(line.depth.meta, arrays)
+        except ValueError as error:
+            raise UnusableImage(str(error)) from error
 
     def _image(self, file: str, sha256: str, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8]]:
         """The file, and its image (H, W, 3) RGB. Raises UnusableImage where it is not the recorded one, and OSError."""
@@ -208,7 +259,8 @@ def _sanitize_recorded_name(name: str) -> str:
 def _files_of(line: _Line | _DroppedLine) -> tuple[str, ...]:
     if isinstance(line, _DroppedLine):
         return ()
-    return (line.file,) if line.right is UNSET else (line.file, line.right.file)
+    right = () if line.right is UNSET else (line.right.file,)
+    return (line.file, *right, *(() if line.depth is UNSET else line.depth.files))
 
 
 def is_recording(folder: Path) -> bool:

@@ -12,6 +12,7 @@ from splatnode.recon.core import give_back_memory
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.locating.landmarks import collect_landmarks
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.metric.depth_fill import fill_measured_depth
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, apply_image_masks
 from splatnode.recon.registration import registration as registration_registration
@@ -246,7 +247,7 @@ def estimate_depth(
         return estimate
     pause = make_deadline_pause(until, pause) if prior.ends_early else pause
     graph, registration = undistort_keyframes(estimate.graph, estimate.registration)
-    pointmaps = prior.pointmaps(graph, registration, pause)
+    pointmaps = fill_measured_depth(prior.pointmaps(graph, registration, pause), graph, registration)
     give_back_memory()
     return replace(estimate, pointmaps=apply_image_masks(pointmaps, graph))
 

@@ -24,6 +24,7 @@ from splatnode.recon.frames.screening import Rejected, ScreeningState
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match_newest, match_pending
 from splatnode.recon.memory import Key, ReconstructionCache
+from splatnode.recon.metric.depth_fill import fill_measured_depth
 from splatnode.recon.modelling import (
     SceneWithVerdict,
     create_initial_scene,
@@ -315,7 +316,8 @@ class IncrementalReconstruction:
         if beside is None or moved is None:
             return False
         graph, placed = beside.graph, beside.registration
-        pointmaps = carried | apply_image_masks(self._prior.further_pointmaps(graph, placed, carried), graph)
+        further = fill_measured_depth(self._prior.further_pointmaps(graph, placed, carried), graph, placed)
+        pointmaps = carried | apply_image_masks(further, graph)
         grown = growth.grow(
             moved, pointmaps, graph, placed, self.config.scene_initialization, self.config.exposure_compensation
         )

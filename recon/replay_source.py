@@ -31,6 +31,7 @@ from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_name
 from splatnode.capture.quality import Limits
+from splatnode.capture.rgbd_folder import find_photographs
 from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
@@ -70,7 +71,7 @@ class Request:
         """The folder in which frames lie by their names; None: they lie in none."""
         if self.is_film:
             return None
-        return self.source if self.cameras is None else self.cameras.folder
+        return find_photographs(self.source) if self.cameras is None else self.cameras.folder
 
 
 @dataclass(frozen=True, eq=False)

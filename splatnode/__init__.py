@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from splatnode.api.reconstruct import Marker, Stereo, reconstruct
     from splatnode.api.result import Camera, Result, View, load
     from splatnode.api.session import Session, Update
+    from splatnode.capture.depth_image import DepthImage, DepthNoise, make_depth_image
     from splatnode.capture.frame import Intrinsics
     from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.occupancy.grid import OccupancyMap
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Camera",
+    "DepthImage",
+    "DepthNoise",
     "Intrinsics",
     "Located",
     "Marker",
@@ -40,11 +43,14 @@ __all__ = [
     "View",
     "connect",
     "load",
+    "make_depth_image",
     "reconstruct",
 ]
 
 _MODULES = {
     "Camera": "splatnode.api.result",
+    "DepthImage": "splatnode.capture.depth_image",
+    "DepthNoise": "splatnode.capture.depth_image",
     "Intrinsics": "splatnode.capture.frame",
     "Located": "splatnode.recon.locating.outcome",
     "Marker": "splatnode.api.reconstruct",
@@ -64,6 +70,7 @@ _MODULES = {
     "View": "splatnode.api.result",
     "connect": "splatnode.api.node",
     "load": "splatnode.api.result",
+    "make_depth_image": "splatnode.capture.depth_image",
     "reconstruct": "splatnode.api.reconstruct",
 }
 

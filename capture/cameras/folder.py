@@ -47,6 +47,7 @@ from splatnode.capture.odometry import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import sanitize_name, sanitize_text
+from splatnode.capture.rgbd_folder import RgbdFolder, find_photographs, find_rgbd_folder
 
 if TYPE_CHECKING:
     from splatnode.capture.pose_files import Trajectory
@@ -94,7 +95,9 @@ class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    folder: Path  # the folder with the photographs, or a recording of `splatnode record`
+    # The folder with the photographs, or a recording of `splatnode record`, or photographs with depth images in the
+    # layout of TUM RGB-D, ScanNet or Record3D
+    folder: Path
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
     # The lens, of all images of its aspect ratio, instead of what their EXIF tells
     intrinsics: Intrinsics | None = None
@@ -125,10 +128,14 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         return pace_frames(
             _repeat_frames(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace
         )
+    rgbd = find_rgbd_folder(config.folder)
+    if rgbd is not None:
+        lens = config.intrinsics or rgbd.intrinsics
+        config = msgspec.structs.replace(config, folder=rgbd.photographs, intrinsics=lens)
     paths = select_images(config.folder, config.names)  # at once, before the first frame, so that mistakes show at once
     rights = {} if config.right is None else _partners(config.right.folder, paths)
     poses = None if config.poses is None else _load_poses(config.poses.file, paths)
-    return pace_frames(_repeat_frames(lambda: _frames(paths, rights, poses, config), config.loops), config.pace)
+    return pace_frames(_repeat_frames(lambda: _frames(paths, rights, poses, rgbd, config), config.loops), config.pace)
 
 
 def _partners(folder: Path, lefts: list[Path]) -> dict[str, Path]:
@@ -171,7 +178,11 @@ def _repeat_frames(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: in
 
 
 def _frames(
-    paths: list[Path], rights: Mapping[str, Path], poses: Trajectory | None, config: Config
+    paths: list[Path],
+    rights: Mapping[str, Path],
+    poses: Trajectory | None,
+    rgbd: RgbdFolder | None,
+    config: Config,
 ) -> Iterator[Frame | DroppedFrame]:
     frame_id, used = 0, find_common_range(paths, config.max_pixels)
     if used is not None:
@@ -199,6 +210,7 @@ def _frames(
                 frame_id, name, stamp_ns, *known, right=right, exposure=decoded.exposure, camera=decoded.camera
             )
             item = apply_alpha_mask(item, decoded.mask)
+            item = item if rgbd is None else rgbd.attach_depth(item, path.name)
             frame_id += isinstance(item, Frame)
             yield _attach_pose(item, poses, config.poses)
     if not config.names:
@@ -320,7 +332,7 @@ def names_in(folder: Path) -> list[str]:
     """Lists the names that `Config.names` can choose from, in order. Raises as `stream` does."""
     if recording.is_recording(folder):
         return recording.read(folder).names
-    return [frame_name(path) for path in select_images(folder)]
+    return [frame_name(path) for path in select_images(find_photographs(folder))]
 
 
 def select_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import Frame, Intrinsics, RightImage, grey
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
@@ -28,7 +29,8 @@ def undistort_frame(frame: Frame) -> Frame:
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
     invented. A fisheye's has as many pixels in another shape, and a mask where the fisheye saw nothing
-    (wide_pinhole.py). Its right image, if it has one, is taken the same way, since both have one lens. Raises
+    (wide_pinhole.py). Its right image, if it has one, is taken the same way, since both have one lens. An aligned depth
+    image keeps its pixels, and gets the lens that they were seen through. Raises
     ValueError for coefficients that fold the picture over.
     """
     if frame.right is None:
@@ -39,6 +41,14 @@ def undistort_frame(frame: Frame) -> Frame:
         _undistort_single(replace(frame, image=seen, mask=None, right=None)),
     )
     return replace(left, right=RightImage(grey(right.image), frame.right.baseline))
+
+
+def straighten_depth(frame: Frame) -> DepthImage | None:
+    """The frame's depth image as `undistort_frame` leaves it: aligned with resampled pixels, it has their old lens."""
+    given, depth = frame.intrinsics, frame.depth
+    if depth is None or given is None or not is_resampled(frame):
+        return depth
+    return depth.apply_lens(given.resized(frame.width, frame.height))
 
 
 def is_resampled(frame: Frame) -> bool:
@@ -57,6 +67,8 @@ def _undistort_single(frame: Frame) -> Frame:
     if given is None:
         return frame
     given = given.resized(frame.width, frame.height)
+    if frame.depth is not None:
+        frame = replace(frame, depth=straighten_depth(frame))
     if given.model == "fisheye":
         return _undistort_fisheye(frame, given)
     if _is_square_pinhole(given):

@@ -16,6 +16,7 @@ import numpy.typing as npt
 import zmq
 from msgspec import UNSET, UnsetType
 
+from splatnode.capture.depth_image import DepthMeta, depth_arrays, describe_depth, read_depth
 from splatnode.capture.frame import (
     Baseline,
     DroppedFrame,
@@ -43,34 +44,47 @@ from splatnode.capture.messaging.wire import (
 )
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 
-# The pixels of a frame as arrays of a message: its image, then its mask and its right image, where it has these.
+# The pixels of a frame as arrays of a message: its image, then, where it has these, its mask, its right image and its
+# depth image.
 
 Array = npt.NDArray[np.generic]
 
 
 class StoredFrameMeta(FrameMeta, frozen=True, kw_only=True):
-    """FrameMeta, and the baseline of a right image. That image is the last of the arrays."""
+    """FrameMeta, the baseline of a right image, and what a depth image is. Their arrays are the last ones, in order."""
 
     baseline: Baseline | UnsetType = UNSET
+    depth: DepthMeta | UnsetType = UNSET
 
 
 def describe_stored_frame(frame: Frame) -> dict[str, Any]:
     """Returns the fields of StoredFrameMeta by name."""
-    return {**describe_frame(frame), "baseline": make_optional_field(frame.right and frame.right.baseline)}
+    return {
+        **describe_frame(frame),
+        "baseline": make_optional_field(frame.right and frame.right.baseline),
+        "depth": UNSET if frame.depth is None else describe_depth(frame.depth),
+    }
 
 
 def arrays_of(frame: Frame) -> list[Array]:
-    """The image (H, W, 3), the mask (H, ceil(W / 8)), first pixel in the highest bit, and the right image (H, W)."""
+    """The image (H, W, 3), the mask (H, ceil(W / 8)), first pixel in the highest bit, the right image (H, W), the depth
+    image (h, w), and its confidence (h, w)."""
     mask = [] if frame.mask is None else [np.packbits(frame.mask, axis=1)]
     right = [] if frame.right is None else [frame.right.image]
-    return [frame.image, *mask, *right]
+    return [frame.image, *mask, *right, *([] if frame.depth is None else depth_arrays(frame.depth))]
 
 
 def frame_in(header: StoredFrameMeta, frame_id: int, arrays: Sequence[npt.NDArray]) -> Frame:
     """The frame of which `arrays_of` gave the arrays; it has a right image if its header tells a baseline.
 
+    And a depth image if its header describes one.
+
     Raises ValueError where they are not that: the mask's and the right image's size must be the image's.
     """
+    depth = None
+    if header.depth is not UNSET:
+        arrays, beside = arrays[: -header.depth.num_arrays], arrays[-header.depth.num_arrays :]
+        depth = read_depth(header.depth, list(beside))
     rights = 0 if header.baseline is UNSET else 1
     if len(arrays) - rights not in (1, 2):
         also = ", with a baseline one right image" if rights else ""
@@ -83,6 +97,7 @@ def frame_in(header: StoredFrameMeta, frame_id: int, arrays: Sequence[npt.NDArra
         image,
         mask=_mask(image, masks[0]) if masks else None,
         right=None if header.baseline is UNSET else RightImage(arrays[-1], header.baseline),
+        depth=depth,
         **read_frame_fields(header),
     )
 
@@ -102,7 +117,7 @@ DELIVERY_PARTS = 2  # that come before a frame's own
 
 
 class FrameHeader(StoredFrameMeta, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
-    """A Frame; its arrays are its image and, where it has these, its mask and its right image."""
+    """A Frame; its arrays are its image and, where it has these, its mask, its right image and its depth image."""
 
     session: SessionId  # these three as every Header has them
     sequence: Sequential

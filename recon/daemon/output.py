@@ -48,12 +48,12 @@ class MetricScaler:
         """Returns the snapshot for viewers, in metres where a scale source is available, else unchanged.
 
         A network, which takes seconds, is asked about a final scene alone. Landmarks are gathered for a final scene, by
-        which it is measured in its files, too; for others where stereo pairs are measured by them.
+        which it is measured in its files, too; for others where stereo pairs or depth images are measured by them.
         """
         evidence = self.collect_evidence(work.graph.keyframes)
         config = self._config if snapshot.final else msgspec.structs.replace(self._config, depth_network=False)
         came = evidence.tracked or evidence.motions
-        if evidence.pairs or (snapshot.final and (config != MetricConfig() or came)):
+        if evidence.pairs or evidence.depths or (snapshot.final and (config != MetricConfig() or came)):
             snapshot = add_landmarks(snapshot, work.find_reconstruction())
         measured = apply_metric_scale(snapshot, config, evidence)
         return measured if snapshot.final else replace(measured, landmarks=None)
@@ -64,7 +64,7 @@ class MetricScaler:
         return apply_metric_scale(with_all, self._config, self.collect_evidence(work.graph.keyframes))
 
     def collect_evidence(self, keyframes: Sequence[Keyframe]) -> Evidence:
-        """Collects the keyframes' scale evidence: markers, poses, motions, gravity, right images."""
+        """Collects the keyframes' scale evidence: markers, poses, motions, gravity, right and depth images."""
         for frame in (each.frame for each in keyframes):
             if frame not in self._told:
                 self._told[frame] = gather_evidence((frame,), self._config)

@@ -8,6 +8,7 @@ import numpy as np
 
 from splatnode.capture.process.text import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity
+from splatnode.recon.metric.depth_scale import estimate_scale_from_depth
 from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.markers import estimate_scale_from_markers
 from splatnode.recon.metric.measurement import (
@@ -53,6 +54,12 @@ def apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evide
 
 def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Snapshot:
     said, aligned = _collect_measurements(snapshot, config, evidence) if len(snapshot.cameras) else ([], None)
+    if evidence.depths and len(snapshot.cameras):
+        others = [each for each in said if isinstance(each, Measurement)]
+        told, checks = estimate_scale_from_depth(
+            make_metric_views(snapshot), snapshot.landmarks, evidence.depths, others
+        )
+        said, snapshot = said + told, replace(snapshot, depth_checks=checks)
     if not said:
         return snapshot
     measurements = [each for each in said if isinstance(each, Measurement)]

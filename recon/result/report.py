@@ -71,6 +71,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "moving": {name: round(share, 4) for name, share in snapshot.moving.items()},
         "gains": {name: [round(gain, 4) for gain in gains] for name, gains in snapshot.gains.items()},
         "vignetting": {name: round(1.0 - math.exp(-falloff), 4) for name, falloff in snapshot.falloffs.items()},
+        **({"depth": [check.record() for check in snapshot.depth_checks]} if snapshot.depth_checks else {}),
         "seed": seed,
         "preset": preset,
         "versions": collect_versions(),

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
+from splatnode.recon.result.depth_check import DepthCheck
 from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale, Up, Verdict, find_widest
 
 # Landmarks: the points of a scene by which a photograph that was not in the set is placed in it.
@@ -204,6 +205,9 @@ class Snapshot:
     moving: Mapping[str, float] = field(default_factory=dict)  # share left out because it moved, by photograph
     gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue
     falloffs: Mapping[str, float] = field(default_factory=dict)  # of lenses that dim their corners, by photograph
+    depth_checks: tuple[
+        DepthCheck, ...
+    ] = ()  # what the images say of depth images, a camera each; none: there were none
     scenes: tuple[str, ...] = ()  # that it was merged of, by scene_id, where it was read from a result
 
     @property

@@ -14,9 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.depths import DepthOf, parse_optional_depth
 from splatnode.api.image_arguments import Lens, Sigmas, append_motion, make_gravity, make_intrinsics, make_pose
 from splatnode.capture.config import Camera, CaptureConfig, ProgramConfig
 from splatnode.capture.daemon import CaptureSession
+from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import (
     Clock,
     DroppedFrame,
@@ -158,6 +160,7 @@ class Publisher:
         motion_sigma: tuple[float, float] | None = None,
         gravity: npt.ArrayLike | None = None,
         gravity_sigma: float | None = None,
+        depth: DepthOf = None,
         wait_s: float = 0.0,
     ) -> Published:
         """Gives the node an image: an array (H, W, 3) uint8 RGB or (H, W) grey, a PIL image, or bytes of a JPEG or PNG.
@@ -170,6 +173,8 @@ class Publisher:
         - `motion`, `motion_sigma`: T_previous_current (4, 4) in metres since the image of this camera that was
           published before, taken or not; metres and degrees of this motion alone (2 % of its length, 2).
         - `gravity`, `gravity_sigma`: the direction of down (3,) in the camera's frame; degrees (2).
+        - `depth`: what a depth camera measured with it, aligned (H, W), uint16 of millimetres or float of metres, or a
+          `DepthImage`, which has its lens, place and noise.
         - `wait_s`: how long to wait for room where recon is behind and the spool is full.
 
         Returns once a keyframe is on the disk; the arrays may be written to again. Raises TypeError and ValueError for
@@ -185,6 +190,7 @@ class Publisher:
             mask,
             (make_pose(pose, _pair(pose_sigma)), make_gravity(gravity, gravity_sigma)),
             (motion, _pair(motion_sigma)),
+            parse_optional_depth(depth),
         )
         deadline = time.monotonic() + wait_s
         while True:
@@ -279,6 +285,7 @@ class Publisher:
         mask: npt.ArrayLike | None,
         told: tuple[GivenPose | None, Gravity | None],
         motion: tuple[npt.ArrayLike | None, tuple[float, float] | None],
+        depth: DepthImage | None,
     ) -> tuple[Frame, Motion | None]:
         """The frame, and the motions up to it. Raises TypeError, ValueError."""
         by = self._config.camera_id if camera_id is None else _check_camera_id(camera_id)
@@ -298,6 +305,7 @@ class Publisher:
             given_pose=told[0],
             gravity=told[1],
             motion=moved,
+            depth=depth,
         )
         if lens is not None:
             known = make_intrinsics(lens, made.width, made.height)

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.depths import Depths, add_depths
 from splatnode.api.image_arguments import Sigmas, parse_sigmas
 from splatnode.api.photographs import (
     Images,
@@ -253,6 +254,7 @@ def reconstruct(
     poses_only_check: bool = False,
     rig: str | PathLike[str] | None = None,
     masks: Masks | None = None,
+    depths: Depths | None = None,
     scale: Scale | None = None,
     budget_s: float | None = None,
     preset: str = "balanced",
@@ -285,6 +287,8 @@ def reconstruct(
     - `rig`: a file with where the cameras stand to each other, as for `--rig`. None: a log tells, else the images do.
     - `masks`: white (any value above 0) is used, black is ignored. A folder of masks with the images' names, one file
       for all, or a list of arrays (H, W), paths, or None. None: all is used.
+    - `depths`: of a depth camera, for metres and plain walls: a folder, a mapping by names, or a list of `DepthImage`,
+      files (16-bit PNG, .npy, .exr), or aligned arrays (H, W): uint16 millimetres, float metres; None: unknown.
     - `scale`: the metres between two cameras, `("a.jpg", "b.jpg", 0.5)` or by places in the list, `(0, 3, 0.5)`;
       `splatnode.Marker(0.1)`; `splatnode.Stereo`; or a list of these. None: lengths have no unit.
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
@@ -302,7 +306,7 @@ def reconstruct(
     check_counts(views=views, threads=threads)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     loaded = load_frames(images, views, every_frame, telling, several)
-    source = _apply_given(loaded, masks, intrinsics, images, telling)
+    source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}

@@ -148,6 +148,7 @@ if TYPE_CHECKING:
     from splatnode.api.window import Viewer
     from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.occupancy.grid import OccupancyMap
+    from splatnode.recon.result.depth_check import DepthCheck
 
 
 class Files(Protocol):
@@ -221,6 +222,11 @@ class Result:
     def scale_interval(self) -> tuple[float, float] | None:
         """A true length is at least and at most so many times the stated one: 95 %. None where that is not known."""
         return self._snapshot.scale.interval_95
+
+    @property
+    def depth_checks(self) -> tuple[DepthCheck, ...]:
+        """The judgement of the images on each camera's depth images; empty where none came."""
+        return self._snapshot.depth_checks
 
     @property
     def final(self) -> bool:

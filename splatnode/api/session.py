@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
+from splatnode.api.depths import DepthOf, parse_optional_depth
 from splatnode.api.image_arguments import append_motion, make_gravity, make_intrinsics, make_pose
 from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
@@ -113,6 +114,7 @@ class Session:
         gravity_sigma: float | None = None,
         right: Picture | None = None,
         baseline_m: float | None = None,
+        depth: DepthOf = None,
     ) -> Update:
         """Offers the session an image: an array (H, W, 3) uint8 RGB, or a PIL image.
 
@@ -126,6 +128,7 @@ class Session:
         - `gravity`, `gravity_sigma`: down (3,) in the camera's frame; degrees. It gives `Result.map` its up.
         - `right`, `baseline_m`: the rectified right image of a stereo pair, of the image's size, and the distance of
           its camera, metres. Pairs give metres.
+        - `depth`: a depth image, as for `reconstruct`. It gives metres, and depth where images have no texture.
 
         Returns the outcome once the scene has grown: after seconds if the image is taken, else milliseconds. Raises
         TypeError and ValueError for wrong arguments, a repeated name, or a session lens with the aspect ratio of no
@@ -143,7 +146,8 @@ class Session:
             usual = metric.odometry_drift, metric.odometry_sigma_deg
             moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
             came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
-            frame = replace(frame, **came, right=_make_right_image(right, baseline_m))
+            beside = {"right": _make_right_image(right, baseline_m), "depth": parse_optional_depth(depth)}
+            frame = replace(frame, **came, **beside)
             self._motion = moved
             self._given.add(frame.name)
             self._sizes += {(frame.width, frame.height)}.difference(self._sizes)
@@ -154,8 +158,9 @@ class Session:
                 self._evidence = self._evidence.merge(gather_evidence((frame,), self._config.metric))
                 work.add_frame(frame)
                 work.update()
-                made = work.snapshot()  # stereo pairs are measured by landmarks
-                self._snapshot = add_landmarks(made, work.find_reconstruction()) if self._evidence.pairs else made
+                made = work.snapshot()  # stereo pairs and depth images are measured by landmarks
+                by_points = bool(self._evidence.pairs or self._evidence.depths)
+                self._snapshot = add_landmarks(made, work.find_reconstruction()) if by_points else made
             taken = frame.name in work.names
             left_out = {each.name: each.reason for each in work.dropped}
             return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)

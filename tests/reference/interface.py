@@ -15,6 +15,7 @@ from splatnode.capture.frame import DroppedFrame, Stamp
 from splatnode.capture.process.terminal import ProgressStep
 from splatnode.recon.locating.outcome import LocalizationBounds
 from splatnode.recon.occupancy.grid import Upright
+from splatnode.recon.result.depth_check import DepthCheck
 from splatnode.recon.result.verdict import Bounds, Verdict
 from tests.reference.comments import field_comments
 
@@ -29,7 +30,7 @@ given. Records are frozen; they and results can be pickled, and used by several 
 
 This page is made from the code by `python -m tests.reference`; change it there.
 """
-_FUNCTIONS = ("reconstruct", "load", "connect")
+_FUNCTIONS = ("reconstruct", "load", "connect", "make_depth_image")
 _CLASSES = (
     "Result",
     "Camera",
@@ -48,9 +49,20 @@ _CLASSES = (
     "Intrinsics",
     "Marker",
     "Stereo",
+    "DepthImage",
+    "DepthNoise",
 )
 _WIDE = 110  # characters
-_FURTHER = (Verdict, Bounds, LocalizationBounds, Upright, DroppedFrame, Stamp, ProgressStep)  # what these lead to
+_FURTHER = (
+    Verdict,
+    DepthCheck,
+    Bounds,
+    LocalizationBounds,
+    Upright,
+    DroppedFrame,
+    Stamp,
+    ProgressStep,
+)  # what these lead to
 
 
 def page() -> str:

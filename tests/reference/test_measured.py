@@ -74,6 +74,7 @@ def test_every_raw_file_has_its_commit():
 @pytest.mark.parametrize("name", sorted(ages.read_commits(DOCS["measurement.md"])))
 def test_a_raw_file_is_that_of_its_commit(name):
     commit = ages.read_commits(DOCS["measurement.md"])[name]
+    assert commit != ages.UNCOMMITTED, "commit the raw file, then run: python -m tests.reference"
     if not ages.has_commit(commit):
         pytest.skip("needs the project's whole history in git")
     assert ages.is_in_history(commit), "that commit was amended away; run: python -m tests.reference"

@@ -11,7 +11,7 @@ from splatnode.extras.calibration.verb import CALIBRATE
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "calibrate.md").read_text(encoding="utf-8")
-CODE = "\n".join(path.read_text() for path in sorted((ROOT / "capture" / "calibration").glob("*.py")))
+CODE = "\n".join(path.read_text() for path in sorted((ROOT / "extras" / "calibration").glob("*.py")))
 
 
 def test_the_page_and_the_verb_have_every_model():

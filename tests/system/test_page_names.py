@@ -22,6 +22,7 @@ FLAGS_OF_OTHERS = {"--no-compile", "--find-links", "--all", "--serve", "--only",
 KEYS = set(re.findall(r"^\| `([\w.]+)` \| ", text("docs/configuration.md"), re.MULTILINE))
 FORMER_SECTIONS = {former for former in former_names.KEYS | former_names.NODE_KEYS if "." not in former}
 SECTIONS = {key.partition(".")[0] for key in KEYS if "." in key} | FORMER_SECTIONS
+OF_A_RIG = {"T_rig_camera", "sigma_m", "sigma_deg", "metric"}  # of a camera in rig.yaml (capture/rig_file.py)
 SUFFIXES = {"npz", "bt", "json", "pgm", "png", "yaml", "py"}  # occupancy.npz is no key of `occupancy`
 
 
@@ -95,6 +96,8 @@ def is_configured(path: tuple[str, ...]) -> bool:
     """Whether an option of capture, of recon or of a lens stands at the path."""
     if path[0] == "reconstruction":
         path = path[1:]
+    if path[:1] == ("cameras",) and path[2:] and path[2] in OF_A_RIG:
+        return True
     if path[:1] == ("cameras",):  # several cameras, or several lenses
         path = ("camera", *path[2:])
     if path[-1:] == ("kind",) or path in {(), ("camera", "count")}:  # count: of the camera that a page invents
@@ -133,7 +136,7 @@ def test_no_sentence_of_the_program_has_a_former_name():
         rf"(?<![\w.-])(?:{'|'.join(map(re.escape, sorted(list_former_words(), reverse=True)))})(?![\w.-])"
     )
     found = []
-    for room in ("splatnode/api", "capture", "recon", "viewer"):
+    for room in ("splatnode/api", "capture", "recon", "viewer", "extras"):
         for path in (ROOT / room).rglob("*.py"):
             if path.name == "former_names.py":
                 continue

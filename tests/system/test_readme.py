@@ -11,7 +11,7 @@ from statistics import mean
 
 from tests.conftest import ROOT
 from tests.reference.measured import race
-from tests.reference.measured.raw import average_over_sets, ends, part, raw, thousands
+from tests.reference.measured.raw import ends, part, raw
 
 MEASUREMENT, README = "docs/measurement.md", "README.md"
 
@@ -35,44 +35,6 @@ def test_how_the_rivals_are_cut_down():
     )
 
 
-def test_the_table_of_the_readme():
-    windows = {method: found["all"] for method, found in raw("windows")["summary"].items()}
-    right = {method: found["right"] + found["right_part"] for method, found in windows.items()}
-    ours = windows["splatnode"]
-    scenes = len({row["scene"] for row in raw("windows")["rows"]})
-    bounds = raw("fit")["many"]["cross_validated"]["windows"]
-    stability = raw("stability")
-    trials = [trial for trial in stability["trials"] if trial["method"] == "splatnode"]
-    kinds, seeds = len({trial["name"] for trial in trials}), len({trial["seed"] for trial in trials})
-    splatnode, instantsplat = (
-        (
-            average_over_sets(rows, lambda row: row["psnr"]),
-            thousands(average_over_sets(rows, lambda row: row["num_gaussians"])),
-            average_over_sets(rows, lambda row: row["seconds"]["total"]),
-        )
-        for rows in (ends("bench_7sets", method=method) for method in ("balanced", "instantsplat-xl"))
-    )
-    walk = raw("building_1000_judged")
-    within = walk["cameras"]["position_percent_of_path"]
-    says(
-        f"| {ours['sets']} windows of 3, 6 and 12 photographs from {scenes} real scenes: cameras right "
-        f"| {right['splatnode']}, of these {ours['right_part']} in part "
-        f"| COLMAP {right['colmap']}, GLOMAP {right['glomap']} |",
-        f"| the same windows: published with wrong cameras | {ours['wrong']} "
-        f"| COLMAP {windows['colmap']['wrong']}, GLOMAP {windows['glomap']['wrong']} |",
-        f"| {100 * bounds['rotations_within']:.0f} % of the rotations, "
-        f"{100 * bounds['centres_within']:.0f} % of the positions |",
-        f"| photographs mistreated in {kinds} ways, {seeds} times each: published beyond its claim "
-        f"| {stability['methods'][0]['false_accept']['count']} of {len(trials)} |",
-        f"| {splatnode[0]:.1f} dB, {splatnode[1]} Gaussians, {splatnode[2]:.0f} s on one core "
-        f"| InstantSplat-XL\\* {instantsplat[0]:.1f} dB, {instantsplat[1]} Gaussians, {instantsplat[2]:.0f} s |",
-        f"| a walk of {walk['keyframes']} keyframes through a made-up building "
-        f"| {walk['in_a_scene']} placed, in one map, within {within:.4f} % of the way; "
-        f"{walk['loops']['loop_links']} loops, none wrong |",
-        on=README,
-    )
-
-
 def test_needles():
     covered = {(row["scene"], row["label"]): row["covered_pct"] for row in raw("needles")["rows"]}
     rows = []
@@ -84,10 +46,6 @@ def test_needles():
 
 def test_all_rows_of_a_case_of_the_race_start_from_the_same_cameras():
     assert race.find_unlike_cases() == []
-
-
-def test_the_race():
-    says(*race.headlines(), on=README)
 
 
 def test_a_cluster_that_loses_a_worker_and_a_node():

@@ -246,7 +246,7 @@ FRAME_FILE = re.compile(r"[0-9]{12,18}\.frame")
 
 
 class FrameRecord(StoredFrameMeta, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A stored keyframe; its arrays are its image and, where it has these, its mask and its right image."""
+    """A stored keyframe; its arrays are its image and, where it has these, its mask, right image and depth image."""
 
     version: int
     session: str

@@ -10,6 +10,7 @@ from tests.conftest import ROOT
 from tests.reference.measured.raw import RESULTS, table
 
 PAGE = ROOT / "docs" / "measurement.md"
+UNCOMMITTED = "0000000"  # of a raw file that no commit has yet
 ENTRY = re.compile(r"`([\w.]+)` ([0-9a-f]{7,})")
 
 
@@ -46,11 +47,18 @@ def ages() -> str:
     days: dict[str, list[str]] = {}
     for path in list_raw_files():
         commit = kept.get(path.name)
-        if commit is None or (has_commit(commit) and not (is_in_history(commit) and is_content_of(path, commit))):
-            commit = _run_git("log", "-1", "--format=%h", "--", str(path)).stdout.strip() or "0000000"
+        if commit in (None, UNCOMMITTED) or (
+            has_commit(commit) and not (is_in_history(commit) and is_content_of(path, commit))
+        ):
+            commit = _run_git("log", "-1", "--format=%h", "--", str(path)).stdout.strip() or UNCOMMITTED
         day = _run_git("log", "-1", "--format=%cs", commit).stdout.strip() or _find_day(path.name)
         days.setdefault(day, []).append(f"`{path.name}` {commit}")
     return table(("day", "raw file and commit"), [(day, ", ".join(found)) for day, found in sorted(days.items())])
+
+
+def _may_hold(path: Path, commit: str) -> bool:
+    """Returns whether the commit has this content, as far as this checkout knows it."""
+    return not has_commit(commit) or (is_in_history(commit) and is_content_of(path, commit))
 
 
 def _find_day(name: str) -> str:

@@ -7,17 +7,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.conftest import ROOT
-from tests.reference.measured import ages, cameras, live, race, robustness, scenes
+from tests.reference.measured import ages, cameras, headline, live, race, robustness, roles, scenes
 
 BLOCKS: dict[str, Callable[[], str]] = {
-    block.__name__: block for room in (scenes, race, cameras, robustness, live, ages) for block in room.BLOCKS
+    block.__name__: block
+    for room in (headline, scenes, race, cameras, robustness, live, roles, ages)
+    for block in room.BLOCKS
 }
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n)(.*?)(^<!-- end -->)", re.DOTALL | re.MULTILINE)
 
 
 def find_pages() -> list[Path]:
-    """Returns the pages of docs/ that have a mark."""
-    return [path for path in sorted((ROOT / "docs").glob("*.md")) if "<!-- table: " in path.read_text(encoding="utf-8")]
+    """Returns README and the pages of docs/ that have a mark."""
+    pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [path for path in pages if "<!-- table: " in path.read_text(encoding="utf-8")]
 
 
 def fill(text: str) -> str:

@@ -282,6 +282,14 @@ def _hostility() -> Iterable[Row]:
         "phases",
         "`siege_ipc.json`, `siege_tcp.json`",
     )
+    kills = raw("kills")
+    require(not kills["lost"] and not kills["places_without_a_scene"], "no keyframe lost, no place without a scene")
+    yield (
+        f"kill -9 of capture or recon at random moments for {kills['minutes']:.0f} minutes, beside an undisturbed node",
+        f"{kills['kills']['together']} kills: none of {kills['keyframes']} acknowledged keyframes lost, "
+        f"{kills['scenes']} scenes as undisturbed",
+        "`kills.json`",
+    )
     fuzz = raw("fuzz")["campaigns"]["boundaries"]
     require(sum(row["cases"] for row in fuzz["rows"].values()) == fuzz["cases"], "cases of all boundaries")
     yield (

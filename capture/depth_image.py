@@ -1,0 +1,211 @@
+"""DepthImage: what a depth camera measured at the moment of a frame, with its lens, its place and its noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import LARGEST_SIDE, Intrinsics
+from splatnode.capture.odometry import rigid_problem
+
+MOST_PIXELS = 1 << 25  # of a depth image: 33 million
+FARTHEST_M = 1000.0  # what is farther was not measured by any depth camera
+MILLIMETRE = 0.001  # metres: the unit of most images of 16 bits
+ALIGNED = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+_UNITS_M = (1e-6, 1.0)  # of a step of 16 bits
+_MOST_SIGMA = 1.0  # of each term of the noise: beyond, nothing was measured
+_LARGEST_OFFSET_M = 10.0  # between a camera and the depth camera beside it
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """Standard deviation of a depth z: `a_m` + `b_per_m` z^2, of each pixel, and of an error that all share.
+
+    Raises ValueError where a number is out of bounds.
+    """
+
+    a_m: float  # metres: what does not grow with the depth
+    b_per_m: float  # per metre: what a disparity's error makes of depth
+    scale_sigma: float = 0.005  # as a share of each depth, alike for all of a camera: its calibration
+
+    def __post_init__(self) -> None:
+        for what, number in (("a_m", self.a_m), ("b_per_m", self.b_per_m), ("scale_sigma", self.scale_sigma)):
+            if not 0 <= number <= _MOST_SIGMA:
+                raise ValueError(f"the noise of a depth image must have {what} of 0 to {_MOST_SIGMA:g}, got {number:g}")
+        if self.a_m + self.b_per_m <= 0:
+            raise ValueError("the noise of a depth image must be above 0: give a_m, b_per_m or both")
+
+    def compute_sigma(self, depth: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Standard deviation of depths, metres, of the same shape."""
+        return self.a_m + self.b_per_m * np.asarray(depth, np.float64) ** 2
+
+
+# Standard deviations where nobody tells any, by the kind of the depth camera.
+NOISES = {
+    "stereo": DepthNoise(0.002, 0.008),  # an OAK or a RealSense D4xx: .25 pixels of disparity at 7.5 cm
+    "structured_light": DepthNoise(0.0015, 0.003),  # the first Kinect (Khoshelham and Elberink 2012)
+    "time_of_flight": DepthNoise(0.005, 0.001),  # Azure Kinect, OAK-D ToF
+    "lidar": DepthNoise(0.01, 0.0025),  # of a telephone, smoothed by its maker
+}
+USUAL_KIND = "stereo"  # the noisiest: what is not known is not believed too much
+
+
+def find_noise(kind: str) -> DepthNoise:
+    """The noise of a kind of depth camera. Raises ValueError where there is no such kind."""
+    if kind not in NOISES:
+        raise ValueError(f"the kind of a depth camera must be one of {', '.join(NOISES)}, got {kind[:40]!a}")
+    return NOISES[kind]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """The z of what each pixel shows, 0 or not a number where it is not known.
+
+    It is aligned where it has neither a lens nor a place of its own: its pixels are those of the frame, whatever its
+    size. Raises ValueError where an array or a number is none of a depth image.
+    """
+
+    values: npt.NDArray[np.uint16] | npt.NDArray[np.float32] = field(repr=False)  # (H, W), steps of `unit_m`
+    unit_m: float = MILLIMETRE  # metres of a step: 0.001 where values are millimetres, 1 where they are metres
+    intrinsics: Intrinsics | None = None  # of the depth camera; None: the frame's, if it has any
+    T_camera_depth: tuple[float, ...] = ALIGNED  # row by row, metres: where the depth camera is beside the frame's
+    noise: DepthNoise = NOISES[USUAL_KIND]  # how unsure each depth is
+    confidence: npt.NDArray[np.uint8] | None = field(default=None, repr=False)  # (H, W), 0: not believed; 255: wholly
+
+    def __post_init__(self) -> None:
+        values = self.values
+        if values.ndim != 2 or values.dtype not in (np.uint16, np.float32):
+            raise ValueError(f"a depth image must be (H, W) uint16 or float32, got {values.shape} {values.dtype}")
+        if not 1 <= min(values.shape) <= max(values.shape) <= LARGEST_SIDE or values.size > MOST_PIXELS:
+            raise ValueError(f"a depth image must have 1 to {MOST_PIXELS} pixels, got {values.shape}")
+        if not _UNITS_M[0] <= self.unit_m <= _UNITS_M[1]:
+            raise ValueError(
+                f"the unit of a depth image must be {_UNITS_M[0]:g} to {_UNITS_M[1]:g} m, got {self.unit_m:g}"
+            )
+        if problem := rigid_problem(self.T_camera_depth):
+            raise ValueError(f"T_camera_depth must be {problem}")
+        offset = math.hypot(*self.T_camera_depth[3:12:4])
+        if offset > _LARGEST_OFFSET_M:
+            raise ValueError(
+                f"the depth camera must be within {_LARGEST_OFFSET_M:g} m of the frame's, got {offset:.3g} m: "
+                "T_camera_depth is in metres"
+            )
+        if self.T_camera_depth != ALIGNED and self.intrinsics is None:
+            raise ValueError("a depth camera with a place of its own must have a lens of its own: give intrinsics")
+        self._check_confidence()
+
+    def _check_confidence(self) -> None:
+        given = self.confidence
+        if given is not None and (given.shape != self.values.shape or given.dtype != np.uint8):
+            raise ValueError(
+                f"the confidence of a depth image must be {self.values.shape} uint8, got {given.shape} {given.dtype}"
+            )
+
+    @property
+    def is_aligned(self) -> bool:
+        """Whether its pixels are those of the frame."""
+        return self.intrinsics is None
+
+    def check_beside(self, width: int, height: int) -> None:
+        """Raises ValueError where it is aligned, and not of the shape of an image of this size."""
+        rows, columns = self.values.shape
+        if self.is_aligned and abs(columns * height - rows * width) > 2 * max(width, height):
+            raise ValueError(
+                f"an aligned depth image must have the shape of its image, {width} x {height}; got {columns} x {rows}. "
+                "Where it is not aligned, give the lens of the depth camera (intrinsics) and T_camera_depth"
+            )
+
+    @property
+    def metres(self) -> npt.NDArray[np.float32]:
+        """(H, W) z in the depth camera's frame, metres; 0 where it is not known, or not believed at all."""
+        z = self.values.astype(np.float32) * np.float32(self.unit_m)
+        known = np.isfinite(z) & (z > 0) & (z <= FARTHEST_M)
+        if self.confidence is not None:
+            known &= self.confidence > 0
+        return np.where(known, z, np.float32(0))
+
+    @property
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """T_camera_depth (4, 4)."""
+        return np.array(self.T_camera_depth, np.float64).reshape(4, 4)
+
+    def apply_lens(self, lens: Intrinsics) -> DepthImage:
+        """The same with the lens of its frame, where it is aligned: the frame's pixels are about to move."""
+        return replace(self, intrinsics=lens) if self.is_aligned else self
+
+
+def make_depth_image(
+    values: npt.NDArray[Any],
+    unit_m: float | None = None,
+    intrinsics: Intrinsics | None = None,
+    T_camera_depth: npt.NDArray[np.floating] | None = None,
+    noise: DepthNoise | str = USUAL_KIND,
+    confidence: npt.NDArray[np.uint8] | None = None,
+) -> DepthImage:
+    """A depth image of an array (H, W): whole numbers are millimetres, floats are metres, unless `unit_m` tells.
+
+    `noise` may name a kind of `NOISES`. Raises ValueError.
+    """
+    array = np.asarray(values)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[..., 0]
+    if array.dtype.kind not in "fu" or array.dtype == np.uint8:
+        raise ValueError(
+            f"a depth image must be (H, W) uint16 of millimetres or float of metres, got {array.shape} {array.dtype}"
+        )
+    whole = array.dtype.kind == "u"
+    if whole and array.dtype != np.uint16:
+        if array.size and int(array.max()) > 65_535:
+            raise ValueError(f"a depth image of whole numbers must be within 65535, got {int(array.max())}")
+        array = array.astype(np.uint16)
+    kept = np.ascontiguousarray(array, np.uint16) if whole else np.ascontiguousarray(array, np.float32)
+    matrix = np.eye(4) if T_camera_depth is None else np.asarray(T_camera_depth, np.float64)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"T_camera_depth must be (4, 4), got {matrix.shape}")
+    model = find_noise(noise) if isinstance(noise, str) else noise
+    unit = unit_m if unit_m is not None else (MILLIMETRE if whole else 1.0)
+    return DepthImage(kept, float(unit), intrinsics, tuple(matrix.ravel().tolist()), model, confidence)
+
+
+# What a depth image is beside its arrays, in messages, checkpoints and recordings alike.
+
+_Unit = Annotated[float, msgspec.Meta(ge=_UNITS_M[0], le=_UNITS_M[1])]
+
+
+class DepthMeta(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Describes a depth image beside its arrays: its values, and its confidence where it has any."""
+
+    unit_m: _Unit
+    intrinsics: Intrinsics | None
+    T_camera_depth: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
+    noise: DepthNoise
+    has_confidence: bool = False
+
+    @property
+    def num_arrays(self) -> int:
+        return 2 if self.has_confidence else 1
+
+
+def describe_depth(depth: DepthImage) -> DepthMeta:
+    """The fields beside its arrays."""
+    return DepthMeta(
+        depth.unit_m, depth.intrinsics, depth.T_camera_depth, depth.noise, has_confidence=depth.confidence is not None
+    )
+
+
+def depth_arrays(depth: DepthImage) -> list[npt.NDArray[Any]]:
+    """Its values, and its confidence where it has any."""
+    return [depth.values, *([] if depth.confidence is None else [depth.confidence])]
+
+
+def read_depth(meta: DepthMeta, arrays: list[npt.NDArray[Any]]) -> DepthImage:
+    """The depth image of which `describe_depth` and `depth_arrays` told. Raises ValueError where it is none."""
+    if len(arrays) != meta.num_arrays:
+        raise ValueError(f"a depth image must have {meta.num_arrays} arrays, got {len(arrays)}")
+    confidence = arrays[1] if meta.has_confidence else None
+    return DepthImage(arrays[0], meta.unit_m, meta.intrinsics, meta.T_camera_depth, meta.noise, confidence)

@@ -1,0 +1,90 @@
+"""Depth images as a program has them: arrays, files or records, by the photographs' names or in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.api.photographs import Images, names_of
+from splatnode.capture.cameras.folder import frame_name
+from splatnode.capture.depth_files import SUFFIXES, read_depth_file
+from splatnode.capture.depth_image import DepthImage, make_depth_image
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.image_file import UnusableImage
+from splatnode.recon.replay_source import Source
+
+DepthOf: TypeAlias = "DepthImage | npt.NDArray[Any] | str | PathLike[str] | None"
+Depths: TypeAlias = "str | PathLike[str] | Mapping[str, DepthOf] | Sequence[DepthOf]"
+
+
+def add_depths(source: Source, depths: Depths | None, images: Images) -> Source:
+    """The frames, each with its depth image. Raises TypeError, ValueError, FileNotFoundError."""
+    if depths is None:
+        return source
+    known = _name_depths(depths, images, source)
+
+    def add(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
+        given = known.get(frame.name)
+        if given is None or not isinstance(frame, Frame):
+            return frame
+        try:
+            return replace(frame, depth=parse_depth(given))
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"the depth image of {frame.name}: {error}") from error
+
+    return replace(source, frames=tuple(map(add, source.frames)))
+
+
+def parse_depth(given: Any) -> DepthImage:
+    """One depth image: a `DepthImage`, an array (H, W), or a file. Raises TypeError, ValueError, FileNotFoundError."""
+    if isinstance(given, DepthImage):
+        return given
+    if isinstance(given, np.ndarray):
+        return make_depth_image(given)
+    if isinstance(given, (str, PathLike)):
+        try:
+            return read_depth_file(Path(given))
+        except UnusableImage as error:
+            raise ValueError(str(error)) from error
+    raise TypeError(
+        f"must be a DepthImage, a NumPy array (H, W) of uint16 millimetres or float metres, or a file, got "
+        f"{type(given).__name__}"
+    )
+
+
+def parse_optional_depth(given: DepthOf) -> DepthImage | None:
+    """As `parse_depth`; None stays None."""
+    return None if given is None else parse_depth(given)
+
+
+def _name_depths(depths: Any, images: Images, source: Source) -> dict[str, Any]:
+    """The depth images by the names of their frames."""
+    if isinstance(depths, (str, PathLike)):
+        return _find_in_folder(Path(depths), source)
+    if isinstance(depths, Mapping):
+        named = {frame_name(Path(name)): each for name, each in depths.items()}
+        names = {frame.name for frame in source.frames}
+        if not names & named.keys():
+            raise ValueError(f"depths are of none of the photographs, such as {min(names, default='none')}")
+        return named
+    names = names_of(images)
+    if len(depths) != len(names):
+        raise ValueError(f"depths must be one for each of the {len(names)} photographs, got {len(depths)}")
+    return dict(zip(names, depths, strict=True))
+
+
+def _find_in_folder(folder: Path, source: Source) -> dict[str, Any]:
+    """The files of a folder that have the names of photographs, whatever their suffixes."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{fspath(folder)!r} is not there; give a folder of depth images")
+    files = {path.stem: path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
+    found = {each.name: files[Path(each.name).stem] for each in source.frames if Path(each.name).stem in files}
+    if not found:
+        raise ValueError(f"no depth image in {fspath(folder)!r} has the name of a photograph; name both alike")
+    return found

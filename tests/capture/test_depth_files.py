@@ -1,0 +1,206 @@
+"""Depth images in files, and folders in the layouts of TUM RGB-D, ScanNet and Record3D."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import folder
+from splatnode.capture.depth_files import decode_exr, read_depth_file
+from splatnode.capture.frame import Frame
+from splatnode.capture.image_file import UnusableImage
+from splatnode.capture.rgbd_folder import RgbdFolderError, find_rgbd_folder
+from splatnode.recon.replay_source import Request, load_source
+
+STEPS = np.random.default_rng(0).integers(1, 5000, (24, 32)).astype(np.uint16)
+METRES = (STEPS / 1000).astype(np.float32)
+K = [40.0, 0, 0, 0, 40.0, 0, 31.5, 23.5, 1]
+
+
+def attribute(name: str, kind: str, data: bytes) -> bytes:
+    return name.encode() + b"\0" + kind.encode() + b"\0" + struct.pack("<i", len(data)) + data
+
+
+def exr(depth: np.ndarray, compression: int = 3, channels: tuple[str, ...] = ("R",), half: bool = False) -> bytes:
+    """An OpenEXR file of scan lines, each channel of which is `depth`."""
+    height, width = depth.shape
+    dtype, number = (np.dtype("<f2"), 1) if half else (np.dtype("<f4"), 2)
+    table = b"".join(name.encode() + b"\0" + struct.pack("<iIii", number, 0, 1, 1) for name in channels) + b"\0"
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    head = b"\x76\x2f\x31\x01" + struct.pack("<i", 2) + attribute("channels", "chlist", table)
+    head += attribute("compression", "compression", bytes([compression])) + attribute("dataWindow", "box2i", window)
+    head += b"\0"
+    lines = {0: 1, 2: 1, 3: 16}[compression]
+    blocks = []
+    for top in range(0, height, lines):
+        rows = depth[top : top + lines].astype(dtype)
+        raw = b"".join(row.tobytes() * len(channels) for row in rows)
+        data = raw
+        if compression:
+            flat = np.frombuffer(raw, np.uint8)
+            split = np.concatenate([flat[::2], flat[1::2]]).astype(np.int64)
+            steps = np.concatenate([split[:1], (split[1:] - split[:-1] + 128) & 255]).astype(np.uint8)
+            packed = zlib.compress(steps.tobytes())
+            data = packed if len(packed) < len(raw) else raw
+        blocks.append(struct.pack("<ii", top, len(data)) + data)
+    start = len(head) + 8 * len(blocks)
+    offsets = [start + sum(map(len, blocks[:i])) for i in range(len(blocks))]
+    return head + struct.pack(f"<{len(blocks)}Q", *offsets) + b"".join(blocks)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+
+
+def photograph(seed: int, width: int = 64, height: int = 48) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("compression", [0, 2, 3])
+@pytest.mark.parametrize("half", [False, True])
+def test_an_exr_is_read_as_it_was_written(compression, half):
+    smooth = np.add.outer(np.linspace(1, 2, 37), np.linspace(0, 1, 21)).astype(np.float32)
+    found = decode_exr(exr(smooth, compression, ("B", "G", "R"), half))
+    assert np.array_equal(found, smooth.astype(np.float16).astype(np.float32) if half else smooth)
+
+
+def test_a_damaged_exr_is_refused_whatever_is_damaged():
+    whole, rng = exr(METRES), np.random.default_rng(0)
+    for _ in range(300):
+        broken = bytearray(whole)
+        for at in rng.integers(0, len(whole), 3):
+            broken[at] = rng.integers(0, 256)
+        for data in (bytes(broken), bytes(broken[: rng.integers(4, len(whole))])):
+            with contextlib.suppress(UnusableImage):
+                assert decode_exr(data).ndim == 2
+    with pytest.raises(UnusableImage, match="channel Z, Y or R"):
+        decode_exr(exr(METRES, channels=("A", "B")))
+    with pytest.raises(UnusableImage, match="ZIP, ZIPS or not at all"):
+        decode_exr(whole.replace(b"compression\0\x01\0\0\0\x03", b"compression\0\x01\0\0\0\x04"))
+
+
+def test_depth_files_of_each_kind_have_the_same_metres(tmp_path):
+    write_png(tmp_path / "a.png", STEPS)
+    np.save(tmp_path / "b.npy", METRES)
+    (tmp_path / "c.exr").write_bytes(exr(METRES))
+    for name in ("a.png", "b.npy", "c.exr"):
+        assert read_depth_file(tmp_path / name).metres == pytest.approx(METRES, abs=1e-6)
+    for name, data, why in (
+        ("d.jpg", b"", "no suffix of depth images"),
+        ("e.png", b"no image", "not an image"),
+        ("f.npy", b"\x93NUMPY\x01\0\x76\0broken", "no array"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(UnusableImage, match=why):
+            read_depth_file(tmp_path / name)
+    np.save(tmp_path / "g.npy", np.array([{}], object), allow_pickle=True)
+    np.save(tmp_path / "h.npy", METRES)
+    whole = (tmp_path / "h.npy").read_bytes()
+    (tmp_path / "h.npy").write_bytes(whole.replace(b"(24, 32)", b"(9**9,)"))
+    (tmp_path / "i.npy").write_bytes(whole.replace(b"(24, 32)", b"(24,99)"))
+    for name in ("g.npy", "h.npy", "i.npy"):
+        with pytest.raises(UnusableImage, match="no array|truncated"):
+            read_depth_file(tmp_path / name)
+
+
+def make_tum(root: Path) -> None:
+    for index in range(3):
+        write_png(root / f"rgb/130.{index}00000.png", photograph(index))
+        write_png(root / f"depth/130.{index}10000.png", 5 * STEPS)
+    write_png(root / "rgb/131.000000.png", photograph(3))
+    times = [f"130.{index}" for index in range(3)]
+    (root / "rgb.txt").write_text(
+        "# color images\n" + "".join(f"{t}00000 rgb/{t}00000.png\n" for t in times) + "131.000000 rgb/131.000000.png\n"
+    )
+    (root / "depth.txt").write_text("# depth maps\n" + "".join(f"{t}10000 depth/{t}10000.png\n" for t in times))
+
+
+def make_scannet(root: Path) -> None:
+    for index in range(3):
+        write_png(root / f"color/{index}.png", photograph(index))
+        write_png(root / f"depth/{index}.png", STEPS)
+    (root / "intrinsic").mkdir()
+    for name, focal in (("color", 40.0), ("depth", 20.0)):
+        matrix = np.eye(4)
+        matrix[:2, :3] = [[focal, 0, 15.5], [0, focal, 11.5]]
+        np.savetxt(root / f"intrinsic/intrinsic_{name}.txt", matrix)
+
+
+def make_record3d(root: Path) -> None:
+    for index in range(3):
+        write_png(root / f"rgb/{index}.png", photograph(index))
+        (root / "depth").mkdir(exist_ok=True)
+        (root / f"depth/{index}.exr").write_bytes(exr(METRES))
+    (root / "metadata.json").write_text(json.dumps({"K": K, "w": 64, "h": 48, "fps": 60, "poses": []}))
+
+
+LAYOUTS = {"TUM RGB-D": make_tum, "ScanNet": make_scannet, "Record3D": make_record3d}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_folder_in_a_layout_gives_photographs_with_their_depth(tmp_path, layout):
+    LAYOUTS[layout](tmp_path)
+    found = find_rgbd_folder(tmp_path)
+    assert found is not None and found.layout == layout
+    for frames in (
+        list(folder.stream(folder.Config(folder=tmp_path))),
+        list(load_source(Request(tmp_path)).frames),
+    ):
+        depths = [each.depth for each in frames if isinstance(each, Frame)]
+        assert len(depths) == (4 if layout == "TUM RGB-D" else 3)
+        if layout == "TUM RGB-D":
+            assert depths.pop() is None, "no depth image was taken within 20 ms"
+        for depth in depths:
+            assert depth is not None and depth.metres == pytest.approx(METRES, abs=1e-4)
+            assert depth.is_aligned == (layout != "ScanNet")
+    assert load_source(Request(tmp_path)).photographs == found.photographs
+
+
+def test_the_lenses_of_a_layout_are_those_of_its_files(tmp_path):
+    make_record3d(tmp_path / "a")
+    make_scannet(tmp_path / "b")
+    record3d, scannet = find_rgbd_folder(tmp_path / "a"), find_rgbd_folder(tmp_path / "b")
+    assert record3d is not None and scannet is not None and record3d.intrinsics is not None
+    assert record3d.intrinsics.K.tolist() == [[40, 0, 32], [0, 40, 24], [0, 0, 1]]
+    assert scannet.depth_intrinsics is not None and scannet.depth_intrinsics.fx == 20.0
+    (first, *_) = folder.stream(folder.Config(folder=tmp_path / "a"))
+    assert isinstance(first, Frame) and first.intrinsics == record3d.intrinsics
+
+
+def test_another_folder_is_as_it_was(tmp_path):
+    write_png(tmp_path / "a.png", photograph(0))
+    write_png(tmp_path / "depth/a.png", STEPS)
+    assert find_rgbd_folder(tmp_path) is None
+    (only,) = folder.stream(folder.Config(folder=tmp_path))
+    assert isinstance(only, Frame) and only.depth is None
+
+
+def test_a_damaged_depth_image_costs_its_depth_alone(tmp_path, caplog):
+    make_scannet(tmp_path)
+    (tmp_path / "depth/1.png").write_bytes(b"nothing")
+    frames = [each for each in folder.stream(folder.Config(folder=tmp_path)) if isinstance(each, Frame)]
+    assert [each.depth is None for each in frames] == [False, True, False]
+    assert "1.png: its depth image is left out" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [("x rgb/a.png\n", "a time and a file"), ("1.0 ../a.png\n", "a file in this folder"), ("#\n", "lists no files")],
+)
+def test_a_list_that_is_none_is_named(tmp_path, text, why):
+    make_tum(tmp_path)
+    (tmp_path / "depth.txt").write_text(text)
+    with pytest.raises(RgbdFolderError, match=why):
+        list(folder.stream(folder.Config(folder=tmp_path)))
+    make_scannet(tmp_path / "s")
+    (tmp_path / "s/intrinsic/intrinsic_depth.txt").write_text("1 2\n3\n")
+    with pytest.raises(RgbdFolderError, match="matrix of 3 or 4 rows"):
+        find_rgbd_folder(tmp_path / "s")

@@ -1,0 +1,219 @@
+"""Depth images give metres and depth, and the images tell what is wrong with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.depth_image import DepthImage, make_depth_image
+from splatnode.capture.frame import Intrinsics
+from splatnode.recon.metric.depth_fill import MeasuredDepth, fuse_depth, warp_depth
+from splatnode.recon.metric.depth_fit import DepthFit, DepthView, fit_depth_images
+from splatnode.recon.metric.depth_scale import estimate_scale_from_depth
+from splatnode.recon.metric.depth_smoothing import smooth_depth
+from splatnode.recon.metric.evidence import CameraDepth, Evidence, gather_evidence
+from splatnode.recon.metric.measurement import Measurement, MetricConfig
+from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.depth_check import DepthCode
+from splatnode.recon.result.report import build_report
+from tests.recon.metric import test_stereo
+from tests.support import synthetic as support
+from tests.support.depth_camera import DepthCamera, add_depths, measure
+
+PLACE, UNIT = test_stereo.PLACE, test_stereo.UNIT
+GOOD = DepthCamera()
+
+
+@lru_cache(maxsize=16)
+def depths(camera: DepthCamera = GOOD) -> dict[str, CameraDepth]:
+    frames = add_depths(support.photographs(PLACE), PLACE, camera)
+    return {each.name: CameraDepth("", each.depth) for each in frames if each.depth is not None}
+
+
+@lru_cache(maxsize=16)
+def views(camera: DepthCamera = GOOD) -> tuple[DepthView, ...]:
+    """True points of the place, in a unit of UNIT metres, with what the depth camera tells of them."""
+    found = []
+    for index, (name, own) in enumerate(depths(camera).items()):
+        _, K = synthetic.scene_cameras(PLACE)[index]
+        rows, columns = (each.ravel() for each in np.mgrid[5:235:5, 5:315:5])
+        z = synthetic.depth(PLACE, index)[rows, columns] / UNIT
+        rays = np.linalg.solve(K, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])).T
+        lens = Intrinsics(320, 240, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "estimated")
+        points = (z[:, None] * rays)[np.isfinite(z)]
+        found.append(DepthView(name, "", points, own.depth, lens))
+    return tuple(found)
+
+
+def fit(camera: DepthCamera = GOOD) -> DepthFit:
+    (found,) = fit_depth_images(views(camera))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_metres_within_half_a_percent_and_their_bound_holds(seed):
+    found = fit(DepthCamera(seed=seed))
+    assert found.check.code is DepthCode.FITS and found.is_usable and found.check.num_points > 1000
+    assert found.metres_per_unit == pytest.approx(UNIT, rel=0.005)
+    assert abs(np.log(found.metres_per_unit / UNIT)) < 1.96 * found.sigma < 0.012
+
+
+@pytest.mark.parametrize("shift", [(4.0, 0.0), (0.0, 4.0), (-4.0, 0.0), (0.0, -4.0), (3.0, -3.0)])
+def test_a_shift_of_four_pixels_is_named_and_its_depth_left_out(shift):
+    found = fit(DepthCamera(shift_px=shift))
+    assert found.check.code is DepthCode.SHIFTED and not found.is_usable and found.check.shift_px is not None
+    assert np.hypot(*(np.array(found.check.shift_px) - shift)) <= 2.0
+    assert "not aligned" in found.check.message and "Align depth to colour" in found.check.message
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_that_is_noisier_than_it_says_is_not_called_misaligned(seed):
+    few = [replace(view, points=view.points[::4]) for view in views(DepthCamera(noise_px=0.6, seed=seed))]
+    (found,) = fit_depth_images(few)
+    assert found.check.code is DepthCode.FITS
+
+
+def test_some_hundred_points_suffice_to_name_a_shift():
+    (found,) = fit_depth_images(
+        [replace(view, points=view.points[::8]) for view in views(DepthCamera(shift_px=(4.0, 0.0)))]
+    )
+    assert found.check.num_points < 800 and found.check.code is DepthCode.SHIFTED
+
+
+def test_depths_of_something_else_contradict_the_images():
+    first, second = views()
+    crossed = [replace(first, depth=second.depth), replace(second, depth=first.depth)]
+    rng = np.random.default_rng(0)
+    noise = make_depth_image((1 + 3 * rng.random((240, 320))).astype(np.float32), noise="time_of_flight")
+    (found,) = fit_depth_images([replace(each, depth=noise) for each in crossed])
+    assert found.check.code in (DepthCode.CONTRADICTS, DepthCode.SHIFTED) and not found.is_usable
+
+
+def test_few_points_judge_nothing():
+    (found,) = fit_depth_images([replace(each, points=each.points[:10]) for each in views()])
+    assert found.check.code is DepthCode.UNTESTED and "30 are needed" in found.check.message and not found.is_usable
+
+
+def test_each_camera_is_judged_alone():
+    first, second = views()[0], views(DepthCamera(shift_px=(5.0, 0.0)))[1]
+    good, bad = fit_depth_images([first, replace(second, camera_id="wrist")])
+    assert (good.camera_id, good.is_usable, bad.camera_id, bad.is_usable) == ("", True, "wrist", False)
+    assert "of wrist" in bad.check.message
+
+
+def test_a_depth_camera_beside_the_colour_camera_with_its_own_lens():
+    place, offset = PLACE, np.array([0.03, 0.0, 0.0])
+    found = []
+    for index, view in enumerate(views()):
+        T, K = synthetic.scene_cameras(place)[index]
+        T_camera_depth = np.eye(4)
+        T_camera_depth[:3, 3] = offset
+        wide = K.copy()
+        wide[0, 0] = wide[1, 1] = 0.8 * K[0, 0]
+        z = synthetic.depth_map(place, (T @ T_camera_depth, wide))
+        lens = Intrinsics(320, 240, wide[0, 0], wide[1, 1], wide[0, 2], wide[1, 2], "calibration")
+        measured = measure(z, DepthCamera(), index)
+        beside = make_depth_image(measured.values, intrinsics=lens, T_camera_depth=T_camera_depth)
+        found.append(replace(view, depth=beside))
+        shown = warp_depth(beside, view.lens, view.lens.K, (240, 320))
+        true = synthetic.depth(place, index)
+        known = shown.z > 0
+        assert known.mean() > 0.6
+        assert np.median(np.abs(shown.z[known] / true[known] - 1)) < 0.01
+    (fitted,) = fit_depth_images(found)
+    assert fitted.is_usable and fitted.metres_per_unit == pytest.approx(UNIT, rel=0.005)
+
+
+# In metres, by what the scene knows.
+
+
+def measured(camera: DepthCamera = GOOD, others: tuple[Measurement, ...] = ()):
+    return estimate_scale_from_depth(test_stereo.known(), test_stereo.landmarks(), depths(camera), others)
+
+
+def test_a_scale_error_of_three_percent_is_named_by_another_source():
+    marker = Measurement(UNIT, 0.005, "a marker of 100 mm")
+    (said,), (check,) = measured(DepthCamera(scale=1.03), (marker,))
+    assert isinstance(said, str) and check.code is DepthCode.SCALE
+    assert check.scale_error == pytest.approx(0.03, abs=0.006)
+    assert "too large by a marker of 100 mm" in check.message
+    (said,), (check,) = measured(DepthCamera(scale=0.97), (marker,))
+    assert check.code is DepthCode.SCALE and "too small" in check.message
+    (said,), (check,) = measured(DepthCamera(), (marker,))
+    assert isinstance(said, Measurement) and check.code is DepthCode.FITS
+
+
+def test_without_points_nothing_is_measured():
+    (said,), (check,) = estimate_scale_from_depth(test_stereo.known(), None, depths(), ())
+    assert isinstance(said, str) and check.code is DepthCode.UNTESTED
+    assert estimate_scale_from_depth(test_stereo.known(), None, {}, ()) == ([], ())
+
+
+def test_the_scene_is_in_metres_and_the_report_tells_of_its_depth_camera():
+    frames = add_depths(support.photographs(PLACE), PLACE)
+    evidence = gather_evidence(frames, MetricConfig())
+    assert set(evidence.depths) == {each.name for each in frames}
+    metric = apply_metric_scale(test_stereo.snapshot(), MetricConfig(), evidence)
+    assert metric.scale.metric and metric.scale.interval_95 is not None
+    low, high = metric.scale.interval_95
+    assert 0.985 < low < 1.0 < high < 1.015
+    apart = np.linalg.norm(metric.cameras[0].T_world_camera[:3, 3] - metric.cameras[1].T_world_camera[:3, 3])
+    (first, _), (second, _) = synthetic.scene_cameras(PLACE)
+    assert apart == pytest.approx(np.linalg.norm(first[:3, 3] - second[:3, 3]), rel=0.01)
+    report = build_report(metric, seed=0, preset="fast", peak_rss_mb=None)
+    assert report["depth"] == [check.record() for check in metric.depth_checks]
+    assert metric.depth_checks[0].record()["code"] == "FITS"
+    without = apply_metric_scale(test_stereo.snapshot(), MetricConfig(), Evidence())
+    assert "depth" not in build_report(without, seed=0, preset="fast", peak_rss_mb=None)
+
+
+# Depth without its noise, and beside stereo.
+
+
+def test_a_wall_is_smoothed_and_its_edge_is_not():
+    z = np.full((120, 160), 2.0)
+    z[:, 80:] = 3.0
+    noisy = z + 0.02 * np.random.default_rng(0).normal(size=z.shape)
+    found, sigma = smooth_depth(make_depth_image(noisy.astype(np.float32)))
+    known = found > 0
+    assert known.mean() > 0.97
+    assert np.sqrt(np.mean((found - z)[known] ** 2)) < 0.012 and sigma[known].max() <= 0.09
+    assert np.abs(found - z)[known].max() < 0.15, "nothing floats between both walls"
+
+
+def pointmap(depth: np.ndarray, confidence: np.ndarray) -> Pointmap:
+    K = np.array([[100.0, 0, 8], [0, 100.0, 6], [0, 0, 1]])
+    normal = np.zeros((*depth.shape, 3), np.float32)
+    return Pointmap("a", 0, depth.astype(np.float32), confidence.astype(np.float32), normal, np.eye(4), K)
+
+
+def test_depth_is_filled_where_stereo_has_none_and_averaged_where_both_agree():
+    stereo, confidence = np.full((12, 16), 2.0), np.full((12, 16), 0.95)
+    stereo[:, :4] = confidence[:, :4] = 0.0
+    stereo[:, 12:] = 3.0
+    told = np.full((12, 16), 2.01)
+    told[0] = 0.0
+    fused = fuse_depth(pointmap(stereo, confidence), MeasuredDepth(told, np.full((12, 16), 0.01)))
+    assert fused.depth[1:, :4] == pytest.approx(2.01) and (fused.confidence[1:, :4] > 0.5).all()
+    assert (fused.depth[1:, 4:12] > 2.0).all() and (fused.depth[1:, 4:12] < 2.01).all()
+    assert fused.depth[:, 12:] == pytest.approx(3.0), "what stereo is sure of stays"
+    assert fused.depth[0, 0] == 0.0 and fused.depth[0, 5] == pytest.approx(2.0)
+    assert np.linalg.norm(fused.normal[5, 1]) == pytest.approx(1.0)
+
+
+def test_what_is_too_unsure_fills_nothing():
+    nothing = np.zeros((12, 16))
+    fused = fuse_depth(pointmap(nothing, nothing), MeasuredDepth(np.full((12, 16), 2.0), np.full((12, 16), 0.2)))
+    assert not fused.depth.any() and not fused.confidence.any()
+
+
+def test_half_believed_pixels_are_twice_as_unsure():
+    wall = np.full((60, 80), 2000, np.uint16)
+    whole = make_depth_image(wall, confidence=np.full(wall.shape, 255, np.uint8))
+    half = DepthImage(wall, confidence=np.full(wall.shape, 128, np.uint8))
+    assert smooth_depth(half)[1][30, 40] == pytest.approx(255 / 128 * smooth_depth(whole)[1][30, 40], rel=1e-6)
