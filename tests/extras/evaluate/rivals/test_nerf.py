@@ -12,8 +12,7 @@ from torch import nn
 
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import FieldSnapshot
-from splatnode.extras.evaluate.rivals import nerfmm, nope_nerf
-from splatnode.extras.evaluate.rivals.nerf import radiance_field
+from splatnode.extras.evaluate.rivals import nerfmm, nope_nerf, radiance_field
 from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
 from splatnode.extras.evaluate.rivals.radiance_field import (
     FAR,
