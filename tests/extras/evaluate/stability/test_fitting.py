@@ -30,7 +30,7 @@ from tests.support.verdicts import evidence
 
 RANDOM = np.random.default_rng(0)
 SCENES = ("a", "b", "c", "d", "e")
-RESULTS = Path(__file__).parents[4] / "bench" / "results"
+RESULTS = Path(__file__).parents[3] / "bench" / "results"
 
 
 def sample(scene: str, inlier_ratio: float = 0.95, far_deg: float = 0.0, count: int = 3) -> Sample:
