@@ -113,7 +113,7 @@ VERBS = (
         "export",
         "write a scene in another format",
         _export_arguments,
-        import_lazily("splatnode.recon.result.export.command", "export"),
+        import_lazily("splatnode.recon.result.export.format", "export"),
     ),
     Verb(
         "locate",

@@ -49,7 +49,7 @@ def reconstruct_dataset(
     Each row takes one core. Like all of Ray Data this is lazy: the work begins when the rows are read. What fails is a
     row with the verdict FAILED. Raises ModuleNotFoundError without ray.
     """
-    from splatnode.extras.batch import cluster
+    from splatnode.extras.batch import remote
     from splatnode.extras.batch.command import replay
     from splatnode.extras.batch.remote import Job
     from splatnode.extras.jobs.child import Limits
@@ -57,4 +57,4 @@ def reconstruct_dataset(
 
     where = str(results) if "://" in str(results) else str(Path(results).resolve())
     job = Job(partial(replay, tuple(options)), where, Limits(max_memory_mb, timeout_s), own_version())
-    return ds.map(partial(cluster.run_row, job=job), num_cpus=1)
+    return ds.map(partial(remote.run_row, job=job), num_cpus=1)

@@ -25,7 +25,7 @@ from splatnode.capture.process.terminal import (
     show_waiting,
 )
 from splatnode.capture.process.text import sanitize_text
-from splatnode.extras.batch import cluster
+from splatnode.extras.batch import remote
 from splatnode.extras.batch.batch import (
     FAILED,
     LEDGER,
@@ -118,11 +118,11 @@ def _run_on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
     try:
         with ray.join_cluster(args.ray, None if args.ray else len(chosen_cores(args.cores))):
             remove_leftovers(args.out)
-            if (why := cluster.shortage(args.max_memory)) is not None and not args.ray:
+            if (why := remote.shortage(args.max_memory)) is not None and not args.ray:
                 raise ValueError(why)
             if why is not None and not args.json:
                 say(f"{why}, or recordings wait until one that has joins", error=True)
-            yield lambda todo: cluster.run_all(todo, job, args.cores)
+            yield lambda todo: remote.run_all(todo, job, args.cores)
     finally:
         remove_leftovers(args.out)
 

@@ -9,8 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.diorama.render import Camera, Matrix, Solid, colour_pixels, look_at, trace
-from splatnode.extras.building.building import CHAIR_ROOM, MIRROR_ROOM, interior
-from splatnode.extras.building.plan import CORRIDOR, DOORS, LENGTH, ZONES, Door, doors_of, zones_at
+from splatnode.extras.building.building import (
+    CHAIR_ROOM,
+    CORRIDOR,
+    DOORS,
+    LENGTH,
+    MIRROR_ROOM,
+    ZONES,
+    Door,
+    doors_of,
+    interior,
+    zones_at,
+)
 
 # The walk as a line on the floor plan: tours of rooms, joined by the corridor, without corners.
 

@@ -69,7 +69,7 @@ def frame_index(name: str) -> int:
 
 
 def scene_camera(config: Config, index: float) -> Camera:
-    """T_world_camera and K of a keyframe; world axes as in splatnode.extras.building.plan, metres."""
+    """T_world_camera and K of a keyframe; world axes as in splatnode.extras.building.building, metres."""
     return _walk(config).T_world_camera(_position(config, index)), intrinsic_matrix(config)
 
 

@@ -27,7 +27,7 @@ from splatnode.extras.evaluate.dataset import Split
 from splatnode.extras.evaluate.methods import is_variant
 from splatnode.extras.evaluate.protocol import FAILED, Row, Settings, compute_mean
 from splatnode.extras.evaluate.shown import PHOTOGRAPH, find_renders
-from splatnode.extras.jobs.alone import ALONE, Moment, now, others_share
+from splatnode.extras.jobs.cores import ALONE, Moment, now, others_share
 from splatnode.recon.config import PRESETS
 from splatnode.recon.core import instruction_sets
 from splatnode.recon.result.export.staged import json_bytes, write_files

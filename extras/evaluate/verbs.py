@@ -133,5 +133,5 @@ STABILITY = Verb(
     "robustness",
     "measure how often the answer is wrong",
     _stability_arguments,
-    import_lazily("splatnode.extras.evaluate.stability.command", "stability"),
+    import_lazily("splatnode.extras.evaluate.stability.campaign", "stability"),
 )

@@ -1,4 +1,4 @@
-"""A process: started on cores of its own, watched, and ended where it takes too long or too much."""
+"""A process: started on cores of its own, watched, and ended where it takes too long or too much; or some at a time."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from splatnode.capture.process import python
 from splatnode.capture.process.files import open_itself
 from splatnode.extras.jobs import launch
-from splatnode.extras.jobs.memory import tree_mb
 
 _LOOK_EVERY_S = 0.1  # at the memory
 _POLL_S = 0.02
+T = TypeVar("T")
 _LARGEST_TAIL = 4096  # bytes of what it said that are looked through for a reason
 _OURS = "splatnode: "  # before a sentence of the command line
 
@@ -140,3 +140,57 @@ def _read_last_message(log: Path) -> str:
         lines = [line for line in file.read().decode(errors="replace").splitlines() if line.strip()]
     ours = [line.removeprefix(_OURS) for line in lines if line.startswith(_OURS)]
     return (ours or [line.strip() for line in lines] or [""])[-1]
+
+
+_PROC = Path("/proc")
+
+
+def tree_mb(pid: int) -> float:
+    """Resident memory now, in 10^6 bytes; what two of the processes share counts in each. 0 where they have ended."""
+    try:
+        pages = int((_PROC / str(pid) / "statm").read_text().split()[1])
+        helpers = [int(child) for task in (_PROC / str(pid) / "task").iterdir() for child in _children(task)]
+    except (OSError, IndexError):  # it has ended meanwhile
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6 + sum(map(tree_mb, helpers))
+
+
+def _children(task: Path) -> list[str]:
+    """None where the thread has ended, or where the kernel does not tell."""
+    try:
+        return (task / "children").read_text().split()
+    except OSError:
+        return []
+
+
+def run_processes(
+    take: Callable[[], T | None],
+    start: Callable[[T, Sequence[int]], Child],
+    places: Sequence[Sequence[int]],
+    limits: Limits,
+) -> Generator[tuple[T, End], None, None]:
+    """Yields what `take` gives, each with its process's end, as they end; as many at a time as `places`.
+
+    A place is the numbers of the cores that a process may use. `take` gives None where there is nothing to begin now:
+    it is asked again after each end, and all is over when nothing runs any more. What is running when the iterator is
+    closed is ended.
+    """
+    free, running = list(places), list[tuple[T, Sequence[int], Child]]()
+    try:
+        while True:
+            while free and (task := take()) is not None:
+                running.append((task, free[0], start(task, free[0])))
+                free.pop(0)
+            if not running:
+                return
+            looks = [(each, each[2].check_end(limits)) for each in running]
+            running = [each for each, end in looks if end is None]
+            over = [(each, end) for each, end in looks if end is not None]
+            for (task, place, _), end in over:
+                free.append(place)
+                yield task, end
+            if not over:
+                time.sleep(_POLL_S)
+    finally:
+        for _, _, child in running:
+            child.stop()

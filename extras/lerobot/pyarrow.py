@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from splatnode.capture.process import apart
 from splatnode.capture.process.files import open_regular
 from splatnode.capture.process.records import decoder_of
-from splatnode.extras.lerobot.tables import (
+from splatnode.extras.lerobot.data_set import (
     LOST,
     MOST_ROWS,
     REFUSED,

@@ -1,4 +1,4 @@
-// Vectors of Gaussians between the world and each Gaussian's own axes (recon/optimize/optimizer.py says what for).
+// Vectors of Gaussians between the world and each Gaussian's own axes (recon/optimize/fit.py says what for).
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

@@ -4,7 +4,8 @@ intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
 watcher   capture.preview -> has the camera moved?
 main      recon.scene, recon.depth, recon.map, recon.status, recon.control; the service manager; signals
-"""
+
+It says that a disk is nearly full while it can still write: before a keyframe or a result is refused."""
 
 from __future__ import annotations
 
@@ -29,11 +30,12 @@ from splatnode.capture.messaging.network import (
 from splatnode.capture.messaging.pubsub import Answer, CommandServer, MarkProblemsSeen, Publisher, StateServer, ask
 from splatnode.capture.messaging.wire import Name, Numbering
 from splatnode.capture.process.config import load_config
-from splatnode.capture.process.files import state_directory
+from splatnode.capture.process.files import shortage, state_directory
 from splatnode.capture.process.logs import Problems, event, is_logged, use_structured_lines
 from splatnode.capture.process.system import (
     ServiceManager,
     handle_first_signal,
+    is_shortage,
     make_sure_of_room,
     raise_file_limit,
     resident_mb,
@@ -45,7 +47,6 @@ from splatnode.capture.process.unfailing import Unfailing
 from splatnode.recon.config import apply_changes
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.disk_space import DiskSpace
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
@@ -57,7 +58,41 @@ from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.staged import finish_interrupted_write
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record, make_depth_header
+from splatnode.recon.result.report import estimate_result_bytes
 from splatnode.recon.result.snapshot import CameraEstimate
+
+log = logging.getLogger(__name__)
+
+# In the checkpoint. Keyframe of 1280 x 720: photograph 2.8 MB, point map 1.2 MB, features and pairs 1 to 2 MB.
+BYTES_A_KEYFRAME = 6_000_000
+BYTES_A_GAUSSIAN = 56  # 14 numbers of 4 bytes
+
+
+class DiskSpace:
+    """The free space where the daemon writes, against what it may still write."""
+
+    def __init__(self, config: DaemonConfig, store: Store) -> None:
+        self._config, self._store = config, store
+        self._told = ""
+
+    def describe_problem(self) -> str:
+        """Describes what may not fit and where; empty where there is room for all. A change is logged."""
+        further_keyframes = max(0, self._config.max_views - len(self._store.names))
+        most_gaussians = self._config.max_gaussians
+        checkpoint_bytes = further_keyframes * BYTES_A_KEYFRAME + most_gaussians * BYTES_A_GAUSSIAN
+        try:
+            problem = shortage(self._store.directory, checkpoint_bytes, "the checkpoint") or shortage(
+                self._config.out, estimate_result_bytes(most_gaussians, self._config.max_views), "the result"
+            )
+        except OSError as error:
+            if is_shortage(error):  # this time it is not known
+                return self._told and f"{self._told}: make room on the disk"
+            problem = f"the disk does not tell how much is free ({error.strerror or error})"
+        if bool(problem) != bool(self._told):
+            event(log, logging.WARNING if problem else logging.INFO, "disk_space", problem=problem or "none")
+        self._told = problem
+        return problem and f"{problem}: make room on the disk"
+
 
 # Commands to the running daemon, and the verb `retract` that sends one.
 
@@ -80,8 +115,6 @@ def remove_keyframe(args: argparse.Namespace) -> int:
     say(answer.message)
     return EXIT_GOOD if answer.done else EXIT_UNKNOWN_NAME
 
-
-log = logging.getLogger(__name__)
 
 SERVE_S = 0.05  # between looks at what the threads have produced
 _SOCKETS = 8  # that it binds: of states two

@@ -1,29 +1,303 @@
-"""Fit: the parameters, targets and optimisers of one refinement, and its steps."""
+"""Fit: the parameters, targets and optimisers of one refinement, and its steps.
+
+The optimiser is Adam (Kingma and Ba 2015, algorithm 1): of all Gaussians at once, whose rows come and go, and of a
+tangent vector."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+import ctypes
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatnode.recon.geometry import exp_se3, twist_gradient
+from splatnode.recon.core import library
+from splatnode.recon.geometry import exp_se3, matrices_from_quats, twist_gradient
 from splatnode.recon.optimize import ensemble, photometric_losses, regularizers
 from splatnode.recon.optimize.control.control import Control, OptimizerStep
-from splatnode.recon.optimize.optimizer import Adam, Moments, Shifts, adam_direction
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.regularizers import Regularizer
 from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
+from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.rasterize.reference import Render
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, compute_fit_masks
 
 if TYPE_CHECKING:
     from splatnode.recon.optimize.training import RefinementConfig
+
+
+_EACH: Any = torch  # has functions of many tensors at once; its pages list them, though their names begin with _
+
+
+class Adam:
+    """Adam of all parameters in one native call, on other devices by torch; `torch.optim.Adam` but for rounding.
+
+    Parameters are named; rows are Gaussians (or cameras). `lrs` may be changed between steps. A row that is added
+    starts with moments of 0 but shares its parameter's count of steps, so its first steps are about three times as
+    long as a new parameter's, as in 3DGS.
+    """
+
+    def __init__(
+        self,
+        params: Mapping[str, Tensor],  # float32 leaves on one device, contiguous, any shape
+        lrs: Mapping[str, float],  # by the same names
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ):
+        if set(params) != set(lrs):
+            raise ValueError(f"params and lrs must have the same names, got {sorted(params)} and {sorted(lrs)}")
+        self.lrs = dict(lrs)
+        self.betas = betas
+        self.eps = eps
+        self._groups = {name: _new_group(name, param) for name, param in params.items()}
+
+    @property
+    def params(self) -> dict[str, Tensor]:
+        return {name: group.param for name, group in self._groups.items()}
+
+    def zero_grad(self) -> None:
+        for group in self._groups.values():
+            group.param.grad = None
+
+    @torch.no_grad()
+    def step(self, lr_factors: Mapping[str, Tensor] | None = None) -> None:
+        """One update of every parameter that has a gradient.
+
+        `lr_factors[name]`, one number a row (N,), multiplies the learning rate; of names left out it is 1.
+        """
+        factors = {name: _row_factors(name, value, self._groups) for name, value in (lr_factors or {}).items()}
+        moving = {name: group for name, group in self._groups.items() if group.param.grad is not None}
+        gradients = {name: _gradient(name, group.param) for name, group in moving.items()}
+        for group in moving.values():
+            group.steps += 1
+        if all(dispatch.is_on_cpu(group.param) for group in moving.values()):
+            self._step_natively(moving, gradients, factors)
+            return
+        self._step_by_torch(moving, gradients, factors)
+
+    def _step_size(self, name: str, group: _Group) -> float:
+        return self.lrs[name] / (1 - self.betas[0] ** group.steps)
+
+    def _step_natively(
+        self, moving: Mapping[str, _Group], gradients: Mapping[str, Tensor], factors: Mapping[str, Tensor]
+    ) -> None:
+        native = (_NativeGroup * len(moving))()
+        for slot, (name, group) in zip(native, moving.items(), strict=True):
+            slot.parameter, slot.gradient = group.param.data_ptr(), gradients[name].data_ptr()
+            slot.first, slot.second = group.first.data_ptr(), group.second.data_ptr()
+            slot.row_factors = factors[name].data_ptr() if name in factors else None
+            slot.count = group.param.numel()
+            slot.row_size = group.param[0].numel() if len(group.param) else 1
+            slot.step_size = self._step_size(name, group)
+            slot.root_correction = (1 - self.betas[1] ** group.steps) ** -0.5
+        library().core_adam(native, len(moving), *map(ctypes.c_double, (*self.betas, self.eps)))
+        for group in moving.values():
+            torch.autograd.graph.increment_version(group.param)
+
+    def _step_by_torch(
+        self, moving: Mapping[str, _Group], gradients: Mapping[str, Tensor], factors: Mapping[str, Tensor]
+    ) -> None:
+        """Steps as the core does, on any device: one launch for each operation, over all parameters at once."""
+        given, groups = list(gradients.values()), list(moving.values())
+        firsts, seconds = [group.first for group in groups], [group.second for group in groups]
+        _EACH._foreach_lerp_(firsts, given, 1 - self.betas[0])
+        _EACH._foreach_mul_(seconds, self.betas[1])
+        _EACH._foreach_addcmul_(seconds, given, given, 1 - self.betas[1])
+        roots = [(1 - self.betas[1] ** group.steps) ** 0.5 for group in groups]  # of the correction of the second
+        spreads = _EACH._foreach_sqrt(seconds)
+        _EACH._foreach_add_(spreads, [self.eps * root for root in roots])
+        sizes = [-self._step_size(name, group) for name, group in moving.items()]
+        sizes = [size * root for size, root in zip(sizes, roots, strict=True)]
+        moves = [_scale_rows(first, factors.get(name)) for name, first in zip(moving, firsts, strict=True)]
+        _EACH._foreach_addcdiv_([group.param for group in groups], moves, spreads, sizes)
+
+    def follow(self, params: Mapping[str, Tensor], origin: Tensor) -> None:
+        """Goes on with `params`, of M rows each, in place of the old ones.
+
+        `origin` (M,) is the old row whose state each goes on with; one of -1 starts with moments of 0.
+        """
+        if set(params) != set(self._groups):
+            raise ValueError(f"params must have the names {sorted(self._groups)}, got {sorted(params)}")
+        fresh = origin < 0
+        for name, param in params.items():
+            group = self._groups[name]
+            if param.shape != (len(origin), *group.param.shape[1:]):
+                shape = (len(origin), *group.param.shape[1:])
+                raise ValueError(f"{name} must be {shape} for these origins, got {tuple(param.shape)}")
+            first, second = (moment[origin].masked_fill_(_broadcast_rows(fresh, moment), 0) for moment in group.moments)
+            self._groups[name] = _Group(_check_param(name, param), first, second, group.steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Adam's state of one parameter after `steps` updates."""
+
+    first: Tensor  # running mean of the gradient
+    second: Tensor  # running mean of its square, element by element
+    steps: int = 0
+
+
+def adam_direction(
+    gradient: Tensor, moments: Moments, betas: tuple[float, float], eps: float = 1e-15
+) -> tuple[Tensor, Moments]:
+    """The direction of Adam's next step, of the gradient's shape, and the moments after it.
+
+    For a parameter on a manifold, such as a camera pose: the gradient is that of a tangent vector at the current point,
+    and the caller moves the point along minus the learning rate times the direction.
+    """
+    steps = moments.steps + 1
+    first = betas[0] * moments.first + (1 - betas[0]) * gradient
+    second = betas[1] * moments.second + (1 - betas[1]) * gradient**2
+    direction = (first / (1 - betas[0] ** steps)) / ((second / (1 - betas[1] ** steps)).sqrt() + eps)
+    return direction, Moments(first, second, steps)
+
+
+@dataclass(eq=False)
+class _Group:
+    """A parameter with its moments, as in `Moments`, which the core updates in place."""
+
+    param: Tensor
+    first: Tensor
+    second: Tensor
+    steps: int
+
+    @property
+    def moments(self) -> tuple[Tensor, Tensor]:
+        return self.first, self.second
+
+
+class _NativeGroup(ctypes.Structure):
+    """AdamGroup of recon/core/adam.cpp."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("parameter", "first", "second", "gradient", "row_factors")),
+        ("count", ctypes.c_int64),
+        ("row_size", ctypes.c_int64),
+        ("step_size", ctypes.c_float),
+        ("root_correction", ctypes.c_float),
+    ]
+
+
+def _scale_rows(values: Tensor, factors: Tensor | None) -> Tensor:
+    return values if factors is None else values * _broadcast_rows(factors.to(values), values)
+
+
+def _broadcast_rows(rows: Tensor, values: Tensor) -> Tensor:
+    """`rows` (N,) in a shape that broadcasts with `values` (N, ...)."""
+    return rows.view(-1, *[1] * (values.dim() - 1))
+
+
+def _new_group(name: str, param: Tensor) -> _Group:
+    zeros = torch.zeros_like(_check_param(name, param), requires_grad=False)
+    return _Group(param, zeros, zeros.clone(), 0)
+
+
+def _check_param(name: str, param: Tensor) -> Tensor:
+    if param.dtype != torch.float32 or not param.is_contiguous() or param.dim() == 0:
+        raise ValueError(
+            f"{name} must be a contiguous float32 tensor with at least one dimension, "
+            f"got {param.dtype} of shape {tuple(param.shape)} and strides {param.stride()}"
+        )
+    if not (param.is_leaf and param.requires_grad):
+        raise ValueError(f"{name} must be a leaf that requires its gradient (call .requires_grad_())")
+    return param
+
+
+def _gradient(name: str, param: Tensor) -> Tensor:
+    assert param.grad is not None
+    if param.grad.is_sparse:
+        raise ValueError(f"the gradient of {name} must be dense")
+    return param.grad.contiguous()
+
+
+def _row_factors(name: str, factors: Tensor, groups: Mapping[str, _Group]) -> Tensor:
+    if name not in groups:
+        raise ValueError(f"lr_factors names {name!r}; there are {sorted(groups)}")
+    rows = len(groups[name].param)
+    if tuple(factors.shape) != (rows,):
+        raise ValueError(f"lr_factors[{name!r}] must be ({rows},), got {tuple(factors.shape)}")
+    return factors.to(torch.float32).contiguous()
+
+
+# Steps of positions along each Gaussian's own axes, in its standard deviations.
+#
+# A Gaussian shows a shift along its thin axis far sooner than one along its long axis. Its covariance is the metric in
+# which both count alike, so that this is the natural gradient of a Gaussian's mean (Amari, "Natural gradient works
+# efficiently in learning", 1998) under Adam. A step is a share of the Gaussian's extent, in whatever unit the scene
+# is.
+
+LARGEST_EXTENT = 0.2  # standard deviation that counts at most, in median depths: the far shell's are many times that
+
+
+class Shifts:
+    """Adam of the offsets (N, 3) by which each mean has moved along its Gaussian's axes; it starts at 0 each step."""
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self._adam = Adam({"offsets": _zeros(gaussians)}, {"offsets": 0.0})
+
+    @torch.no_grad()
+    def step(self, gaussians: Gaussians, rate: float) -> None:
+        """Moves `gaussians.means`, which must have their gradient, by about `rate` standard deviations."""
+        assert gaussians.means.grad is not None
+        offsets, turned = self._adam.params["offsets"], make_axis_rotation(gaussians)
+        offsets.grad = turned(gaussians.means.grad, to_world=False)
+        self._adam.lrs = {"offsets": rate}
+        self._adam.step()
+        gaussians.means.add_(turned(offsets, to_world=True))
+        offsets.zero_()
+
+    def follow(self, gaussians: Gaussians, origin: Tensor) -> None:
+        """Goes on with these Gaussians; `origin` (N,) is as in `Adam.follow`."""
+        self._adam.follow({"offsets": _zeros(gaussians)}, origin)
+
+
+def rotate_to_axes(gradients: Tensor, gaussians: Gaussians) -> Tensor:
+    """(N, 3) the derivatives by offsets along the axes, of derivatives by positions `gradients` (N, 3)."""
+    return make_axis_rotation(gaussians)(gradients, to_world=False)
+
+
+def rotate_to_world(offsets: Tensor, gaussians: Gaussians) -> Tensor:
+    """(N, 3) the shifts in the world, of `offsets` (N, 3) along the axes in standard deviations."""
+    return make_axis_rotation(gaussians)(offsets, to_world=True)
+
+
+def make_axis_rotation(gaussians: Gaussians) -> Callable[..., Tensor]:
+    """A function of vectors (N, 3) and of `to_world`, by which vectors along the axes of `gaussians` turn into it."""
+    quats, log_scales = gaussians.quats.detach(), gaussians.log_scales.detach()
+    if dispatch.is_on_cpu(quats):
+        return partial(_rotate_by_core, quats, log_scales)
+    return partial(rotate_by_torch, axes_by_torch(quats, log_scales))
+
+
+def _rotate_by_core(quats: Tensor, log_scales: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
+    given = [tensor.to(torch.float32).contiguous() for tensor in (quats, log_scales, vectors.detach())]
+    result = torch.empty_like(given[2])
+    addresses = [ctypes.c_void_p(tensor.data_ptr()) for tensor in given]
+    largest, count = ctypes.c_double(LARGEST_EXTENT), ctypes.c_int64(len(result))
+    library().core_own_axes(*addresses, count, largest, int(to_world), ctypes.c_void_p(result.data_ptr()))
+    return result.to(vectors.dtype)
+
+
+def axes_by_torch(quats: Tensor, log_scales: Tensor) -> Tensor:
+    """(N, 3, 3) the axes in columns, as long as their standard deviations count."""
+    return matrices_from_quats(quats) * log_scales.exp().clamp_max(LARGEST_EXTENT)[:, None, :]
+
+
+def rotate_by_torch(axes: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
+    """Rotates as the core does, on any device."""
+    beside = vectors[:, None, :] if to_world else vectors[:, :, None]
+    return (axes * beside).sum(2 if to_world else 1)
+
+
+def _zeros(gaussians: Gaussians) -> Tensor:
+    return torch.zeros_like(gaussians.means, requires_grad=True)
+
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 _SCALES = {False: 1.0, True: 0.5}  # of the photographs' resolution, by whether it is halved

@@ -20,7 +20,7 @@ from splatnode.extras.evaluate.demo import write_capture
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.optimize.optimizer import Adam
+from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.pipeline import run

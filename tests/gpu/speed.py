@@ -17,7 +17,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.methods import extract_start_config, find_start
 from splatnode.recon.config import preset
 from splatnode.recon.modelling import create_initial_scene
-from splatnode.recon.optimize.optimizer import Adam
+from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.rasterize import dispatch

@@ -507,7 +507,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "fit",
-        "extras/evaluate/stability/fitting/fit.py",
+        "extras/evaluate/stability/fitting.py",
         (
             "leave-one-scene-out leaves nothing out",
             "fit_models([sample for sample in samples if sample.scene != scene])",
@@ -545,7 +545,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "fit",
-        "extras/evaluate/stability/fitting/samples.py",
+        "extras/evaluate/stability/fitting.py",
         (
             "cameras of two worlds are no gross error",
             "return not self.is_one_world or any(\n            error.centre_pct",

@@ -18,7 +18,7 @@ STARTS = {
     "capture/process/python.py",  # the one way
     "capture/process/start.py",  # what is run there first
     "extras/jobs/launch.py",  # becomes the command that it was given
-    "recon/core/trial.py",  # the Python of a clean environment, isolated
+    "recon/core/release.py",  # the Python of a clean environment, isolated
 }
 UNPICKLES = {
     "extras/jobs/call.py",  # from a folder of this user alone, or from Ray

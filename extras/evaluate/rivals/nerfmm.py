@@ -14,9 +14,8 @@ from collections.abc import Iterator, Sequence
 import torch
 
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.rivals import outcome
-from splatnode.extras.evaluate.rivals.nerf import radiance_field
-from splatnode.extras.evaluate.rivals.nerf.radiance_field import Focal, make_field_snapshot
+from splatnode.extras.evaluate.rivals import outcome, radiance_field
+from splatnode.extras.evaluate.rivals.radiance_field import Focal, make_field_snapshot
 from splatnode.recon.clock import Clock
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot

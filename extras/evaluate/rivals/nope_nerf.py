@@ -18,11 +18,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.rivals import outcome
-from splatnode.extras.evaluate.rivals.nerf import radiance_field
-from splatnode.extras.evaluate.rivals.nerf.radiance_field import Focal, make_field_snapshot, sample_pixels
+from splatnode.extras.evaluate.rivals import outcome, radiance_field
 from splatnode.extras.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
 from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
+from splatnode.extras.evaluate.rivals.radiance_field import Focal, make_field_snapshot, sample_pixels
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -1,9 +1,12 @@
-"""All trials of a plan, some at a time; what is on the disk already is not run again."""
+"""All trials of a plan, some at a time; what is on the disk already is not run again; and its verb."""
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import logging
+import shlex
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -11,15 +14,19 @@ from pathlib import Path
 
 import msgspec
 
+from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.colmap_model import read_json
-from splatnode.extras.evaluate.report import check_same_cores, describe_machine
+from splatnode.extras.evaluate.report import check_same_cores, describe_machine, explain_missing_seconds
 from splatnode.extras.evaluate.runner import Journal
 from splatnode.extras.evaluate.stability.case import MatrixRow, TrialCase
-from splatnode.extras.evaluate.stability.perturbations import Sampler, ScenesByMotion
-from splatnode.extras.evaluate.stability.report import make_report
-from splatnode.extras.evaluate.stability.trial import FAILED, Trial, judge_trial, run_trial
+from splatnode.extras.evaluate.stability.matrix import select_rows
+from splatnode.extras.evaluate.stability.perturbations import Sampler, ScenesByMotion, load_scenes_by_motion
+from splatnode.extras.evaluate.stability.report import Rate, make_report, summarise
+from splatnode.extras.evaluate.stability.trial import FAILED, Trial, find_method, judge_trial, run_trial
+from splatnode.extras.evaluate.stability.windows.campaign import run_windows_verb
 from splatnode.extras.jobs.call import pack_call
 from splatnode.extras.jobs.calls import Engine, Task, work_folder
+from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.folder import hold_result_folder
@@ -138,3 +145,48 @@ def _resume_trials(path: Path, scenes: Sequence[str], cores_each: int) -> list[d
 
 def _make_key(trial: Mapping) -> Key:
     return trial["row"], trial["name"], trial["seed"], trial["method"]
+
+
+def stability(args: argparse.Namespace) -> int:
+    """Runs the matrix, writes stability.json and stability.png, and prints the rates; or the windows, where asked."""
+    if args.windows:
+        return run_windows_verb(args)
+    plan = Plan(
+        rows=select_rows(args.rows),
+        seeds=tuple(range(args.seeds)),
+        methods=args.methods or ("splatnode",),
+        timeout_s=args.timeout_s,
+        max_memory_mb=args.max_memory,
+    )
+    for method in plan.methods:
+        find_method(method)
+    command = shlex.join(["splatnode", *sys.argv[1:]])
+    with opened(args.cores, args.ray) as engine:
+        trials = run_campaign(plan, load_scenes_by_motion(args.scenes, args.out), args.out, command, engine)
+    try:
+        from splatnode.extras.evaluate.stability import report
+    except ImportError:
+        logger.warning("no chart: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
+    else:
+        report.draw(args.out / "stability.json", args.out)
+    for trial in trials:
+        if trial["outcome"] in ("false_accept", "false_refuse", "failed"):
+            which = f"row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}"
+            reason = trial["message"].strip().splitlines()[-1]
+            say(f"{trial['outcome']}: {which}: {trial['verdict']}; {trial['note']}; {reason}")
+    for method in dict.fromkeys(trial["method"] for trial in trials):
+        summary = summarise(trials, method)
+        say(
+            f"{method}: {summary.trials} trials, false accepts {_format_rate(summary.false_accept)}, "
+            f"false refusals {_format_rate(summary.false_refuse)}, other codes {_format_rate(summary.other_code)}"
+        )
+    if why := explain_missing_seconds([trial.get("others") for trial in trials]):
+        say(why)
+    say(f"results: {args.out}/ (stability.json, stability.png)")
+    return 0
+
+
+def _format_rate(rate: Rate) -> str:
+    if rate.rate is None or rate.low is None or rate.high is None:
+        return "not tried"
+    return f"{rate.count}/{rate.of} = {rate.rate:.1%} ({rate.low:.1%} to {rate.high:.1%})"

@@ -37,7 +37,7 @@ from splatnode.extras.evaluate.stability.case import (
 )
 from splatnode.extras.evaluate.stability.perturbations import TrialImage
 from splatnode.extras.jobs import call
-from splatnode.extras.jobs.alone import now
+from splatnode.extras.jobs.cores import now
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction

@@ -1,10 +1,12 @@
 """What an export format is. A new one is a new module of recon.result.export.formats, and nothing else.
 
 Further ones are installed beside the core: an entry point of `splatnode.export_formats` names the module of each.
+The verb export is here, too.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
@@ -12,8 +14,9 @@ from pkgutil import iter_modules
 from typing import Protocol, cast
 
 from splatnode.capture.process import plugins
+from splatnode.capture.process.terminal import say, show_waiting
 from splatnode.recon.result.export import formats
-from splatnode.recon.result.export.prepare import EVERYTHING, Selection
+from splatnode.recon.result.export.prepare import EVERYTHING, Box, Selection
 from splatnode.recon.result.export.result import write_beside
 from splatnode.recon.result.export.stored import StoredResult
 
@@ -82,3 +85,13 @@ def export_scene(source: Path, to: str, destination: Path | None = None, selecti
     content = format_.export(result)
     write_beside(destination, {"": content} if isinstance(content, bytes) else content, of=result.scene)
     return destination
+
+
+def export(args: argparse.Namespace) -> int:
+    within = None if args.crop is None else Box(args.crop[:3], args.crop[3:])
+    with show_waiting(f"writing the scene as {args.to}"):
+        written = export_scene(
+            args.scene, args.to, args.out, Selection(args.multi_view_only, within, args.no_background)
+        )
+    say(written)
+    return 0

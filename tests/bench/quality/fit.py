@@ -16,15 +16,16 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.extras.evaluate.stability.fitting.fit import (
+from splatnode.extras.evaluate.stability.fitting import (
     fit_models,
     fit_without_each_scene,
     format_module,
+    load_results,
     make_report,
     pair_held_out_models,
+    read_samples,
     rejudge_rows,
 )
-from splatnode.extras.evaluate.stability.fitting.samples import load_results, read_samples
 from splatnode.extras.evaluate.stability.windows import campaign
 from splatnode.extras.evaluate.stability.windows.campaign import format_report, summarise
 from splatnode.extras.evaluate.stability.windows.windows import COUNTS, WindowRow

@@ -27,10 +27,10 @@ import numpy as np
 
 from splatnode.extras.evaluate.dataset import load_scene
 from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
-from splatnode.extras.evaluate.stability.fitting.fit import fit_models
-from splatnode.extras.evaluate.stability.fitting.samples import (
+from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     exceeds_bounds,
+    fit_models,
     is_published,
     load_results,
     make_trial_samples,

@@ -33,8 +33,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.render import Camera, Solid
 from splatnode.capture.frame import Frame
 from splatnode.extras.building import walk
-from splatnode.extras.building.building import CHAIR_ROOM, MIRROR_ROOM, interior
-from splatnode.extras.building.plan import ZONES
+from splatnode.extras.building.building import CHAIR_ROOM, MIRROR_ROOM, ZONES, interior
 from splatnode.extras.cameras import building
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset

@@ -27,7 +27,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon import core
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import exp_se3, twist_gradient
-from splatnode.recon.optimize.optimizer import Adam
+from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize import cpu

@@ -19,8 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.extras.priors.patchmatchnet import WEIGHTS, load_network
-from splatnode.extras.priors.patchmatchnet.stereo import NetworkStereo
+from splatnode.extras.priors.patchmatchnet import WEIGHTS, NetworkStereo, load_network
 from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors.classical import DepthEstimator

@@ -10,8 +10,7 @@ from splatnode.capture.diorama.render import look_at
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.process.config import parse_config
 from splatnode.extras.building import walk
-from splatnode.extras.building.building import CHAIR_ROOM, LOOK_ALIKES, MIRROR_ROOM, interior
-from splatnode.extras.building.plan import CORRIDOR, ZONES, zones_at
+from splatnode.extras.building.building import CHAIR_ROOM, CORRIDOR, LOOK_ALIKES, MIRROR_ROOM, ZONES, interior, zones_at
 from splatnode.extras.cameras import building
 
 TINY = building.Config(width=96, height=72, samples=1)

@@ -6,8 +6,7 @@ import os
 import sys
 from collections import deque
 
-from splatnode.extras.jobs.child import Child, Limits
-from splatnode.extras.jobs.engine import run_processes
+from splatnode.extras.jobs.child import Child, Limits, run_processes
 
 CORES = tuple(sorted(os.sched_getaffinity(0)))
 

@@ -11,9 +11,18 @@ import pytest
 import torch
 
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, load_scene
-from splatnode.extras.priors.aliked import WEIGHTS, Config, load
-from splatnode.extras.priors.aliked.matcher import AlikedMatcher, match_mutual
-from splatnode.extras.priors.aliked.network import Aliked, DeformableConv, detect_keypoints, load_aliked, sample_maps
+from splatnode.extras.priors.aliked import (
+    WEIGHTS,
+    Aliked,
+    AlikedMatcher,
+    Config,
+    DeformableConv,
+    detect_keypoints,
+    load,
+    load_aliked,
+    match_mutual,
+    sample_maps,
+)
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from tests.support.generated import generated, generated_images, shapes_of
 

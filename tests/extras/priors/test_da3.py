@@ -15,8 +15,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.priors.da3.network import DepthAnything3, DepthEstimate, PlacedCamera, load_network
-from splatnode.extras.priors.da3.prior import Config, Da3Prior, estimate_keyframes, load
+from splatnode.extras.priors.da3 import (
+    Config,
+    Da3Prior,
+    DepthAnything3,
+    DepthEstimate,
+    PlacedCamera,
+    estimate_keyframes,
+    load,
+    load_network,
+)
 from splatnode.recon.networks.vit import MEAN, STD
 from splatnode.recon.registration import registration as registration_registration
 from tests.support.generated import generated_images, generated_weights, shapes_of

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from splatnode.extras.priors import patchmatchnet
-from splatnode.extras.priors.patchmatchnet.network import PatchmatchNet, Source
-from splatnode.extras.priors.patchmatchnet.stereo import NetworkStereo, _make_planes
+from splatnode.extras.priors.patchmatchnet import NetworkStereo, PatchmatchNet, Source, _make_planes
 from splatnode.recon.priors.stereo import StereoConfig, StereoView
 
 HEIGHT, WIDTH, DEPTH = 64, 96, 2.0

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.core import release, trial
-from splatnode.recon.core.release import Row
-from splatnode.recon.core.trial import Trial, TrialFailed
+from splatnode.recon.core import release
+from splatnode.recon.core.release import Row, Trial, TrialFailed
 
 REPORT = {
     "verdict": {"code": "OK", "message": "exact", "publishable": True},
@@ -32,12 +31,12 @@ def test_the_table_has_a_line_for_each_artefact_in_columns():
 
 
 def test_a_scene_that_is_not_published_or_not_measured_fails_the_trial():
-    assert trial.format_verdict(REPORT) == "OK, 33.1 dB, 20 s"
+    assert release.format_verdict(REPORT) == "OK, 33.1 dB, 20 s"
     refused = {"verdict": {"code": "TOO_FEW", "message": "of one", "publishable": False}}
     with pytest.raises(TrialFailed, match="the demo's verdict is TOO_FEW: of one"):
-        trial.format_verdict({**REPORT, **refused})
+        release.format_verdict({**REPORT, **refused})
     with pytest.raises(TrialFailed, match="OK"):
-        trial.format_verdict({key: value for key, value in REPORT.items() if key != "held_out"})
+        release.format_verdict({key: value for key, value in REPORT.items() if key != "held_out"})
 
 
 def test_nothing_of_this_environment_reaches_the_trial():
@@ -48,15 +47,15 @@ def test_nothing_of_this_environment_reaches_the_trial():
         "SPLATNODE_ISA": "avx2",
         "CXX": "g++",
     }
-    assert trial.clean_environment(here, None) == {"PATH": "/usr/bin", "CXX": "g++"}
-    assert trial.clean_environment(here, Path("/e/bin")) == {"PATH": "/e/bin"}
+    assert release.clean_environment(here, None) == {"PATH": "/usr/bin", "CXX": "g++"}
+    assert release.clean_environment(here, Path("/e/bin")) == {"PATH": "/e/bin"}
 
 
 def test_links_count_as_themselves(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "file").write_bytes(bytes(1000))
     (tmp_path / "link").symlink_to("folder")
-    assert trial.size_of(tmp_path) == 1000 + len("folder")
+    assert release.size_of(tmp_path) == 1000 + len("folder")
 
 
 SAID = """

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatnode.recon.optimize.optimizer import Adam, Moments, adam_direction
+from splatnode.recon.optimize.fit import Adam, Moments, adam_direction
 
 SHAPES = {"means": (5000, 3), "opacities": (5000,), "sh": (5000, 4, 3), "cameras": (3, 6)}
 

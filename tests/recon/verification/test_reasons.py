@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.extras.evaluate.stability.fitting.fit import FOR
+from splatnode.extras.evaluate.stability.fitting import FOR
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.consistency import CycleConsistency, Reflection

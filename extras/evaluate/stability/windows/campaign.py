@@ -68,11 +68,11 @@ from splatnode.extras.evaluate.stability.windows.windows import (
     select_keys,
     select_moving_scenes,
 )
-from splatnode.extras.jobs.alone import now
 from splatnode.extras.jobs.call import Work, pack_call
 from splatnode.extras.jobs.calls import Engine, Task, work_folder
 from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
+from splatnode.extras.jobs.cores import now
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.fallbacks.run import run_fallbacks

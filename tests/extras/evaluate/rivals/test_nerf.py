@@ -12,9 +12,9 @@ from torch import nn
 
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import FieldSnapshot
-from splatnode.extras.evaluate.rivals import nerfmm, nope_nerf
-from splatnode.extras.evaluate.rivals.nerf import radiance_field
-from splatnode.extras.evaluate.rivals.nerf.radiance_field import (
+from splatnode.extras.evaluate.rivals import nerfmm, nope_nerf, radiance_field
+from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
+from splatnode.extras.evaluate.rivals.radiance_field import (
     FAR,
     NEAR,
     SAMPLES,
@@ -27,7 +27,6 @@ from splatnode.extras.evaluate.rivals.nerf.radiance_field import (
     render_rays,
     sample_pixels,
 )
-from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
 from tests.support.synthetic import photographs
 
 K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])

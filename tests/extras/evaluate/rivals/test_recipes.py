@@ -12,8 +12,16 @@ import pytest
 pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install 'splatnode[bench]')")
 
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.rivals import cf_3dgs, colmap, colmap_3dgs, colmap_fsgs, nerfmm, nope_nerf, outcome
-from splatnode.extras.evaluate.rivals.nerf import radiance_field
+from splatnode.extras.evaluate.rivals import (
+    cf_3dgs,
+    colmap,
+    colmap_3dgs,
+    colmap_fsgs,
+    nerfmm,
+    nope_nerf,
+    outcome,
+    radiance_field,
+)
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.result.verdict import Code
 

@@ -1,10 +1,12 @@
-"""`splatnode view --rerun`: its flags, and what runs it."""
+"""`splatnode view --rerun` and `--viser`: their flags, and what runs them."""
 
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from typing import TYPE_CHECKING
 
+from splatnode.capture.process.terminal import say
 from splatnode.viewer.further import FurtherViewer
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ def _check_arguments(args: argparse.Namespace) -> None:
         raise ValueError("--rerun-url needs --rerun")
 
 
-def _show(source: Source, args: argparse.Namespace) -> None:
+def _show_rerun(source: Source, args: argparse.Namespace) -> None:
     from splatnode.extras.viewers.rerun_stream import URL, stream
 
     stream(source, args.rerun_url or URL)
@@ -31,7 +33,21 @@ RERUN = FurtherViewer(
     "show it in the rerun viewer that runs on this machine, or that ssh -R leads to; of a node each update, until "
     "Ctrl-C",
     "shows it in the rerun viewer",
-    _show,
+    _show_rerun,
     _add_arguments,
     _check_arguments,
+)
+
+
+def _show_viser(source: Source, args: argparse.Namespace) -> None:
+    viser = import_module("splatnode.extras.viewers.viser")  # an extra
+    viser.show(source, args.listen, viser.PORT if args.port is None else args.port, say)
+
+
+VISER = FurtherViewer(
+    "viser",
+    "show it in a browser by viser, with the means of that (needs the extra viser); --web lets in fewer",
+    "shows it in a browser",
+    _show_viser,
+    is_server=True,
 )

@@ -9,20 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatnode.extras.evaluate.stability import fitting
 from splatnode.extras.evaluate.stability.case import CameraError
-from splatnode.extras.evaluate.stability.fitting import fit
-from splatnode.extras.evaluate.stability.fitting.fit import (
+from splatnode.extras.evaluate.stability.fitting import (
+    Sample,
     count_judgements,
+    exceeds_bounds,
     fit_models,
     fit_without_each_scene,
     format_module,
-    pair_held_out_models,
-)
-from splatnode.extras.evaluate.stability.fitting.samples import (
-    Sample,
-    exceeds_bounds,
     is_published,
     is_wrong,
+    pair_held_out_models,
     read_samples,
 )
 from splatnode.recon.verification.error_model import VerdictModels
@@ -32,7 +30,7 @@ from tests.support.verdicts import evidence
 
 RANDOM = np.random.default_rng(0)
 SCENES = ("a", "b", "c", "d", "e")
-RESULTS = Path(__file__).parents[4] / "bench" / "results"
+RESULTS = Path(__file__).parents[3] / "bench" / "results"
 
 
 def sample(scene: str, inlier_ratio: float = 0.95, far_deg: float = 0.0, count: int = 3) -> Sample:
@@ -66,7 +64,7 @@ def test_the_bounds_hold_for_as_many_errors_as_they_should(samples):
 
 
 def test_a_bound_grows_with_what_the_sources_say(samples):
-    model = fit.fit_bounds(samples).rotation
+    model = fitting.fit_bounds(samples).rotation
     narrow, wide = (model.predict_bound(Errors(size, size, 0.0), 3) for size in (0.2, 2.0))
     assert 4.0 * narrow < wide
     assert model.predict_bound(Errors(0.2, 0.2, 50.0), 3) == 100.0  # what the focal length leaves open, twice
@@ -80,9 +78,11 @@ def test_wrong_registrations_are_refused_by_numbers_that_did_not_see_their_scene
 
 
 def test_a_measure_never_counts_the_wrong_way(samples):
-    found = fit.fit_odds(samples, fit.fit_bounds(samples)).terms
-    assert set(found) == {*fit.FOR, *fit.AGAINST, "own_lens"} and found["own_lens"].slope <= 0
-    assert all(found[name].slope >= 0 for name in fit.FOR) and all(found[name].slope <= 0 for name in fit.AGAINST)
+    found = fitting.fit_odds(samples, fitting.fit_bounds(samples)).terms
+    assert set(found) == {*fitting.FOR, *fitting.AGAINST, "own_lens"} and found["own_lens"].slope <= 0
+    assert all(found[name].slope >= 0 for name in fitting.FOR) and all(
+        found[name].slope <= 0 for name in fitting.AGAINST
+    )
     assert found["inlier_ratio"].slope > 0 or found["camera_inlier_ratio"].slope > 0
 
 
@@ -98,7 +98,7 @@ def with_own_lens(of: Sample, broken: bool, times: float = 1.0) -> Sample:
 
 def test_sets_that_break_the_assumption_of_one_lens_widen_the_bounds_of_such_sets_alone(samples):
     broken = [with_own_lens(each, broken=True, times=2.0) for each in samples if each.right]
-    without, found = fit.fit_bounds(samples), fit.fit_bounds([*samples, *broken])
+    without, found = fitting.fit_bounds(samples), fitting.fit_bounds([*samples, *broken])
     assert found.rotation.factor == without.rotation.factor and found.centre.factor == without.centre.factor
     assert without.rotation.own_lens == 1.0
     assert 1.4 < found.rotation.own_lens < 3.0 and 1.4 < found.centre.own_lens < 3.0
@@ -110,8 +110,8 @@ def test_more_must_speak_for_poses_with_a_lens_of_its_own_where_such_were_wrong(
     convincing = [
         replace(s, broken=True, evidence=replace(s.evidence, cameras=tuple(good), inlier_ratio=0.95)) for s in seen
     ]
-    claims = fit.fit_bounds(samples)
-    without, found = fit.fit_odds(samples, claims), fit.fit_odds([*samples, *convincing], claims)
+    claims = fitting.fit_bounds(samples)
+    without, found = fitting.fit_odds(samples, claims), fitting.fit_odds([*samples, *convincing], claims)
     assert without.terms["own_lens"].slope == 0.0
     assert found.prior == without.prior and found.terms["own_lens"].slope < -1.0
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from splatnode.extras.evaluate.stability import fitting
 from splatnode.extras.evaluate.stability.case import ROUGH, CameraError
-from splatnode.extras.evaluate.stability.fitting import fit
-from splatnode.extras.evaluate.stability.fitting.samples import (
+from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     exceeds_bounds,
     is_wrong,
@@ -58,7 +58,7 @@ def test_a_scene_s_numbers_know_nothing_of_it():
         else s
         for s in samples
     ]
-    numbers, changed = fit.fit_without_each_scene(samples), fit.fit_without_each_scene(worse)
+    numbers, changed = fitting.fit_without_each_scene(samples), fitting.fit_without_each_scene(worse)
     assert list(numbers) == list(SCENES)
     assert changed["a"] == numbers["a"]
     assert changed["b"] != numbers["b"] and changed["c"] != numbers["c"]
@@ -67,42 +67,42 @@ def test_a_scene_s_numbers_know_nothing_of_it():
 def test_the_prior_refuses_the_most_convincing_wrong_one_as_the_other_scenes_judge_it():
     """By hand: the log odds of each wrong one by slopes of the other scenes; the largest is .5 below publishing."""
     samples = make_samples()
-    claims = fit.fit_bounds(samples)
+    claims = fitting.fit_bounds(samples)
     alone = VerdictModel(claims, OddsModel(0.0, {}))
     samples = [sample for sample in samples if sample.right or is_wrong(sample, alone)]  # the others are neither
-    table = np.array([[compute_measures(s.evidence, claims)[name] for name in fit.SIGNS] for s in samples])
+    table = np.array([[compute_measures(s.evidence, claims)[name] for name in fitting.SIGNS] for s in samples])
     right, scenes = np.array([s.right for s in samples]), np.array([s.scene for s in samples])
     convincing = []
     for index, sample in enumerate(samples):
         if not right[index] and passes_limits(sample, alone) and exceeds_bounds(sample, alone):
             others = scenes != sample.scene
-            model = fit._fit_regression(table[others], right[others])
+            model = fitting._fit_regression(table[others], right[others])
             terms = zip(model.terms.values(), table[index], strict=True)
             convincing.append(model.prior + sum(term.evaluate(value) for term, value in terms))
-    whole = fit._fit_regression(table, right)
+    whole = fitting._fit_regression(table, right)
     assert max(convincing) > 1.0  # in the other scenes nothing that looks like those of scene c is wrong
-    found = fit.fit_odds(make_samples(), claims)
+    found = fitting.fit_odds(make_samples(), claims)
     assert found.prior == pytest.approx(whole.prior - max(convincing) - 0.5, abs=0.01)
 
 
 def test_a_wrong_registration_weighs_as_much_as_four_right_ones():
     """Of 30 right and 5 wrong ones that look alike, the log odds are log(30 / (4 * 5))."""
     right = np.arange(35) < 30
-    model = fit._fit_regression(np.ones((35, len(fit.SIGNS))), right)
+    model = fitting._fit_regression(np.ones((35, len(fitting.SIGNS))), right)
     assert model.prior == pytest.approx(math.log(30 / 20), abs=1e-3)
 
 
 def test_gross_errors_are_no_errors_to_fit_bounds_to():
     samples = make_samples()
     assert [sample.is_gross for sample in samples[-6:]] == [True] * 6
-    assert fit.fit_bounds(samples) == fit.fit_bounds(samples[:-6])
+    assert fitting.fit_bounds(samples) == fitting.fit_bounds(samples[:-6])
 
 
 def test_a_bound_holds_for_96_of_100_errors_that_it_is_fitted_to():
     """Of 60 cameras that nothing tells apart, with errors of 1 to 60 degrees, 58 are within it."""
     said = Errors(0.1, 0.1, 0.0)
-    lines = [fit._ErrorSample("a", float(error), said, 1.0, 1.0, 3, False, False) for error in range(1, 61)]
-    found = fit._fit_bound_model(lines, fit.FLOORS["rotation"])
+    lines = [fitting._ErrorSample("a", float(error), said, 1.0, 1.0, 3, False, False) for error in range(1, 61)]
+    found = fitting._fit_bound_model(lines, fitting.FLOORS["rotation"])
     assert found.predict_bound(said, 3) == pytest.approx(58.0, rel=0.01)
 
 
@@ -117,8 +117,8 @@ def test_the_report_counts_windows_with_a_told_lens_apart():
     samples = make_samples()
     told = [replace(sample, told=True) for sample in samples[:4]]
     matrix = [replace(sample, window=False) for sample in samples[:2]]
-    numbers = fit.fit_without_each_scene(samples)
-    report: dict[str, Any] = fit.make_report(fit.pair_held_out_models([*samples, *told, *matrix], numbers))
+    numbers = fitting.fit_without_each_scene(samples)
+    report: dict[str, Any] = fitting.make_report(fitting.pair_held_out_models([*samples, *told, *matrix], numbers))
     counts = {kind: report[kind]["sets"] for kind in ("windows", "windows_told", "matrix")}
     assert counts == {"windows": len(samples), "windows_told": 4, "matrix": 2}
     assert sum(row["sets"] for row in report["windows_by_count"].values()) == len(samples)
@@ -146,23 +146,23 @@ def by_scene(**priors: float) -> dict[str, VerdictModel]:
 
 def test_rows_are_published_and_refused_by_the_numbers_without_their_scene():
     rows = [make_row("a"), make_row("b"), make_row("a", published=False), make_row("b", published=False)]
-    judged = fit.rejudge_rows(rows, by_scene(a=LOOSE, b=STRICT))
+    judged = fitting.rejudge_rows(rows, by_scene(a=LOOSE, b=STRICT))
     assert [row.published for row in judged] == [True, False, True, False]
-    assert [row.verdict for row in judged] == ["OK", fit.REFUSED, "OK", "AMBIGUOUS"]
+    assert [row.verdict for row in judged] == ["OK", fitting.REFUSED, "OK", "AMBIGUOUS"]
     assert [row.outcome for row in judged] == [WindowOutcome.RIGHT, WindowOutcome.REFUSED] * 2
     assert all(camera.bounds is not None for row in judged for camera in row.cameras)  # theirs, not the product's
 
 
 def test_what_is_known_roughly_is_called_so():
-    exact, rough = fit.rejudge_rows([make_row("a"), make_row("a", wide=True)], by_scene(a=LOOSE))
+    exact, rough = fitting.rejudge_rows([make_row("a"), make_row("a", wide=True)], by_scene(a=LOOSE))
     assert (exact.verdict, rough.verdict) == (Code.OK.value, ROUGH) and rough.published
     part = make_row("a", count=4)
-    assert fit.rejudge_rows([part], by_scene(a=LOOSE))[0].verdict == Code.OK_PARTIAL.value
+    assert fitting.rejudge_rows([part], by_scene(a=LOOSE))[0].verdict == Code.OK_PARTIAL.value
 
 
 def test_a_wrong_camera_is_told_by_the_bounds_of_the_numbers_that_judged_it():
     far = tuple(replace(camera, rotation_deg=4.0) for camera in make_row("a").cameras)
-    (judged,) = fit.rejudge_rows([make_row("a", cameras=far)], by_scene(a=LOOSE))
+    (judged,) = fitting.rejudge_rows([make_row("a", cameras=far)], by_scene(a=LOOSE))
     assert judged.published and judged.outcome is WindowOutcome.WRONG
     assert make_window_sample(judged).scene == "a" and exceeds_bounds(make_window_sample(judged), by_scene(a=0.0)["a"])
 
@@ -170,4 +170,4 @@ def test_a_wrong_camera_is_told_by_the_bounds_of_the_numbers_that_judged_it():
 def test_what_cannot_be_judged_again_stays_as_it_is():
     nothing, foreign = make_row("a", evidence=None, method="colmap"), make_row("elsewhere")
     two = make_row("a", count=2, evidence=asdict(evidence((0, 1))))
-    assert fit.rejudge_rows([nothing, foreign, two], by_scene(a=STRICT)) == [nothing, foreign, two]
+    assert fitting.rejudge_rows([nothing, foreign, two], by_scene(a=STRICT)) == [nothing, foreign, two]

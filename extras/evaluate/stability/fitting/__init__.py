@@ -1,1 +1,0 @@
-"""The numbers of the verdict, found from raw results (windows.json, stability.json)."""
