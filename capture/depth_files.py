@@ -6,6 +6,8 @@ import io
 import math
 import struct
 import zlib
+from collections.abc import Iterable
+from os import fspath
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,20 @@ _EXR = b"\x76\x2f\x31\x01"
 _LINES = {0: 1, 2: 1, 3: 16}  # of a block by its compression: none, ZIPS, ZIP
 _TYPES = {1: np.dtype("<f2"), 2: np.dtype("<f4")}  # of a channel
 _MOST_ATTRIBUTES, _MOST_CHANNELS = 200, 32
+
+
+def find_depth_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
+    """The files of a folder that have the names of these photographs, whatever their suffixes.
+
+    Raises FileNotFoundError, and ValueError where there is none.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{fspath(folder)!r} is not there; give a folder of depth images")
+    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES}
+    found = {name: files[Path(name).stem] for name in names if Path(name).stem in files}
+    if not found:
+        raise ValueError(f"no depth image in {fspath(folder)!r} has the name of a photograph; name both alike")
+    return found
 
 
 def read_depth_file(

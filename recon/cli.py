@@ -20,7 +20,7 @@ from splatnode.recon.metric.arguments import collect_drift_changes, collect_metr
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, set_preview_interval
-from splatnode.recon.replay_source import Request, Source, add_poses, load_source, parse_sources
+from splatnode.recon.replay_source import Request, Source, add_depth_folder, add_poses, load_source, parse_sources
 from splatnode.recon.result.export.result import LIVE_PICTURE
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.report import bound_result_bytes
@@ -44,6 +44,8 @@ def replay(args: argparse.Namespace) -> int:
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
     if args.map and args.multi_view_only:
         raise ValueError("--multi-view-only is for one scene: a merged map does not tell what two photographs confirm")
+    if args.map and args.depths is not None:
+        raise ValueError("--depths is for one scene; with --map give a folder whose layout has depth (docs/inputs.md)")
     if args.map:
         return replay_map(args, request, config)
     with show_progress(quiet=args.json) as tell:
@@ -59,6 +61,7 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
     if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
         say(taken, error=True)
     given, config = apply_rig(given, config, args.rig, tell)
+    given = given if args.depths is None else add_depth_folder(given, args.depths)
     check_baseline(config, given)
     trajectory = None if args.poses is None else read_poses(args.poses)
     known = _load_scale_evidence(args, given, trajectory)

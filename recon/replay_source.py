@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -20,8 +20,10 @@ import numpy.typing as npt
 
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
+from splatnode.capture.depth_files import find_depth_files, read_depth_file
+from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.image_file import encode_png
+from splatnode.capture.image_file import UnusableImage, encode_png
 from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose, group_frame_sets
 from splatnode.capture.lens_file import Lenses, describe_image
 from splatnode.capture.masks import Find, mask_frames, open_masks
@@ -29,7 +31,7 @@ from splatnode.capture.multi_camera import ALL as EVERY_CAMERA
 from splatnode.capture.multi_camera import CameraSet, select_cameras
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
-from splatnode.capture.process.text import sanitize_name
+from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.quality import Limits
 from splatnode.capture.rgbd_folder import find_photographs
 from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
@@ -276,6 +278,39 @@ def add_poses(
             raise ValueError(f"{sanitize_name(frame.name)}: {error}") from error
 
     return replace(given, frames=tuple(map(add_pose, given.frames)))
+
+
+def add_depth_folder(given: Source, folder: Path) -> Source:
+    """The frames, each with the depth image of its name in the folder.
+
+    Raises FileNotFoundError, OSError, and ValueError where a file is no depth image, or none has the name of a frame.
+    """
+    files = find_depth_files(folder, [frame.name for frame in given.frames])
+
+    def find(frame: Frame) -> DepthImage | None:
+        if frame.name not in files:
+            return None
+        try:
+            return read_depth_file(files[frame.name])
+        except UnusableImage as error:
+            raise ValueError(f"{sanitize_text(str(files[frame.name]))}: {error}") from error
+
+    return attach_depths(given, find)
+
+
+def attach_depths(given: Source, find: Callable[[Frame], DepthImage | None]) -> Source:
+    """The frames, each with the depth image that is found for it. Raises ValueError where it cannot be its."""
+
+    def attach(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
+        depth = find(frame) if isinstance(frame, Frame) else None
+        if depth is None or not isinstance(frame, Frame):
+            return frame
+        try:
+            return replace(frame, depth=depth)
+        except ValueError as error:
+            raise ValueError(f"the depth image of {sanitize_name(frame.name)}: {error}") from error
+
+    return replace(given, frames=tuple(map(attach, given.frames)))
 
 
 def apply_masks(given: Source, find: Find, tell: Tell = ignore_progress) -> Source:

@@ -56,6 +56,12 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add_stereo(parser)
     _add_masks(parser)
     parser.add_argument(
+        "--depths",
+        type=Path,
+        metavar="FOLDER",
+        help="depth images of the names of their photographs: .png or .tif of millimetres, .npy or .exr of metres",
+    )
+    parser.add_argument(
         "--intrinsics",
         type=Path,
         metavar="FILE",

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from os import PathLike, fspath
+from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -13,11 +12,11 @@ import numpy.typing as npt
 
 from splatnode.api.photographs import Images, names_of
 from splatnode.capture.cameras.folder import frame_name
-from splatnode.capture.depth_files import SUFFIXES, read_depth_file
+from splatnode.capture.depth_files import find_depth_files, read_depth_file
 from splatnode.capture.depth_image import DepthImage, make_depth_image
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage
-from splatnode.recon.replay_source import Source
+from splatnode.recon.replay_source import Source, attach_depths
 
 DepthOf: TypeAlias = "DepthImage | npt.NDArray[Any] | str | PathLike[str] | None"
 Depths: TypeAlias = "str | PathLike[str] | Mapping[str, DepthOf] | Sequence[DepthOf]"
@@ -29,16 +28,13 @@ def add_depths(source: Source, depths: Depths | None, images: Images) -> Source:
         return source
     known = _name_depths(depths, images, source)
 
-    def add(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
-        given = known.get(frame.name)
-        if given is None or not isinstance(frame, Frame):
-            return frame
+    def find(frame: Frame) -> DepthImage | None:
         try:
-            return replace(frame, depth=parse_depth(given))
+            return parse_optional_depth(known.get(frame.name))
         except (TypeError, ValueError) as error:
             raise type(error)(f"the depth image of {frame.name}: {error}") from error
 
-    return replace(source, frames=tuple(map(add, source.frames)))
+    return attach_depths(source, find)
 
 
 def parse_depth(given: Any) -> DepthImage:
@@ -66,7 +62,7 @@ def parse_optional_depth(given: DepthOf) -> DepthImage | None:
 def _name_depths(depths: Any, images: Images, source: Source) -> dict[str, Any]:
     """The depth images by the names of their frames."""
     if isinstance(depths, (str, PathLike)):
-        return _find_in_folder(Path(depths), source)
+        return find_depth_files(Path(depths), [frame.name for frame in source.frames])
     if isinstance(depths, Mapping):
         named = {frame_name(Path(name)): each for name, each in depths.items()}
         names = {frame.name for frame in source.frames}
@@ -77,14 +73,3 @@ def _name_depths(depths: Any, images: Images, source: Source) -> dict[str, Any]:
     if len(depths) != len(names):
         raise ValueError(f"depths must be one for each of the {len(names)} photographs, got {len(depths)}")
     return dict(zip(names, depths, strict=True))
-
-
-def _find_in_folder(folder: Path, source: Source) -> dict[str, Any]:
-    """The files of a folder that have the names of photographs, whatever their suffixes."""
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{fspath(folder)!r} is not there; give a folder of depth images")
-    files = {path.stem: path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES}
-    found = {each.name: files[Path(each.name).stem] for each in source.frames if Path(each.name).stem in files}
-    if not found:
-        raise ValueError(f"no depth image in {fspath(folder)!r} has the name of a photograph; name both alike")
-    return found

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import msgspec
 import numpy as np
 import pytest
 
 import splatnode
+from splatnode import command_line
 from splatnode.api.depths import add_depths
 from splatnode.api.photographs import load_frames
 from splatnode.capture.cameras import synthetic
@@ -107,6 +110,19 @@ def test_depths_are_a_list_a_mapping_a_folder_or_files(folder, arrays, depths, t
 def test_what_are_no_depths_is_said(arrays, given, kind, why):
     with pytest.raises(kind, match=why):
         add_depths(load_frames(arrays, None, False, lambda _: None), given, arrays)
+
+
+def test_replay_takes_a_folder_of_depth_images(folder, depths, tmp_path, capsys):
+    for index, depth in enumerate(depths):
+        (tmp_path / f"{index:04d}.tif").write_bytes(cv2.imencode(".tif", depth.values)[1].tobytes())
+    out = tmp_path / "out"
+    options = ["--preset", "preview", "--out", str(out), "--depths"]
+    assert command_line.main(["replay", str(folder), *options, str(tmp_path)]) == 0
+    report = json.loads((out / "report.json").read_text())
+    assert [each["code"] for each in report["depth"]] == ["FITS"]
+    (tmp_path / "0001.tif").write_bytes(b"II*\0 no image")
+    assert command_line.main(["replay", str(folder), *options, str(tmp_path)]) != 0
+    assert "0001.tif" in capsys.readouterr().err
 
 
 def test_a_folder_without_them_is_said(arrays, tmp_path):
