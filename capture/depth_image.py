@@ -177,12 +177,15 @@ def make_depth_image(
 _Unit = Annotated[float, msgspec.Meta(ge=_UNITS_M[0], le=_UNITS_M[1])]
 
 
+_Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]  # metres at most; `DepthImage` knows the rest
+
+
 class DepthMeta(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Describes a depth image beside its arrays: its values, and its confidence where it has any."""
 
     unit_m: _Unit
     intrinsics: Intrinsics | None
-    T_camera_depth: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]
+    T_camera_depth: Annotated[tuple[_Number, ...], msgspec.Meta(min_length=16, max_length=16)]
     noise: DepthNoise
     has_confidence: bool = False
 

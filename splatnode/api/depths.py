@@ -7,18 +7,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-import numpy.typing as npt
-
+from splatnode.api.image_arguments import DepthOf, parse_optional_depth
 from splatnode.api.photographs import Images, names_of
 from splatnode.capture.cameras.folder import frame_name
-from splatnode.capture.depth_files import find_depth_files, read_depth_file
-from splatnode.capture.depth_image import DepthImage, make_depth_image
+from splatnode.capture.depth_files import find_depth_files
+from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import Frame
-from splatnode.capture.image_file import UnusableImage
 from splatnode.recon.replay_source import Source, attach_depths
 
-DepthOf: TypeAlias = "DepthImage | npt.NDArray[Any] | str | PathLike[str] | None"
 Depths: TypeAlias = "str | PathLike[str] | Mapping[str, DepthOf] | Sequence[DepthOf]"
 
 
@@ -35,28 +31,6 @@ def add_depths(source: Source, depths: Depths | None, images: Images) -> Source:
             raise type(error)(f"the depth image of {frame.name}: {error}") from error
 
     return attach_depths(source, find)
-
-
-def parse_depth(given: Any) -> DepthImage:
-    """One depth image: a `DepthImage`, an array (H, W), or a file. Raises TypeError, ValueError, FileNotFoundError."""
-    if isinstance(given, DepthImage):
-        return given
-    if isinstance(given, np.ndarray):
-        return make_depth_image(given)
-    if isinstance(given, (str, PathLike)):
-        try:
-            return read_depth_file(Path(given))
-        except UnusableImage as error:
-            raise ValueError(str(error)) from error
-    raise TypeError(
-        f"must be a DepthImage, a NumPy array (H, W) of uint16 millimetres or float metres, or a file, got "
-        f"{type(given).__name__}"
-    )
-
-
-def parse_optional_depth(given: DepthOf) -> DepthImage | None:
-    """As `parse_depth`; None stays None."""
-    return None if given is None else parse_depth(given)
 
 
 def _name_depths(depths: Any, images: Images, source: Source) -> dict[str, Any]:

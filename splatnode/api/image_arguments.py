@@ -1,13 +1,18 @@
-"""Lens, pose, motion and gravity of one image, as a program gives them, as the records that a frame has."""
+"""Lens, depth image, pose, motion and gravity of one image, as a program gives them, as the records that a frame has."""
 
 from __future__ import annotations
 
+from os import PathLike
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.depth_files import read_depth_file
+from splatnode.capture.depth_image import DepthImage, make_depth_image
 from splatnode.capture.frame import Intrinsics
+from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.odometry import (
     GRAVITY_SIGMA_DEG,
     MOTION_DRIFT,
@@ -22,6 +27,7 @@ from splatnode.capture.odometry import (
 )
 
 Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
+DepthOf: TypeAlias = "DepthImage | npt.NDArray[Any] | str | PathLike[str] | None"
 Sigmas: TypeAlias = "tuple[float, float]"  # metres and degrees
 
 
@@ -99,3 +105,25 @@ def parse_sigmas(sigmas: Any, what: str) -> Sigmas:
     if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
         raise TypeError(f"{what} must be metres and degrees, (0.01, 2.0), got {sigmas!r}")
     return float(sigmas[0]), float(sigmas[1])
+
+
+def parse_depth(given: Any) -> DepthImage:
+    """One depth image: a `DepthImage`, an array (H, W), or a file. Raises TypeError, ValueError, FileNotFoundError."""
+    if isinstance(given, DepthImage):
+        return given
+    if isinstance(given, np.ndarray):
+        return make_depth_image(given)
+    if isinstance(given, (str, PathLike)):
+        try:
+            return read_depth_file(Path(given))
+        except UnusableImage as error:
+            raise ValueError(str(error)) from error
+    raise TypeError(
+        f"must be a DepthImage, a NumPy array (H, W) of uint16 millimetres or float metres, or a file, got "
+        f"{type(given).__name__}"
+    )
+
+
+def parse_optional_depth(given: DepthOf) -> DepthImage | None:
+    """As `parse_depth`; None stays None."""
+    return None if given is None else parse_depth(given)

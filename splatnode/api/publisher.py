@@ -14,8 +14,16 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.api.depths import DepthOf, parse_optional_depth
-from splatnode.api.image_arguments import Lens, Sigmas, append_motion, make_gravity, make_intrinsics, make_pose
+from splatnode.api.image_arguments import (
+    DepthOf,
+    Lens,
+    Sigmas,
+    append_motion,
+    make_gravity,
+    make_intrinsics,
+    make_pose,
+    parse_optional_depth,
+)
 from splatnode.capture.config import Camera, CaptureConfig, ProgramConfig
 from splatnode.capture.daemon import CaptureSession
 from splatnode.capture.depth_image import DepthImage

@@ -8,8 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
-from splatnode.api.depths import DepthOf, parse_optional_depth
-from splatnode.api.image_arguments import append_motion, make_gravity, make_intrinsics, make_pose
+from splatnode.api.image_arguments import (
+    DepthOf,
+    append_motion,
+    make_gravity,
+    make_intrinsics,
+    make_pose,
+    parse_optional_depth,
+)
 from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
     Changes,

@@ -12,6 +12,7 @@ import pytest
 from msgspec import inspect
 
 from splatnode.capture import config, status
+from splatnode.capture.depth_image import DepthNoise
 from splatnode.capture.frame import Baseline, ExposureSettings, Intrinsics
 from splatnode.capture.messaging import messages, pubsub
 from splatnode.capture.messaging.pubsub import Want
@@ -30,7 +31,7 @@ SCHEMAS = [
     Want, ReconStatus, SceneHeader, MapHeader, DepthHeader,
 ]  # fmt: skip
 # Their __post_init__ knows all their bounds.
-CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings, Baseline)
+CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings, Baseline, DepthNoise)
 
 
 def unbounded(kind: inspect.Type, where: str) -> Iterator[str]:
