@@ -1,4 +1,4 @@
-"""Lens, depth image, pose, motion and gravity of one image, as a program gives them, as the records that a frame has."""
+"""Lens, depth image, pose, motion and gravity of one image, as a program gives them, as records of a frame."""
 
 from __future__ import annotations
 

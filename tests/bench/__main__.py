@@ -62,6 +62,7 @@ BENCHMARKS = {
         "known_poses",
         "several_cameras",
         "rigs",
+        "rgbd",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

@@ -149,6 +149,25 @@ def rigs() -> str:
     return table(("rig", "degrees", "% of the distance", "largest error over its bound"), rows)
 
 
+def rgbd() -> str:
+    """Depth images: what is found of the surface, and how depth cameras are judged."""
+    surface, cameras = (raw("rgbd")["summary"][name] for name in ("surface", "depth_cameras"))
+    rows = [
+        (words.replace("depth", "depth images"), each["places"], each["answered"], percent(each["found"], 1),
+         percent(each["median_error"], 2))
+        for words, each in surface.items()
+    ]  # fmt: skip
+    found = table(("walls", "places", "answered", "surface found to 2 %", "median error of depth"), rows)
+    words = {"good": "a good one", "noisy": "noise twice as large as it says", "shifted": "4 pixels (of 640) aside"}
+    rows = [
+        (words[kind], each["cameras"], each["named_shifted"], each["named_otherwise"],
+         "–" if each["largest_unit_error"] is None else percent(each["largest_unit_error"], 2), each["beyond_bound"])
+        for kind, each in cameras.items()
+    ]  # fmt: skip
+    header = "depth camera", "trials", "named as shifted", "named otherwise", "largest error of metres", "beyond bound"
+    return f"{found}\n\n{table(header, rows)}"
+
+
 def known_poses() -> str:
     """Poses that are given, with one of them false or none."""
     found, rows = raw("known_poses")["rows"], []
@@ -405,6 +424,7 @@ BLOCKS = (
     lens_assumptions,
     several_cameras,
     rigs,
+    rgbd,
     known_poses,
     hard_sets,
     told_lenses,
