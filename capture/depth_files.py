@@ -16,6 +16,7 @@ import numpy.typing as npt
 from splatnode.capture.depth_image import MOST_PIXELS, DepthImage, DepthNoise, make_depth_image
 from splatnode.capture.frame import LARGEST_SIDE, Intrinsics
 from splatnode.capture.image_file import UnusableImage, decode_values, read_image_file
+from splatnode.capture.process.library_lines import ignore_file_warnings
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 SUFFIXES = {".png", ".tif", ".tiff", ".npy", ".exr"}
@@ -25,6 +26,8 @@ _EXR = b"\x76\x2f\x31\x01"
 _LINES = {0: 1, 2: 1, 3: 16}  # of a block by its compression: none, ZIPS, ZIP
 _TYPES = {1: np.dtype("<f2"), 2: np.dtype("<f4")}  # of a channel
 _MOST_ATTRIBUTES, _MOST_CHANNELS = 200, 32
+_MOST_EXR_BYTES = 16 * MOST_PIXELS  # of all its lines and channels, unpacked
+_MOST_HEADER = 1000  # bytes of an array's header in .npy
 
 
 def find_depth_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -78,10 +81,11 @@ def _decode_npy(data: bytes) -> npt.NDArray:
     try:
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version[0] == 1 else np.lib.format.read_array_header_2_0
-        shape, by_columns, dtype = read(file)
-    except (ValueError, OSError) as error:
-        raise UnusableImage(f"no array of NumPy: {error}") from error
-    if dtype.kind not in "fu" or len(shape) > 3:
+        with ignore_file_warnings():
+            shape, by_columns, dtype = read(file, max_header_size=_MOST_HEADER)
+    except (ValueError, OSError, MemoryError, RecursionError) as error:  # of a header that Python parses: its own fault
+        raise UnusableImage(f"no array of NumPy: {sanitize_text(error, 300)}") from None
+    if dtype.kind not in "fu" or len(shape) > 3 or min(shape, default=0) < 0:
         raise UnusableImage(f"no array (H, W) of numbers: {shape} {dtype}")
     count = math.prod(shape)
     if count * dtype.itemsize > len(data) - file.tell():
@@ -151,17 +155,22 @@ def _read_lines(
     if len(offsets) != count:
         raise UnusableImage("truncated: the file ends early")
     line_bytes = sum(kind.itemsize for kind in channels.values()) * width
+    if line_bytes * height > _MOST_EXR_BYTES:
+        raise UnusableImage(f"{width} x {height} of {len(channels)} channels: too large; write the depth channel alone")
     before = 0
     for name, kind in channels.items():
         if name == wanted:
             break
         before += kind.itemsize * width
-    made = np.zeros(shape, np.float32)
+    made, read_bytes = np.zeros(shape, np.float32), 0
     for block, offset in enumerate(offsets):
         if not position <= offset <= len(data) - 8:
             raise UnusableImage("truncated: the file ends early")
         (size,) = struct.unpack_from("<i", data, offset + 4)
         rows = min(lines, height - block * lines)
+        read_bytes += 8 + max(0, size)
+        if read_bytes > len(data) or size > rows * line_bytes:  # who packs leaves as it is what would grow
+            raise UnusableImage("damaged: its blocks overlap, or are larger than what they hold")
         raw = _inflate(data[offset + 8 : offset + 8 + max(0, size)], rows * line_bytes, compression)
         table = np.frombuffer(raw, np.uint8).reshape(rows, line_bytes)
         kind = channels[wanted]
@@ -180,9 +189,9 @@ def _inflate(data: bytes, size: int, compression: int) -> bytes:
             raw = stream.decompress(data, size)
         except zlib.error as error:
             raise UnusableImage(f"damaged: {error}") from error
-        steps = np.frombuffer(raw, np.uint8).astype(np.int64)
-        steps[1:] -= 128
-        flat = (np.cumsum(steps) & 255).astype(np.uint8)
+        steps = np.frombuffer(raw, np.uint8).copy()
+        steps[1:] += 128  # modulo 256, as the sums below
+        flat = np.cumsum(steps, dtype=np.uint8)
         woven = np.empty_like(flat)
         half = (len(flat) + 1) // 2
         woven[::2], woven[1::2] = flat[:half], flat[half:]

@@ -19,6 +19,7 @@ MILLIMETRE = 0.001  # metres: the unit of most images of 16 bits
 ALIGNED = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 _UNITS_M = (1e-6, 1.0)  # of a step of 16 bits
 _MOST_SIGMA = 1.0  # of each term of the noise: beyond, nothing was measured
+_LEAST_SIGMA = 1e-9  # metres, or per metre: what is below makes weights overflow
 _LARGEST_OFFSET_M = 10.0  # between a camera and the depth camera beside it
 
 
@@ -37,8 +38,8 @@ class DepthNoise:
         for what, number in (("a_m", self.a_m), ("b_per_m", self.b_per_m), ("scale_sigma", self.scale_sigma)):
             if not 0 <= number <= _MOST_SIGMA:
                 raise ValueError(f"the noise of a depth image must have {what} of 0 to {_MOST_SIGMA:g}, got {number:g}")
-        if self.a_m + self.b_per_m <= 0:
-            raise ValueError("the noise of a depth image must be above 0: give a_m, b_per_m or both")
+        if self.a_m + self.b_per_m < _LEAST_SIGMA:
+            raise ValueError("the noise of a depth image must be above 1 nm: give a_m, b_per_m or both")
 
     def compute_sigma(self, depth: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """Standard deviation of depths, metres, of the same shape."""
@@ -60,6 +61,15 @@ def find_noise(kind: str) -> DepthNoise:
     if kind not in NOISES:
         raise ValueError(f"the kind of a depth camera must be one of {', '.join(NOISES)}, got {kind[:40]!a}")
     return NOISES[kind]
+
+
+def _check_shape(columns: int, rows: int, width: int, height: int, of: str) -> None:
+    """Raises ValueError unless a depth image has the shape of another size, to a pixel."""
+    if abs(columns * height - rows * width) > max(width, height) + max(columns, rows):
+        raise ValueError(
+            f"a depth image must have the shape of {of}, {width} x {height}; got {columns} x {rows}. Where it is not "
+            "aligned, give the lens of the depth camera (intrinsics) and T_camera_depth"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +105,10 @@ class DepthImage:
                 f"the depth camera must be within {_LARGEST_OFFSET_M:g} m of the frame's, got {offset:.3g} m: "
                 "T_camera_depth is in metres"
             )
+        if self.intrinsics is not None:
+            rows, columns = values.shape
+            _check_shape(columns, rows, self.intrinsics.width, self.intrinsics.height, "its lens")
+            self.intrinsics.resized(columns, rows)  # raises where that is no lens
         if self.T_camera_depth != ALIGNED and self.intrinsics is None:
             raise ValueError("a depth camera with a place of its own must have a lens of its own: give intrinsics")
         self._check_confidence()
@@ -114,11 +128,8 @@ class DepthImage:
     def check_beside(self, width: int, height: int) -> None:
         """Raises ValueError where it is aligned, and not of the shape of an image of this size."""
         rows, columns = self.values.shape
-        if self.is_aligned and abs(columns * height - rows * width) > 2 * max(width, height):
-            raise ValueError(
-                f"an aligned depth image must have the shape of its image, {width} x {height}; got {columns} x {rows}. "
-                "Where it is not aligned, give the lens of the depth camera (intrinsics) and T_camera_depth"
-            )
+        if self.is_aligned:
+            _check_shape(columns, rows, width, height, "its image")
 
     @property
     def metres(self) -> npt.NDArray[np.float32]:

@@ -15,6 +15,7 @@ from splatnode.capture.process.text import LONGEST_NAME, is_printable
 
 # Where others say that a camera was: odometry, a tracker, a drone's log.
 
+LEAST_SIGMA = 1e-9  # metres or degrees: below it the weights of least squares overflow
 LARGEST_M = 1e6  # of a coordinate, and of its standard deviation
 SIGMA_M, SIGMA_DEG = 0.01, 2.0  # standard deviations where nobody tells any
 _RIGID = 1e-2  # largest difference of a rotation times its transpose from the identity
@@ -34,9 +35,9 @@ class GivenPose:
     sigma_deg: float = SIGMA_DEG  # of the orientation about each axis, degrees
 
     def __post_init__(self) -> None:
-        if not (0 < self.sigma_m <= LARGEST_M and 0 < self.sigma_deg <= 180):
+        if not (LEAST_SIGMA <= self.sigma_m <= LARGEST_M and LEAST_SIGMA <= self.sigma_deg <= 180):
             raise ValueError(
-                f"the sigmas of a given pose must be above 0 and finite, up to {LARGEST_M:g} m and 180 degrees; "
+                f"the sigmas of a given pose must be {LEAST_SIGMA:g} or more, up to {LARGEST_M:g} m and 180 degrees; "
                 f"got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
             )
         if problem := rigid_problem(self.T_world_camera):
@@ -159,8 +160,10 @@ class Gravity:
         length = math.hypot(*self.down)
         if len(self.down) != 3 or not _SHORTEST <= length <= _LONGEST:
             raise ValueError(f"gravity must be a direction of three numbers, not zero; got {list(self.down)[:4]}")
-        if not 0 < self.sigma_deg <= 90:
-            raise ValueError(f"the sigma of gravity must be above 0, up to 90 degrees, got {self.sigma_deg:g}")
+        if not LEAST_SIGMA <= self.sigma_deg <= 90:
+            raise ValueError(
+                f"the sigma of gravity must be {LEAST_SIGMA:g} or more, up to 90 degrees, got {self.sigma_deg:g}"
+            )
 
     @property
     def direction(self) -> npt.NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ from splatnode.capture.process.text import guard_untrusted, sanitize_name, sanit
 log = logging.getLogger(__name__)
 
 _MAX_TEXT_BYTES = 50_000_000
+_MOST_LINES, _MOST_S = 500_000, 1e11  # of a list of files, and of a time in it
 _TUM_STEPS = 5000.0  # of depth a metre
 _TUM_APART_S = 0.02  # between a photograph and its depth image, as TUM's associate.py has it
 _DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".tif", ".tiff")
@@ -87,12 +89,13 @@ def _open_tum(folder: Path) -> RgbdFolder:
     places = {(folder / file).parent for _, file in colours}
     if len(places) != 1:
         raise RgbdFolderError(f"{str(folder / 'rgb.txt')!r} must list files of one folder, got {len(places)} folders")
-    times = np.array([time for time, _ in depths])
-    found = {}
+    depths.sort()
+    times, found = [time for time, _ in depths], {}
     for time, file in colours:
-        nearest = int(np.argmin(np.abs(times - time)))
-        if abs(times[nearest] - time) <= _TUM_APART_S:
-            found[Path(file).name] = folder / depths[nearest][1]
+        at = bisect.bisect_left(times, time)
+        near = min(depths[max(0, at - 1) : at + 1], key=lambda each: abs(each[0] - time))
+        if abs(near[0] - time) <= _TUM_APART_S:
+            found[Path(file).name] = folder / near[1]
     return RgbdFolder("TUM RGB-D", places.pop(), found, 1.0 / _TUM_STEPS)
 
 
@@ -109,12 +112,14 @@ def _read_list(path: Path) -> list[tuple[float, str]]:
             seconds = float(time)
         except ValueError:
             seconds = float("nan")
-        if not np.isfinite(seconds) or not file.strip():
+        if not abs(seconds) < _MOST_S or not file.strip():
             raise RgbdFolderError(f"{where} must be a time and a file, got {sanitize_text(line, 60)!r}")
         parts = Path(file.strip()).parts
-        if Path(file.strip()).is_absolute() or ".." in parts:
+        if not parts or Path(file.strip()).is_absolute() or ".." in parts or "\0" in file:
             raise RgbdFolderError(f"{where} must name a file in this folder, got {sanitize_text(file, 60)!r}")
         found.append((seconds, file.strip()))
+        if len(found) > _MOST_LINES:
+            raise RgbdFolderError(f"{str(path)!r} must list at most {_MOST_LINES} files; cut the recording")
     if not found:
         raise RgbdFolderError(f"{str(path)!r} lists no files")
     return found

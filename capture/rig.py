@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics, Stamp
-from splatnode.capture.odometry import rigid_problem
+from splatnode.capture.odometry import LARGEST_M, LEAST_SIGMA, rigid_problem
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 
 TOLERANCE_S = 0.02  # between images that were taken together, where nobody tells any
@@ -34,10 +33,10 @@ class RigCamera:
     def __post_init__(self) -> None:
         if not self.camera_id or sanitize_text(self.camera_id, LONGEST_NAME) != self.camera_id:
             raise ValueError(f"a camera id must be 1 to {LONGEST_NAME} printable letters, got {self.camera_id[:40]!a}")
-        if not (0 < self.sigma_m < math.inf and 0 < self.sigma_deg <= 180):
+        if not (LEAST_SIGMA <= self.sigma_m <= LARGEST_M and LEAST_SIGMA <= self.sigma_deg <= 180):
             raise ValueError(
-                "the sigmas of a camera on its rig must be above 0 and finite, up to 180 degrees; "
-                f"got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
+                f"the sigmas of a camera on its rig must be {LEAST_SIGMA:g} or more, up to {LARGEST_M:g} m and "
+                f"180 degrees; got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
             )
         if self.T_rig_camera is not None and (problem := rigid_problem(self.T_rig_camera)):
             raise ValueError(f"the pose of {self.camera_id} on its rig must be {problem}")

@@ -93,7 +93,7 @@ def entry_points(group: str) -> Mapping[str, EntryPoint]:
     A name of `extras` stays what it is. Where two distributions give one name to two things, `load` refuses it. None is
     imported.
     """
-    return _read_all(tuple(sys.path)).get(group, MappingProxyType({}))
+    return _read_all(tuple(sys.path), os.getcwd()).get(group, MappingProxyType({}))
 
 
 def load_all(group: str) -> dict[str, Any]:
@@ -108,8 +108,11 @@ def load_all(group: str) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=4)
-def _read_all(path: tuple[str, ...]) -> Mapping[str, Mapping[str, EntryPoint]]:
-    """All groups of this project. `importlib.metadata` finds the same, in the time of a whole start."""
+def _read_all(path: tuple[str, ...], current: str) -> Mapping[str, Mapping[str, EntryPoint]]:
+    """All groups of this project, of what is not in the `current` folder.
+
+    `importlib.metadata` finds the same, in the time of a whole start.
+    """
     found: dict[str, dict[str, EntryPoint]] = {}
     for file in (_OWN, *_find_files(path)):
         for entry in _read_file(file):
@@ -126,8 +129,10 @@ def _find_files(path: tuple[str, ...]) -> Iterator[Path]:
     """
     seen = {"splatnode"}
     for folder in dict.fromkeys(path):
+        if not os.path.isabs(folder) or _is_current(folder):  # whoever made its files is nobody's choice
+            continue
         try:
-            names = sorted(os.listdir(folder or "."))
+            names = sorted(os.listdir(folder))
         except OSError as error:  # a zip file, or nothing
             raise_shortage(error)
             continue
@@ -138,6 +143,14 @@ def _find_files(path: tuple[str, ...]) -> Iterator[Path]:
                 yield file
 
 
+def _is_current(folder: str) -> bool:
+    try:
+        return os.path.samefile(folder, ".")
+    except OSError as error:  # either is not there
+        raise_shortage(error)
+        return False
+
+
 def _name_package(file: Path) -> str:
     """The name of the distribution whose file this is: of my_eyes-1.0.dist-info/entry_points.txt it is my-eyes."""
     folder = file.parent.name.removesuffix(".dist-info").removesuffix(".egg-info")
@@ -146,6 +159,8 @@ def _name_package(file: Path) -> str:
 
 def _read_file(file: Path) -> Iterator[EntryPoint]:
     try:
+        if not file.is_file():
+            return
         with file.open("rb") as opened:
             text = opened.read(_MAX_BYTES).decode("utf-8", "replace")
     except OSError as error:  # most distributions declare nothing

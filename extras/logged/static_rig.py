@@ -141,11 +141,15 @@ def read_static_transforms(file: Path) -> dict[str, Transform]:
             continue
         with guard_untrusted(UnusableMessage, sanitize_text(message.topic.name)):
             for each in _TRANSFORMS[message.topic.kind](message.data):
+                if each.child in moving:
+                    continue
                 before = found.setdefault(each.child, each)
+                if len(found) > _MOST_FRAMES:
+                    raise UnusableMessage(f"a log must have at most {_MOST_FRAMES} coordinate frames")
+                if before is each or before == each:
+                    continue
                 if before.parent != each.parent or np.abs(before.matrix - each.matrix).max() > _SAME:
                     moving.add(each.child)
-        if len(found) > _MOST_FRAMES:
-            raise UnusableMessage(f"a log must have at most {_MOST_FRAMES} coordinate frames")
     return {child: each for child, each in found.items() if child not in moving}
 
 

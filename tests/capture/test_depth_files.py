@@ -204,3 +204,46 @@ def test_a_list_that_is_none_is_named(tmp_path, text, why):
     (tmp_path / "s/intrinsic/intrinsic_depth.txt").write_text("1 2\n3\n")
     with pytest.raises(RgbdFolderError, match="matrix of 3 or 4 rows"):
         find_rgbd_folder(tmp_path / "s")
+
+
+def write_lists(folder: Path, rgb: str, depth: str) -> Path:
+    (folder / "rgb").mkdir()
+    (folder / "rgb.txt").write_text(rgb)
+    (folder / "depth.txt").write_text(depth)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "line", ["1 .", "1 ./.", "1 ../a.png", "1 /a.png", "1 rgb/a\0.png", "nan rgb/a.png", "1e300 rgb/a.png"]
+)
+def test_a_list_of_files_leads_nowhere_else(tmp_path, line):
+    with pytest.raises(RgbdFolderError, match="line 1"):
+        find_rgbd_folder(write_lists(tmp_path, f"{line}\n", "1 depth/a.png\n"))
+
+
+def test_long_lists_are_associated_in_the_time_of_sorting(tmp_path):
+    count = 100_000
+    rgb = "".join(f"{i} rgb/{i}.png\n" for i in range(count))
+    depth = "".join(f"{i + 0.01:.2f} depth/{i}.png\n" for i in reversed(range(count)))
+    found = find_rgbd_folder(write_lists(tmp_path, rgb, depth))
+    assert found is not None and len(found.depth_of) == count
+    assert found.depth_of["77.png"] == tmp_path / "depth" / "77.png"
+
+
+def test_a_header_of_npy_that_python_cannot_parse_is_no_lack_of_memory(tmp_path):
+    header = b"-" * 9000 + b"1\n"
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header)
+    with pytest.raises(UnusableImage, match="no array of NumPy"):
+        read_depth_file(path)
+
+
+def test_blocks_of_an_exr_file_are_no_more_than_the_file():
+    whole = exr(np.full((64, 8), 2.0, np.float32), compression=0)
+    at = len(whole) - sum(8 + 8 * 4 for _ in range(64))  # lines, not compressed
+    first = at - 8 * 64
+    offsets = struct.unpack_from("<64Q", whole, first)
+    shared = whole[:first] + struct.pack("<64Q", *offsets[:1] * 64) + whole[at : at + 40]
+    assert decode_exr(whole).shape == (64, 8)
+    with pytest.raises(UnusableImage, match="blocks overlap"):
+        decode_exr(shared)

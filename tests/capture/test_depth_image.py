@@ -85,7 +85,9 @@ def test_noise_grows_with_the_square_of_the_depth():
         (lambda: make_depth_image(STEPS, confidence=np.zeros((2, 2), np.uint8)), r"must be \(3, 4\) uint8"),
         (lambda: make_depth_image(STEPS, noise="sonar"), "must be one of stereo"),
         (lambda: DepthNoise(-1.0, 0.0), "a_m"),
-        (lambda: DepthNoise(0.0, 0.0), "above 0"),
+        (lambda: DepthNoise(0.0, 0.0), "above 1 nm"),
+        (lambda: DepthNoise(0.0, 1e-320), "above 1 nm"),
+        (lambda: make_depth_image(np.ones((3, 8), np.uint16), intrinsics=LENS), "shape of its lens, 8 x 6; got 8 x 3"),
         (lambda: DepthNoise(0.1, float("nan")), "b_per_m"),
     ],
 )
@@ -119,7 +121,7 @@ def test_a_message_without_one_is_that_of_a_splatnode_that_knows_none():
 def test_an_aligned_one_has_the_shape_of_its_image():
     with pytest.raises(ValueError, match=r"shape of its image, 8 x 6; got 8 x 3.*give the lens"):
         frame(make_depth_image(np.ones((3, 8), np.uint16)))
-    assert frame(make_depth_image(np.ones((3, 8), np.uint16), intrinsics=LENS)).depth is not None
+    assert frame(make_depth_image(np.ones((3, 8), np.uint16), intrinsics=LENS.resized(8, 3))).depth is not None
 
 
 def test_arrays_that_are_no_depth_image_are_refused():

@@ -9,8 +9,9 @@ import pytest
 from splatnode.capture.frame import Frame, rename_frame
 from splatnode.capture.messaging.messages import FrameHeader, encode_frame
 from splatnode.capture.messaging.wire import Numbering, decode
-from splatnode.capture.odometry import LARGEST_M, make_given_pose
+from splatnode.capture.odometry import LARGEST_M, GivenPose, make_given_pose
 from splatnode.capture.recording import INDEX, Recorder, read
+from splatnode.capture.rig import RigCamera
 from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
 
 MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
@@ -34,9 +35,9 @@ def test_a_pose_is_its_matrix_and_how_unsure_it_is():
         (MOVED[:3], (0.01, 2.0), r"\(4, 4\), got \(3, 4\)"),
         (MOVED * np.nan, (0.01, 2.0), "finite"),
         (MOVED + 2 * LARGEST_M * (np.arange(16).reshape(4, 4) == 3), (0.01, 2.0), "within 1e"),
-        (MOVED, (0.0, 2.0), "above 0"),
+        (MOVED, (0.0, 2.0), "1e-09 or more"),
         (MOVED, (0.01, 181.0), "180 degrees"),
-        (MOVED, (float("inf"), 2.0), "finite"),
+        (MOVED, (float("inf"), 2.0), "up to 1e"),
     ],
 )
 def test_what_is_no_pose_is_refused(T, sigmas, said):
@@ -64,3 +65,11 @@ def test_recordings_and_checkpoints_keep_it(tmp_path, pose):
     path = tmp_path / file_name(3)
     write_frame(path, ("0" * 32, 0), frame(pose))
     assert read_frame(path).frame.given_pose == pose
+
+
+@pytest.mark.parametrize("sigmas", [(1e-320, 1.0), (1.0, 1e-320), (0.0, 1.0)])
+def test_sigmas_whose_weights_would_overflow_are_refused(sigmas):
+    with pytest.raises(ValueError, match="1e-09 or more"):
+        GivenPose(tuple(np.eye(4).ravel().tolist()), *sigmas)
+    with pytest.raises(ValueError, match="1e-09 or more"):
+        RigCamera("left", None, *sigmas)

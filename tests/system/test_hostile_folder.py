@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from splatnode.extras.jobs.child import Child, Limits, wait_for_end
 from splatnode.extras.jobs.version import own_version
 from splatnode.viewer.probe import probe_window
 from splatnode.viewer.splash import splash
+from tests.conftest import ROOT
 from tests.support.hostile_folder import make_hostile, program, variables
 
 
@@ -60,3 +62,16 @@ def test_looking_for_a_window_runs_none(trace):
     with splash():
         assert probe_window().detail
     assert not trace.exists()
+
+
+@pytest.mark.parametrize("entries", [":", "ROOT:", ":ROOT", "ROOT:.:"])
+def test_the_current_folder_on_the_path_of_modules_runs_none(tmp_path, entries):
+    """As `export PYTHONPATH=/my/packages:$PYTHONPATH` leaves it; sitecustomize is Python's own, before any program."""
+    for name in ("yaml", "numpy", "msgspec", "evil"):
+        (tmp_path / f"{name}.py").write_text("import sys; print('EXECUTED', file=sys.stderr)\n")
+    (tmp_path / "x.dist-info").mkdir()
+    (tmp_path / "x.dist-info" / "entry_points.txt").write_text("[splatnode.recordings]\nz = evil\n")
+    env = {**os.environ, "PYTHONPATH": entries.replace("ROOT", str(ROOT))}
+    command = [sys.executable, "-m", "splatnode", "replay", ".", "--out", "out"]
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert "no photographs in '.'" in done.stderr and "EXECUTED" not in done.stderr, done.stderr

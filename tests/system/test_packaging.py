@@ -56,7 +56,7 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     assert not [name for name in names if not name.startswith(("splatnode/", "splatnode-"))]
     (told,) = [name for name in names if name.endswith(".dist-info/entry_points.txt")]
     metadata = read_groups(zipfile.ZipFile(wheel).read(told).decode())
-    assert metadata.pop("console_scripts") == {"splatnode": "splatnode.command_line:main"}
+    assert metadata.pop("console_scripts") == {"splatnode": "splatnode.__main__:main"}
     assert metadata == read_groups((ROOT / "extras" / "entry_points.txt").read_text())
     assert "splatnode/extras/entry_points.txt" in names
 

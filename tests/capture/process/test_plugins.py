@@ -141,3 +141,14 @@ def test_without_the_room_the_core_runs_and_offers_what_it_has(tmp_path):
     assert "mcap" not in splatnode("view", "--help", path=copy, cwd=tmp_path).stdout
     done = splatnode("bench", path=copy, cwd=tmp_path)
     assert done.returncode == 2 and "invalid choice: 'bench'" in done.stderr
+
+
+@pytest.mark.parametrize("entry", ["", ".", "sub", "HERE"])
+def test_a_folder_of_data_plugs_nothing_in(tmp_path, monkeypatch, entry):
+    """As where $PYTHONPATH ends with a colon: the current folder is on the path, or a relative one."""
+    for place in (tmp_path, tmp_path / "sub"):
+        (place / "x.dist-info").mkdir(parents=True)
+        (place / "x.dist-info" / "entry_points.txt").write_text("[splatnode.recordings]\nstranger = evil\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path) if entry == "HERE" else entry])
+    assert "stranger" not in plugins.entry_points("splatnode.recordings")
