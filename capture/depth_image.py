@@ -174,13 +174,21 @@ def make_depth_image(
         if array.size and int(array.max()) > 65_535:
             raise ValueError(f"a depth image of whole numbers must be within 65535, got {int(array.max())}")
         array = array.astype(np.uint16)
-    kept = np.ascontiguousarray(array, np.uint16) if whole else np.ascontiguousarray(array, np.float32)
+    with np.errstate(over="ignore"):
+        kept = np.ascontiguousarray(array, np.uint16) if whole else np.ascontiguousarray(array, np.float32)
     matrix = np.eye(4) if T_camera_depth is None else np.asarray(T_camera_depth, np.float64)
     if matrix.shape != (4, 4):
         raise ValueError(f"T_camera_depth must be (4, 4), got {matrix.shape}")
     model = find_noise(noise) if isinstance(noise, str) else noise
     unit = unit_m if unit_m is not None else (MILLIMETRE if whole else 1.0)
-    return DepthImage(kept, float(unit), intrinsics, tuple(matrix.ravel().tolist()), model, confidence)
+    return DepthImage(_clear_unknown(kept), float(unit), intrinsics, tuple(matrix.ravel().tolist()), model, confidence)
+
+
+def _clear_unknown(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The values with 0 in place of what is no number or has no end."""
+    if values.dtype.kind != "f" or np.isfinite(values).all():
+        return values
+    return np.where(np.isfinite(values), values, values.dtype.type(0))
 
 
 # What a depth image is beside its arrays, in messages, checkpoints and recordings alike.
@@ -222,4 +230,6 @@ def read_depth(meta: DepthMeta, arrays: list[npt.NDArray[Any]]) -> DepthImage:
     if len(arrays) != meta.num_arrays:
         raise ValueError(f"a depth image must have {meta.num_arrays} arrays, got {len(arrays)}")
     confidence = arrays[1] if meta.has_confidence else None
-    return DepthImage(arrays[0], meta.unit_m, meta.intrinsics, meta.T_camera_depth, meta.noise, confidence)
+    return DepthImage(
+        _clear_unknown(arrays[0]), meta.unit_m, meta.intrinsics, meta.T_camera_depth, meta.noise, confidence
+    )

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 import zmq
 
-from splatnode.capture.depth_image import NOISES, DepthImage, DepthNoise, make_depth_image
+from splatnode.capture.depth_image import (
+    NOISES,
+    DepthImage,
+    DepthNoise,
+    depth_arrays,
+    describe_depth,
+    make_depth_image,
+    read_depth,
+)
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lenses.undistort import undistort_frame
@@ -148,3 +156,10 @@ def test_a_straightened_frame_keeps_the_pixels_of_its_depth_and_tells_their_lens
     assert straight is DEPTHS["millimetres"], "a pinhole's frame is not resampled"
     beside = undistort_frame(replace(frame(DEPTHS["beside"]), intrinsics=bent)).depth
     assert beside is DEPTHS["beside"], "a depth camera of its own lens keeps it"
+
+
+def test_what_is_no_number_is_unknown_whoever_sends_it():
+    values = np.array([[np.nan, np.inf, -np.inf, 2.0]], np.float32)
+    sent = DepthImage(values, 1.0)
+    for found in (make_depth_image(values), read_depth(describe_depth(sent), depth_arrays(sent))):
+        assert found.values.tolist() == [[0.0, 0.0, 0.0, 2.0]] and found.values.dtype == np.float32

@@ -33,7 +33,7 @@ def apart(first, last) -> float:
 
 def test_keyframes_with_motions_give_metres_and_up_also_after_a_restart(config, peer):  # noqa: F811
     frames = frames_with_odometry()
-    node = changed(config, map=FreeSpace(live=True))
+    node = changed(config, occupancy=FreeSpace(live=True))
     with running(node), splatnode.connect(config.network.directory) as connection:
         for frame in frames:
             peer.server.offer(frame)

@@ -74,12 +74,21 @@ def image_row(rng: random.Random) -> Row:
 
 
 def frame_rows(rng: random.Random, header: Any) -> list[Row]:
-    """The image of a frame, and its right image where the header tells of one; now and then others."""
+    """The image of a frame, its right and depth images where the header tells of these; now and then others."""
     if rng.random() < 0.3:
         return [image_row(rng)]
-    image = "u1", [12, 16, 3], rng.randbytes(576)
-    has_right = isinstance(header, dict) and header.get("baseline") is not None
-    return [image, ("u1", [12, 16], rng.randbytes(192))] if has_right else [image]
+    told = header if isinstance(header, dict) else {}
+    rows: list[Row] = [("u1", [12, 16, 3], rng.randbytes(576))]
+    if told.get("baseline") is not None:
+        rows.append(("u1", [12, 16], rng.randbytes(192)))
+    if isinstance(depth := told.get("depth"), dict):
+        kind = rng.choice(
+            (("u2", rng.randbytes(384)), ("f4", np.full(192, rng.choice((0.0, 1.0, np.nan)), "<f4").tobytes()))
+        )
+        rows.append((kind[0], [12, 16], kind[1]))
+        if depth.get("has_confidence") is True:
+            rows.append(("u1", [12, 16], rng.randbytes(192)))
+    return rows
 
 
 def bytes_row(data: bytes) -> Row:

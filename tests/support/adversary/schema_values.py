@@ -18,6 +18,8 @@ _USUAL: dict[str, tuple[Any, ...]] = {
     "T_world_map": (_IDENTITY,),
     "T_previous_current": (_IDENTITY,),
     "T_start_current": (_IDENTITY,),
+    "T_camera_depth": (_IDENTITY,),
+    **dict.fromkeys(("a_m", "b_per_m", "scale_sigma"), (0.01,)),
     "chain": ("a.png",),
     "K": ([20.0, 0.0, 8.0, 0.0, 20.0, 6.0, 0.0, 0.0, 1.0],),
     **dict.fromkeys(("sigma_m", "sigma_deg", "time_s"), (0.01,)),
