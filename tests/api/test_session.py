@@ -149,7 +149,7 @@ def test_what_is_no_pose_is_said_and_the_photograph_can_come_again(arrays):
             ({"pose": np.eye(3)}, TypeError, r"a pose must be T_world_camera \(4, 4\) or None, got shape \(3, 3\)"),
             ({"pose": np.diag([1.0, 1, -1, 1])}, ValueError, "a given pose must be a rigid motion"),
             ({"pose": np.eye(4), "pose_sigma": 0.1}, TypeError, "pose_sigma must be metres and degrees"),
-            ({"pose": np.eye(4), "pose_sigma": (0.0, 1.0)}, ValueError, "sigmas of a given pose must be above 0"),
+            ({"pose": np.eye(4), "pose_sigma": (0.0, 1.0)}, ValueError, "sigmas of a given pose must be 1e-09 or more"),
             ({"pose_sigma": (0.1, 1.0)}, ValueError, "give pose, too"),
         ):
             with pytest.raises(kind, match=why):

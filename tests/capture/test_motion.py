@@ -51,7 +51,7 @@ def test_steps_add_up_and_what_they_are_unsure_by_squares():
         (lambda: MOTION.append_step(STEP, 0.0, 1.0), "sigmas of a step must be above 0"),
         (lambda: Gravity((0.0, 0.0, 0.0)), "not zero"),
         (lambda: Gravity((float("nan"), 0.0, 1.0)), "a direction of three numbers"),
-        (lambda: Gravity((0.0, 0.0, 1.0), 0.0), "sigma of gravity must be above 0"),
+        (lambda: Gravity((0.0, 0.0, 1.0), 0.0), "sigma of gravity must be 1e-09 or more"),
     ],
 )
 def test_what_is_none_is_refused(made, said):
