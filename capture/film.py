@@ -115,11 +115,17 @@ def camera(path: Path) -> tuple[str, dict[str, Any]]:
 
     Raises ValueError for a part of a video that is no range of seconds.
     """
+    kind, _, told = _find_camera(path)
+    return kind, told
+
+
+def _find_camera(path: Path) -> tuple[str, Any, dict[str, Any]]:
+    """As `camera`, with the module between."""
     file, part = file_and_part(path)
     if (found := find_reader(file)) is not None:
         kind, reader = found
-        return kind, reader.configure_part(file, part)
-    return "video", {"file": file, **(_parse_seconds(file, part) if part else {})}
+        return kind, reader, reader.configure_part(file, part)
+    return "video", video, {"file": file, **(_parse_seconds(file, part) if part else {})}
 
 
 def _parse_seconds(file: Path, part: str) -> dict[str, float]:
@@ -138,7 +144,5 @@ def _parse_seconds(file: Path, part: str) -> dict[str, float]:
 
 def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
     """Its frames. Raises FileNotFoundError, or ValueError where they cannot be had."""
-    _, told = camera(path)
-    found = find_reader(file_and_part(path)[0])
-    reader = video if found is None else found[1]
-    return reader.stream(reader.Config(**told))
+    _, module, told = _find_camera(path)
+    return module.stream(module.Config(**told))

@@ -17,7 +17,7 @@ import msgspec
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.pose_files import binary_images, text_images
 from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
-from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.files import read_bounded, read_text
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 
@@ -162,12 +162,7 @@ def read_lenses(path: Path) -> Lenses:
     if path.is_dir():
         path = path / "cameras.txt"
     shown = sanitize_text(str(path))
-    try:
-        text = read_bounded(path, MAX_BYTES, UnusableLens, shown).decode("utf-8-sig")
-    except OSError as error:
-        raise UnusableLens(f"{shown}: {error.strerror}; give a file with {_READ}") from error
-    except UnicodeDecodeError as error:
-        raise UnusableLens(f"{shown} is no text; it must give {_READ}") from error
+    text = read_text(path, MAX_BYTES, UnusableLens, shown, _READ)
     with guard_untrusted(UnusableLens, shown):
         return _parse(path, shown, text)
 

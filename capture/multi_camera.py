@@ -70,16 +70,6 @@ class CameraSet:
         found = film.find_reader(min(files)) if len(files) == 1 else None
         return found and found[1].read_rig(min(files), {camera_id: part for camera_id, (_, part) in parts.items()})
 
-    def read_rig(self) -> Rig:
-        """Returns where the cameras stand to each other, as the static transforms of their one log tell.
-
-        Raises ValueError where they are of no log, or of several, and as the log's reader does.
-        """
-        rig = self.find_rig()
-        if rig is None:
-            raise ValueError("static transforms are those of one MCAP file; of other cameras, give the rig in a file")
-        return rig
-
     def form_frame_sets(self, names: Sequence[str] = ()) -> Sequence[FrameSet]:
         """Returns which photographs of folders, all or those called `names`, were taken together, in their order.
 

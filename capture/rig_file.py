@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.lens_file import read_lenses
 from splatnode.capture.process.config_text import MAX_BYTES, parse_yaml
-from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.files import read_text
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 from splatnode.capture.rig import SIGMA_DEG, SIGMA_M, Rig, RigCamera
@@ -50,12 +50,7 @@ class _File(msgspec.Struct, frozen=True):
 def read_rig(path: Path) -> Rig:
     """Returns the rig that a file gives. Raises UnusableRig."""
     shown = sanitize_text(str(path))
-    try:
-        text = read_bounded(path, MAX_BYTES, UnusableRig, shown).decode("utf-8-sig")
-    except OSError as error:
-        raise UnusableRig(f"{shown}: {error.strerror}; give a file with {_READ}") from error
-    except UnicodeDecodeError as error:
-        raise UnusableRig(f"{shown} is no text; it must give {_READ}") from error
+    text = read_text(path, MAX_BYTES, UnusableRig, shown, _READ)
     with guard_untrusted(UnusableRig, shown):
         content = parse_yaml(text, shown)  # JSON is YAML
         if isinstance(content, list):

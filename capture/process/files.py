@@ -246,6 +246,16 @@ def read_bounded(path: Path, most: int, refusal: type[Exception], source: str = 
         return file.read(size)
 
 
+def read_text(path: Path, most: int, refusal: type[Exception], source: str, wanted: str) -> str:
+    """The text of a file that must give what `wanted` says. Raises a `refusal` that begins with `source`."""
+    try:
+        return read_bounded(path, most, refusal, source).decode("utf-8-sig")
+    except OSError as error:
+        raise refusal(f"{source}: {error.strerror}; give a file with {wanted}") from error
+    except UnicodeDecodeError as error:
+        raise refusal(f"{source} is no text; it must give {wanted}") from error
+
+
 @contextlib.contextmanager
 def open_regular(path: Path, refusal: type[Exception], source: str = "") -> Iterator[BinaryIO]:
     """The file `path`, opened to be read. Raises as `read_bounded`."""

@@ -19,6 +19,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from splatnode.capture.process.files import open_regular
+from splatnode.capture.process.python import is_current_folder
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import sanitize_text
 
@@ -129,7 +131,7 @@ def _find_files(path: tuple[str, ...]) -> Iterator[Path]:
     """
     seen = {"splatnode"}
     for folder in dict.fromkeys(path):
-        if not os.path.isabs(folder) or _is_current(folder):  # whoever made its files is nobody's choice
+        if not os.path.isabs(folder) or is_current_folder(folder):  # whoever made its files is nobody's choice
             continue
         try:
             names = sorted(os.listdir(folder))
@@ -143,14 +145,6 @@ def _find_files(path: tuple[str, ...]) -> Iterator[Path]:
                 yield file
 
 
-def _is_current(folder: str) -> bool:
-    try:
-        return os.path.samefile(folder, ".")
-    except OSError as error:  # either is not there
-        raise_shortage(error)
-        return False
-
-
 def _name_package(file: Path) -> str:
     """The name of the distribution whose file this is: of my_eyes-1.0.dist-info/entry_points.txt it is my-eyes."""
     folder = file.parent.name.removesuffix(".dist-info").removesuffix(".egg-info")
@@ -159,9 +153,7 @@ def _name_package(file: Path) -> str:
 
 def _read_file(file: Path) -> Iterator[EntryPoint]:
     try:
-        if not file.is_file():
-            return
-        with file.open("rb") as opened:
+        with open_regular(file, OSError) as opened:
             text = opened.read(_MAX_BYTES).decode("utf-8", "replace")
     except OSError as error:  # most distributions declare nothing
         raise_shortage(error)

@@ -44,10 +44,11 @@ def _user_folders() -> list[str]:
     named = [*os.environ.get("PYTHONPATH", "").split(os.pathsep), site.getusersitepackages()]
     known = set(sys.path)
     found = dict.fromkeys(os.path.abspath(each) for each in named if os.path.isabs(each))
-    return [each for each in found if each in known and not _is_current(each)]
+    return [each for each in found if each in known and not is_current_folder(each)]
 
 
-def _is_current(folder: str) -> bool:
+def is_current_folder(folder: str) -> bool:
+    """Returns whether a folder is the current one, which may be anybody's."""
     try:
         return os.path.samefile(folder, os.curdir)
     except OSError:  # one of them is not there

@@ -14,13 +14,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses.lens import project, unproject
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.depth_fit import DepthView, find_depth_lens, fit_depth_images, group_by_name
-from splatnode.recon.metric.depth_smoothing import smooth_depth
 from splatnode.recon.priors.pointmap import LEAST_CONFIDENCE, Pointmap, compute_depth_normals
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 
@@ -61,13 +59,11 @@ def fill_measured_depth(
     fits = fit_depth_images(views)
     for fit in fits:
         log.log(logging.INFO if fit.is_usable else logging.WARNING, "%s", fit.check.message)
-    usable, lenses = group_by_name(fits), {view.name: view.lens for view in views}
+    usable, by_name = group_by_name(fits), {view.name: view for view in views}
     found = []
     for pointmap in pointmaps:
-        fit = usable.get(pointmap.name)
-        depth = keyframes[pointmap.name].frame.depth if fit is not None else None
-        if fit is not None and depth is not None:
-            measured = warp_depth(depth, lenses[pointmap.name], pointmap.K, pointmap.depth.shape)
+        if (fit := usable.get(pointmap.name)) is not None:
+            measured = warp_depth(by_name[pointmap.name], pointmap.K, pointmap.depth.shape)
             unit = fit.metres_per_unit
             pointmap = fuse_depth(pointmap, MeasuredDepth(measured.z / unit, measured.sigma / unit))
         found.append(pointmap)
@@ -88,11 +84,11 @@ def make_depth_view(keyframe: Keyframe, registration: Registration, camera: Regi
     return DepthView(keyframe.name, frame.camera_id, points, frame.depth, lens)
 
 
-def warp_depth(depth: DepthImage, lens: Intrinsics, K: Map, shape: tuple[int, int]) -> MeasuredDepth:
-    """The depth image as the pinhole K (3, 3) sees it, in `shape` (h, w). `lens` is of the image it is aligned with."""
-    z, sigma = smooth_depth(depth)
-    own = find_depth_lens(depth, lens)
-    T_camera_depth = depth.matrix
+def warp_depth(view: DepthView, K: Map, shape: tuple[int, int]) -> MeasuredDepth:
+    """The depth image as the pinhole K (3, 3) of its camera sees it, in `shape` (h, w)."""
+    z, sigma = view.smoothed
+    own = find_depth_lens(view.depth, view.lens)
+    T_camera_depth = view.depth.matrix
     height, width = shape
     across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(across - K[0, 2]) / K[0, 0], (down - K[1, 2]) / K[1, 1], np.ones_like(across)], -1)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,11 @@ class DepthView:
     points: Array  # (M, 3) in the camera's frame, the scene's unit
     depth: DepthImage
     lens: Intrinsics  # of the camera's image; at any size
+
+    @cached_property
+    def smoothed(self) -> tuple[Array, Array]:
+        """(H, W) z of the depth image without its noise, and its standard deviation, metres."""
+        return smooth_depth(self.depth)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,17 +132,16 @@ def find_depth_lens(depth: DepthImage, lens: Intrinsics) -> Intrinsics:
 
 def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
     names, unit = tuple(view.name for view in views), 1.0
-    step = -(-sum(len(view.points) for view in views) // _MOST_POINTS)
-    views = [replace(view, points=view.points[:: max(1, step)]) for view in views]
+    step = max(1, -(-sum(len(view.points) for view in views) // _MOST_POINTS))
     scale = max(max(view.depth.values.shape) for view in views) / REFERENCE_PX
     aside = any(view.depth.T_camera_depth[3::4][:3] != (0.0, 0.0, 0.0) for view in views)
-    maps = map_parallel(smooth_depth, [view.depth for view in views])
-    samples = _collect_samples(views, maps, unit)
+    map_parallel(lambda view: view.smoothed, views)
+    samples = _collect_samples(views, unit, step)
     for _ in range(4 if aside else 1):  # where a depth camera stands beside, its pixels depend on the unit
         ratio, _ = samples.look((0.0, 0.0), scale)
         if np.isfinite(ratio).sum() >= LEAST_POINTS:
             unit *= float(np.exp(np.nanmedian(ratio)))
-            samples = _collect_samples(views, maps, unit)
+            samples = _collect_samples(views, unit, step)
     ratio, sigma = samples.look((0.0, 0.0), scale)
     known = np.isfinite(ratio)
     if known.sum() < LEAST_POINTS:
@@ -149,18 +154,21 @@ def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
     return DepthFit(camera_id, names, unit * float(np.exp(mean)), float(np.hypot(mean_sigma, noise)), check)
 
 
-def _collect_samples(views: Sequence[DepthView], maps: list[tuple[Array, Array]], unit: float) -> _Samples:
+def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Samples:
+    """Every `step`-th point of each view."""
     view_of, pixels, log_z = [], [], []
     for number, view in enumerate(views):
         T_depth_camera = np.linalg.inv(view.depth.matrix)
-        points = unit * view.points @ T_depth_camera[:3, :3].T + T_depth_camera[:3, 3]
+        points = unit * view.points[::step] @ T_depth_camera[:3, :3].T + T_depth_camera[:3, 3]
         points = points[points[:, 2] > 0]
         seen = project(points, find_depth_lens(view.depth, view.lens)) if len(points) else np.zeros((0, 2))
         kept = np.isfinite(seen).all(1) & (np.abs(seen) < 1e6).all(1)
         view_of.append(np.full(int(kept.sum()), number))
         pixels.append(seen[kept])
         log_z.append(np.log(points[kept, 2]))
-    return _Samples(maps, np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z))
+    return _Samples(
+        [view.smoothed for view in views], np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z)
+    )
 
 
 def _average(values: Array, sigmas: Array) -> tuple[float, float]:

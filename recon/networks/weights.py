@@ -379,7 +379,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         with (
             ignore_file_warnings(),
             torch.serialization.safe_globals([argparse.Namespace]),
-            contextlib.nullcontext(path) if is_archive else _FileOfItsSize(io.FileIO(path)) as file,
+            contextlib.nullcontext(path) if is_archive else _FileOfItsSize(path) as file,
         ):
             content = torch.load(file, map_location="cpu", weights_only=True, mmap=is_archive)
     except pickle.UnpicklingError as error:
@@ -413,8 +413,12 @@ def _check_tensors(weights: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
 class _FileOfItsSize(io.BufferedReader):
     """A file that allocates no more than it holds when it is asked for more, as a pickle's lengths may ask."""
 
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
     def read(self, size: int | None = -1, /) -> bytes:
-        held = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
+        held = max(self._size - self.tell(), 0)
         return super().read(held if size is None or size < 0 else min(size, held))
 
 

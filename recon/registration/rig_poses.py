@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +40,11 @@ class RelativePoses:
     centres: Array  # (S, 3)
     covariances: Array  # (S, 6, 6) of the turn in the reference's axes, radians, and of the centre
     scatter: tuple[float, float] = (0.0, 0.0)  # variances of turn and shift of a set, which the covariances have, too
+
+    @cached_property
+    def mounts(self) -> list[list[int]]:
+        """Positions that agree on one pose, the most first; see `find_mounts`."""
+        return find_mounts(self)
 
     def select(self, positions: Sequence[int]) -> RelativePoses:
         """Returns those of some positions."""
@@ -132,7 +138,7 @@ def is_mounted(poses: RelativePoses, distance: float) -> bool:
     """
     if poses.scatter[0] > MOST_SCATTER_TURN**2 or poses.scatter[1] > (MOST_SCATTER_SHIFT * distance) ** 2:
         return False
-    parts, count = find_mounts(poses), len(poses.sets)
+    parts, count = poses.mounts, len(poses.sets)
     return len(parts[0]) > 1 and (2 * len(parts[0]) > count or _LEAST_RUN * len(parts) <= count)
 
 

@@ -136,8 +136,7 @@ def adjust_with_rig(
     if reference is None:
         return None
     mounts = {camera: poses for (first, camera), poses in measured.items() if first == reference}
-    split = {camera: rig_poses.find_mounts(poses) for camera, poses in mounts.items()}
-    split = {camera: [part for part in parts if len(part) >= _LEAST_SETS] for camera, parts in split.items()}
+    split = {c: [part for part in poses.mounts if len(part) >= _LEAST_SETS] for c, poses in mounts.items()}
     told = {c: [mounts[c].select(part).mean() for part in parts] for c, parts in split.items() if parts}
     if not told:
         return None
@@ -178,7 +177,7 @@ def _choose_reference(measured: dict[tuple[str, str], RelativePoses]) -> str | N
     """The camera that stands to the others as always in the most sets."""
     kept: dict[str, int] = {}
     for (first, _), poses in measured.items():
-        kept[first] = kept.get(first, 0) + len(rig_poses.find_mounts(poses)[0])
+        kept[first] = kept.get(first, 0) + len(poses.mounts[0])
     return min(kept, key=lambda camera: (-kept[camera], camera)) if kept else None
 
 
@@ -308,9 +307,8 @@ def _find_changes(sets: _Sets, measured: dict[tuple[str, str], RelativePoses], r
     others = sorted({camera for first, camera in measured if first == reference})
     for camera in others:
         poses = measured[reference, camera]
-        parts = rig_poses.find_mounts(poses)
-        usual = poses.select(parts[0]).mean()
-        for part in parts[1:]:
+        usual = poses.select(poses.mounts[0]).mean()
+        for part in poses.mounts[1:]:
             rotation, centre, _ = poses.select(part).mean()
             turned = np.trace(rotation @ usual[0].T)
             first = poses.sets[part[0]]

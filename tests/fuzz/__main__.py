@@ -85,15 +85,14 @@ class _Saver:
 
     def __call__(self, rows: dict[str, boundaries.Row]) -> None:
         for defect in (defect for row in rows.values() for defect in row.kept):
-            if (case := (defect.boundary, defect.number)) in self._saved:
-                continue
-            self._saved.add(case)
-            path = reproducer.save(defect, self._folder, self._commit)
-            print(
-                f"\n{defect.boundary}, case {defect.number}: {defect.problem}\n  {reproducer.REPLAY} {path}",
-                file=sys.stderr,
-                flush=True,
-            )
+            if (case := (defect.boundary, defect.number)) not in self._saved:
+                self._saved.add(case)
+                path = reproducer.save(defect, self._folder, self._commit)
+                print(f"\n{_describe(defect, path)}", file=sys.stderr, flush=True)
+
+
+def _describe(defect: reproducer.Defect, path: Path) -> str:
+    return f"{defect.boundary}, case {defect.number}: {defect.problem}\n  {reproducer.REPLAY} {path}"
 
 
 class _Progress:
@@ -122,8 +121,7 @@ def _tell(results: dict[str, dict[str, Any]], args: argparse.Namespace, interrup
         print(file=sys.stderr)
     commit = _commit()
     for defect in results.get("boundaries", {}).pop("kept", []):
-        path = reproducer.save(defect, args.defects, commit)
-        print(f"{defect.boundary}, case {defect.number}: {defect.problem}\n  {reproducer.REPLAY} {path}")
+        print(_describe(defect, reproducer.save(defect, args.defects, commit)))
     print("\n".join(table.lines(results)))
     if args.out is not None:
         told = {"command": shlex.join(["./run", "fuzz", *sys.argv[1:]]), "seed": args.seed, "commit": commit}

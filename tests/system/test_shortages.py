@@ -86,7 +86,7 @@ HARMLESS = {
         "capture/process/files.py:remove_leftovers",
         "capture/process/files.py:write_atomically",
         "capture/process/files.py:_remove_if_empty",
-        "capture/process/python.py:_is_current",
+        "capture/process/python.py:is_current_folder",
         "capture/process/terminal.py:_is_closed_pipe",
         "capture/v4l2_device.py:close",
         "extras/batch/batch.py:_is",

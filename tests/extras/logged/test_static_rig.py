@@ -61,7 +61,7 @@ def test_a_tree_of_transforms_is_a_rig(tmp_path):
         transform("odom", "base_link", (1.0, 0.0, 0.0)),
     ]
     file = mcap_files.write(tmp_path / "drive.mcap", messages)
-    rig = select_cameras([file]).read_rig()
+    rig = select_cameras([file]).find_rig()
     left, right = (rig.find_camera(camera).matrix for camera in ("left", "right"))
     np.testing.assert_allclose(left[:3, 3], [0.1, 0.06, 1.0], atol=1e-12)
     np.testing.assert_allclose(left[:3, :3] @ [0, 0, 1], [1, 0, 0], atol=1e-12)  # it looks along the robot's x
@@ -85,7 +85,7 @@ def test_what_ros_2_writes_is_read(tmp_path):
     ]
     file = mcap_files.write(tmp_path / "bag.mcap", written)
     assert set(read_static_transforms(file)) == {"a_optical", "bb_optical"}
-    assert select_cameras([file]).read_rig().find_camera("a").matrix[:3, 3].tolist() == [1.0, 2.0, 3.0]
+    assert select_cameras([file]).find_rig().find_camera("a").matrix[:3, 3].tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(UnusableMessage, match="ends within"):
         parse_tf_message(data[:60])
 
@@ -138,14 +138,14 @@ def test_foxglove_protobuf():
 def test_cameras_that_no_static_transform_places_are_named(tmp_path):
     file = mcap_files.write(tmp_path / "a.mcap", [transform("base", "left_optical"), shot("left"), shot("right")])
     with pytest.raises(ValueError, match="where the camera right stands: its images name the frame 'right_optical'"):
-        select_cameras([file]).read_rig()
+        select_cameras([file]).find_rig()
     apart = [transform("base", "left_optical"), transform("arm", "right_optical"), shot("left"), shot("right")]
     with pytest.raises(ValueError, match="cameras that move to each other"):
-        select_cameras([mcap_files.write(tmp_path / "b.mcap", apart)]).read_rig()
+        select_cameras([mcap_files.write(tmp_path / "b.mcap", apart)]).find_rig()
     circle = [transform("left_optical", "base"), transform("base", "left_optical"), shot("left"), shot("right")]
     with pytest.raises(ValueError, match="must be a tree"):
-        select_cameras([mcap_files.write(tmp_path / "c.mcap", circle)]).read_rig()
+        select_cameras([mcap_files.write(tmp_path / "c.mcap", circle)]).find_rig()
     wrong = [transform("base", "left_optical", turn=(0.0, 0.0, 0.0, 0.0)), shot("left"), shot("right")]
     wrong += [transform("base", "left_optical", turn=(0.0, 0.0, 0.0, 0.0))]
     with pytest.raises(UnusableMessage, match="no rigid motion"):
-        select_cameras([mcap_files.write(tmp_path / "d.mcap", wrong)]).read_rig()
+        select_cameras([mcap_files.write(tmp_path / "d.mcap", wrong)]).find_rig()

@@ -120,7 +120,7 @@ def test_a_depth_camera_beside_the_colour_camera_with_its_own_lens():
         measured = measure(z, DepthCamera(), index)
         beside = make_depth_image(measured.values, intrinsics=lens, T_camera_depth=T_camera_depth)
         found.append(replace(view, depth=beside))
-        shown = warp_depth(beside, view.lens, view.lens.K, (240, 320))
+        shown = warp_depth(replace(view, depth=beside), view.lens.K, (240, 320))
         true = synthetic.depth(place, index)
         known = shown.z > 0
         assert known.mean() > 0.6

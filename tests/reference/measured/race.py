@@ -57,13 +57,17 @@ def _losses() -> str:
     whole, shown = ([compute_margins(ends(), measure) for measure in measures] for measures in (WHOLE, SHOWN))
     lost = [_lost(each, digits) for each, digits in zip(whole, DIGITS, strict=True)]
     means, seen = _leads(whole), _leads(shown)
-    refused = len({(row.scene, row.views) for row in ends() if row.method == OURS and row.psnr is None})
+    refused = _count_refused()
     return (
         f"**What is lost.** `{OURS}` refuses {refused} of {len(whole[0]) + refused} sets. On the other "
         f"{len(whole[0])} it is behind the best other recipe of each set in PSNR in {lost[0]}, in SSIM in {lost[1]}, "
         f"in LPIPS in {lost[2]}. Its mean lead is {means[0]} dB, {means[1]} SSIM and {means[2]} LPIPS (positive is "
         f"better); on pixels that a training view shows {seen[0]} dB, {seen[1]} and {seen[2]}."
     )
+
+
+def _count_refused() -> int:
+    return len({(row.scene, row.views) for row in ends() if row.method == OURS and row.psnr is None})
 
 
 def _certainty() -> str:
@@ -229,14 +233,13 @@ def headlines() -> list[tuple[str, str, str]]:
     """The rows of README's table: of the default, and of `quality`; all measures, and the sets that were refused."""
     default, quality = ([compute_margins(ends(), measure, method) for measure in WHOLE] for method in (OURS, "quality"))
     beside, (low, high) = _beside(), _resample()[1]
-    refused = len({(row.scene, row.views) for row in ends() if row.method == OURS and row.psnr is None})
     more = beside["quality"][0]
     return [
         (
             f"held-out PSNR, SSIM, LPIPS on {len(default[0])} sets, partly of scenes that presets were chosen on: mean "
             "lead over the best of up to five other recipes\\* in each",
             f"{_three(default)} (PSNR {low} to {high} by scenes), with a {beside[LARGEST][0].size:.0f}th of "
-            f"InstantSplat-XL's Gaussians; {refused} more sets refused",
+            f"InstantSplat-XL's Gaussians; {_count_refused()} more sets refused",
             f"better in {_behinds(default)}",
         ),
         (
