@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 
 from splatnode.capture import daemon
-from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live
+from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live, mount_camera
 from splatnode.capture.daemon import last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
@@ -60,7 +60,8 @@ def record(args: argparse.Namespace) -> int:
     config = _config(args)
     with Recorder(args.out) as recorder:
         camera = config.camera
-        with Reader(camera_opener(camera), is_live(camera), config.reader) as reader, show_progress() as tell:
+        opened = mount_camera(camera_opener(camera), config.T_base_camera)
+        with Reader(opened, is_live(camera), config.reader) as reader, show_progress() as tell:
             try:
                 for item in report_items(_read_until(reader, args.seconds), tell, "recording", 0, "frame"):
                     recorder.write(item)

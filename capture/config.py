@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import msgspec
 import numpy as np
@@ -19,6 +19,7 @@ from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.network import CaptureId, Network
 from splatnode.capture.messaging.wire import Header, Message, Name, Numbering, Sequential, Text, WireError
+from splatnode.capture.odometry import rigid_problem
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
@@ -72,6 +73,33 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
     return decode_jpeg(message.arrays[0], _LARGEST_SIDE)
 
 
+# Where a camera stands on the robot's base.
+
+Row: TypeAlias = tuple[float, float, float, float]
+Mount: TypeAlias = tuple[Row, Row, Row, Row]
+
+
+def check_mount(T_base_camera: Mount | None) -> None:
+    """Raises ValueError where the matrix is no rigid motion in metres."""
+    if T_base_camera is not None and (problem := rigid_problem([number for row in T_base_camera for number in row])):
+        raise ValueError(f"T_base_camera must be {problem}")
+
+
+def mount_camera(
+    opened: Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]], T_base_camera: Mount | None
+) -> Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]]:
+    """The camera, whose frames tell where it stands on the base; as it is where nobody knows."""
+    if T_base_camera is None:
+        return opened
+    numbers = tuple(number for row in T_base_camera for number in row)
+
+    def stream() -> Iterator[Frame | DroppedFrame | KeepAlive]:
+        for item in opened():
+            yield replace(item, T_base_camera=numbers) if isinstance(item, Frame) else item
+
+    return stream
+
+
 class Camera(Plugin):
     """The source of frames: a module of capture/cameras, or one that is installed beside it."""
 
@@ -89,6 +117,10 @@ class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spool: spool.SpoolConfig = spool.SpoolConfig()
     network: Network = Network()
     camera_id: CaptureId = ""
+    T_base_camera: Mount | None = None
+
+    def __post_init__(self) -> None:
+        check_mount(self.T_base_camera)
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -108,6 +140,12 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of this capture, where several run beside one recon: letters, digits, - and _. Frames of several that were taken
     # at one time form a frame set
     camera_id: CaptureId = ""
+    # Where the camera stands on the robot's base: four rows of four numbers, metres; p_base = T_base_camera @ p_camera.
+    # Camera: x right, y down, z forward. Base: x forward, y left, z up. Recon's metric.frame: base needs it
+    T_base_camera: Mount | None = None
+
+    def __post_init__(self) -> None:
+        check_mount(self.T_base_camera)
 
 
 def camera_opener(

@@ -15,7 +15,7 @@ from typing import Annotated, Protocol
 import cv2
 import msgspec
 
-from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live, name_camera
+from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live, mount_camera, name_camera
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.keyframe_selection import Decision, Selector
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
@@ -122,7 +122,8 @@ def capture(config: CaptureConfig) -> None:
         )
         session = CaptureSession(config, server, resources)
         camera = config.camera
-        opened = name_camera(camera_opener(camera, config.body_mask), config.camera_id)
+        opened = mount_camera(camera_opener(camera, config.body_mask), config.T_base_camera)
+        opened = name_camera(opened, config.camera_id)
         reader = resources.enter_context(Reader(opened, is_live(camera), config.reader))
         resources.callback(manager.stopping)
         begin_run(config.network, config.camera_id)

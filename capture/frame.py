@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.odometry import GivenPose, Gravity, Motion, rigid_problem
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 
 if TYPE_CHECKING:
@@ -270,6 +270,8 @@ class Frame:
     camera: str = ""  # make, model and lens, as EXIF tells: different ones share no lens; empty: unknown
     camera_id: str = ""  # of several cameras, which one: what a robot or a folder calls it; empty: there is one
     depth: DepthImage | None = field(default=None, repr=False)  # of a depth camera beside its camera; None: none
+    # T_base_camera of its camera on the robot's base (x forward, y left, z up), metres, row by row; None: nobody knows
+    T_base_camera: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         for text in ("name", "camera", "camera_id"):
@@ -286,11 +288,18 @@ class Frame:
             raise ValueError(f"the right image must be {self.image.shape[:2]}, got {self.right.image.shape}")
         if self.depth is not None:
             self.depth.check_beside(self.width, self.height)
+        if self.T_base_camera is not None and (problem := rigid_problem(self.T_base_camera)):
+            raise ValueError(f"T_base_camera must be {problem}")
         if not self.name:
             raise ValueError("a frame must have a name")
         for what, number in (("frame_id", self.frame_id), ("stamp_ns", self.stamp_ns)):
             if not 0 <= number <= LARGEST_NUMBER:
                 raise ValueError(f"{what} must be 0 to 2**62, got {number}")
+
+    @property
+    def mount(self) -> npt.NDArray[np.float64] | None:
+        """T_base_camera (4, 4); None where nobody knows it."""
+        return None if self.T_base_camera is None else np.array(self.T_base_camera, np.float64).reshape(4, 4)
 
     @property
     def height(self) -> int:

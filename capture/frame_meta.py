@@ -40,6 +40,7 @@ class FrameMeta(msgspec.Struct, frozen=True, kw_only=True):
     exposure: ExposureSettings | UnsetType = UNSET
     camera: _Name | UnsetType = UNSET
     camera_id: _Name | UnsetType = UNSET
+    T_base_camera: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)] | UnsetType = UNSET
 
 
 def describe_frame(frame: Frame) -> dict[str, Any]:
@@ -55,6 +56,7 @@ def describe_frame(frame: Frame) -> dict[str, Any]:
         "exposure": make_optional_field(frame.exposure),
         "camera": frame.camera or UNSET,
         "camera_id": frame.camera_id or UNSET,
+        "T_base_camera": make_optional_field(frame.T_base_camera),
     }
 
 
@@ -69,4 +71,5 @@ def read_frame_fields(meta: FrameMeta) -> dict[str, Any]:
         "exposure": read_optional_field(meta.exposure),
         "camera": read_optional_field(meta.camera) or "",
         "camera_id": read_optional_field(meta.camera_id) or "",
+        "T_base_camera": read_optional_field(meta.T_base_camera),
     }

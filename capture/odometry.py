@@ -63,6 +63,14 @@ def rigid_problem(numbers: Sequence[float]) -> str:
     return ""
 
 
+def make_rigid(T: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The rigid motion (4, 4) nearest to one whose rotation is not exact, as people and files round it."""
+    left, _, right = np.linalg.svd(T[:3, :3])
+    exact = np.eye(4)
+    exact[:3, :3], exact[:3, 3] = left @ right, T[:3, 3]
+    return exact
+
+
 def are_rigid(matrices: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """(N,): of which of the (N, 4, 4), metres, `rigid_problem` has surely nothing to say; quickly, of many at once."""
     flat = matrices.reshape(-1, 16)

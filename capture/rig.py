@@ -49,14 +49,29 @@ class RigCamera:
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras whose relative poses do not change. Raises ValueError for fewer than two, or two of one camera id."""
+    """Cameras whose relative poses do not change.
+
+    Raises ValueError for fewer than two, unless its frame is the robot's base, and for two of one camera id.
+    """
 
     cameras: tuple[RigCamera, ...]
+    is_base: bool = False  # its frame is the robot's base (x forward, y left, z up): T_rig_camera is T_base_camera
 
     def __post_init__(self) -> None:
         ids = [camera.camera_id for camera in self.cameras]
-        if len(ids) < 2 or len(set(ids)) != len(ids):
-            raise ValueError(f"a rig must have two cameras or more, each with its own camera id; got {ids}")
+        if len(ids) < (1 if self.is_base else 2) or len(set(ids)) != len(ids):
+            raise ValueError(
+                f"a rig must have two cameras or more, each with its own camera id; got {ids}. A single camera is one "
+                "by its T_base_camera alone"
+            )
+
+    def find_mount(self, camera_id: str) -> tuple[float, ...] | None:
+        """Returns T_base_camera of a camera, of images that name none that of the only one; None where not told."""
+        if not self.is_base:
+            return None
+        single = self.cameras[0] if len(self.cameras) == 1 and not camera_id else None
+        found = single or self.find_camera(camera_id)
+        return None if found is None else found.T_rig_camera
 
     def find_camera(self, camera_id: str) -> RigCamera | None:
         """Returns the camera with this id; None where the rig has none."""

@@ -7,6 +7,8 @@ Sources of the formats: COLMAP's page on rigs, Kalibr's wiki on its YAML formats
       left: {T_rig_camera: [...], sigma_m: 0.002, sigma_deg: 0.1}
 
 Lengths are metres, cameras look along z, x right, y down. Of a camera without T_rig_camera nobody knows where it is.
+With T_base_camera in place of T_rig_camera the rig's frame is the robot's base: x forward, y left, z up. One camera is
+enough then.
 """
 
 from __future__ import annotations
@@ -38,6 +40,7 @@ class UnusableRig(ValueError):
 
 class _Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     T_rig_camera: tuple[tuple[float, ...], ...] | None = None
+    T_base_camera: tuple[tuple[float, ...], ...] | None = None
     sigma_m: float = SIGMA_M
     sigma_deg: float = SIGMA_DEG
     metric: bool = True
@@ -67,12 +70,17 @@ def _parse_own(shown: str, content: Mapping[str, Any]) -> Rig:
         cameras = record_of(content, _File).cameras
         if any(not camera.metric and camera.T_rig_camera is not None for camera in cameras.values()):
             raise ValueError("it has no metres: its scene had none. Measure it, or leave T_rig_camera out")
-        return Rig(
-            tuple(
-                RigCamera(name, _flatten(camera.T_rig_camera), camera.sigma_m, camera.sigma_deg)
-                for name, camera in cameras.items()
+        on_base = [name for name, camera in cameras.items() if camera.T_base_camera is not None]
+        on_rig = [name for name, camera in cameras.items() if camera.T_rig_camera is not None]
+        if on_base and on_rig:
+            raise ValueError(
+                f"{sanitize_text(on_base[0], LONGEST_NAME)} has T_base_camera and "
+                f"{sanitize_text(on_rig[0], LONGEST_NAME)} T_rig_camera: give all cameras the one or the other"
             )
-        )
+        known = {name: each.T_base_camera or each.T_rig_camera for name, each in cameras.items()}
+        found = tuple(RigCamera(name, _flatten(known[name]), each.sigma_m, each.sigma_deg)
+                      for name, each in cameras.items())  # fmt: skip
+        return Rig(found, is_base=bool(on_base))
     except (ValueError, msgspec.ValidationError) as error:
         raise UnusableRig(f"{shown}: {error}") from error
 

@@ -53,7 +53,7 @@ def choose_camera(raw: Mapping[str, Any], camera_id: str) -> dict[str, Any]:
         raise ConfigError(f"--camera-id: expected one of {', '.join(known)}, got {sanitize_text(camera_id, 60)!r}")
     rest = {key: value for key, value in raw.items() if key != "cameras"}
     camera = dict(raw["cameras"][camera_id])
-    own = {"body_mask": camera.pop("body_mask")} if "body_mask" in camera else {}
+    own = {key: camera.pop(key) for key in ("body_mask", "T_base_camera") if key in camera}
     return {**rest, **own, "camera": camera, "camera_id": camera_id}
 
 

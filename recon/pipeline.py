@@ -31,6 +31,7 @@ from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.reference_frame import check_frame
 from splatnode.recon.modelling import (
     create_coarse_preview,
     create_initial_scene,
@@ -251,10 +252,12 @@ def reconstruct_source(
     `given` is what is known of metres beside the photographs. `without_guesses` leaves out what no two photographs
     confirm. `show` gets every snapshot, and `tell` hears what is being done. The work takes `most_threads` threads at
     most; None: as many as the process may use.
-    Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
+    Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used, and UnknownFrame
+    where nothing can tell the frame of reference that is asked for.
     """
     with threads.apply_thread_limit(most_threads):
         evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
+        check_frame(config.metric, evidence)
         snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)
     snapshot = _add_given_lenses(snapshot, source.frames)
     if without_guesses:

@@ -19,7 +19,7 @@ from splatnode.capture.process.arguments import (
     positive,
     seconds,
 )
-from splatnode.recon.metric.arguments import add_baseline, add_marker, add_poses, add_stereo
+from splatnode.recon.metric.arguments import add_baseline, add_frame, add_marker, add_poses, add_stereo
 from splatnode.recon.shared_arguments import add_device, add_multi_view_only
 
 
@@ -116,6 +116,7 @@ def add_reconstruction_options(parser: argparse.ArgumentParser) -> tuple[argpars
             "bound)",
         ),
         add_marker(parser),
+        *add_frame(parser),
         add("--max-gaussians", type=positive, metavar="N", help="the best scene with at most so many Gaussians"),
         add("--max-mb", type=megabytes, metavar="MB", help="the best scene of at most so many 10^6 bytes"),
         add("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)"),

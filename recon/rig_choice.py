@@ -31,7 +31,29 @@ def apply_rig(
     Raises as `choose_rig` and `add_rig_lenses`.
     """
     rig = choose_rig(None if file is None else Path(file), given.cameras, tell)
-    return (given, config) if rig is None else (add_rig_lenses(given, rig), hold_rig(config, rig))
+    if rig is None:
+        return given, config
+    mounted = add_mounts(given, rig)
+    return (mounted, config) if len(rig.cameras) < 2 else (add_rig_lenses(mounted, rig), hold_rig(config, rig))
+
+
+def add_mounts(given: Source, rig: Rig) -> Source:
+    """The frames with where their camera stands on the robot's base, as far as the rig tells it.
+
+    Raises ValueError where it tells it of no camera of the frames.
+    """
+    if not rig.is_base:
+        return given
+    told = {each.name: rig.find_mount(each.camera_id) for each in given.frames if isinstance(each, Frame)}
+    if told and not any(told.values()):
+        names = ", ".join(each.camera_id for each in rig.cameras)
+        raise ValueError(
+            f"the rig has T_base_camera of {sanitize_text(names, 200)}, and no image is of such a camera. Name the "
+            "cameras as the rig does: --cameras A,B"
+        )
+    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
+              for each in given.frames)  # fmt: skip
+    return replace(given, frames=tuple(frames))
 
 
 def choose_rig(file: Path | None, cameras: CameraSet | None, tell: Tell) -> Rig | None:

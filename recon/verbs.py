@@ -20,7 +20,7 @@ from splatnode.capture.process.arguments import (
     megabytes,
     positive,
 )
-from splatnode.recon.metric.arguments import add_marker
+from splatnode.recon.metric.arguments import add_frame, add_marker
 from splatnode.recon.replay_verb import REPLAY
 from splatnode.recon.shared_arguments import add_lens, add_multi_view_only
 
@@ -43,6 +43,7 @@ def _recon_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
     add_marker(parser)
+    add_frame(parser)
 
 
 def _remove_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,6 +88,11 @@ def _occupancy_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where up is in the result's world, if it is known"
+    )
+    parser.add_argument(
+        "--relative",
+        action="store_true",
+        help="write nav2's map.pgm of a result without metres, too: nav2 will take its lengths for metres",
     )
 
 

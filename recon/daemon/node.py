@@ -53,7 +53,7 @@ from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
 from splatnode.recon.daemon.relocalization import Watcher
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.daemon.worker import Worker
-from splatnode.recon.metric.arguments import collect_marker_changes
+from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.staged import finish_interrupted_write
 from splatnode.recon.result.folder import hold_result_folder
@@ -133,8 +133,8 @@ def recon(args: argparse.Namespace) -> int:
         config = msgspec.structs.replace(config, checkpoint=args.checkpoint)
     if args.out:
         config = msgspec.structs.replace(config, out=args.out)
-    if args.marker:
-        recipe = apply_changes(config.reconstruction, {"metric": collect_marker_changes(args)})
+    if changes := collect_marker_changes(args) | collect_frame_changes(args):
+        recipe = apply_changes(config.reconstruction, {"metric": changes})
         config = msgspec.structs.replace(config, reconstruction=recipe)
     stopping = threading.Event()
     handle_first_signal((signal.SIGTERM, signal.SIGINT), stopping.set)

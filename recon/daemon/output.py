@@ -64,7 +64,7 @@ class MetricScaler:
         return apply_metric_scale(with_all, self._config, self.collect_evidence(work.graph.keyframes))
 
     def collect_evidence(self, keyframes: Sequence[Keyframe]) -> Evidence:
-        """Collects the keyframes' scale evidence: markers, poses, motions, gravity, right and depth images."""
+        """Collects the keyframes' scale evidence: markers, poses, motions, gravity, mounts and so on."""
         for frame in (each.frame for each in keyframes):
             if frame not in self._told:
                 self._told[frame] = gather_evidence((frame,), self._config)
@@ -140,7 +140,7 @@ class Output:
             write_result_folder(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)
-            self.places.update(_make_submap_record(place, state, folder.name, snapshot, kept))
+            self.places.update(_make_submap_record(place, state, folder.name, measured, kept))
             if judged:
                 self.places.link_scene(place.scene_id, before)
         except OSError as error:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any
 
+from splatnode.capture.odometry import Gravity
 from splatnode.capture.process.text import measurement_argument, parse_measurement, sanitize_text
+from splatnode.recon.result.reference_frame import parse_frame_name
 
 DRIFT_DEG = 0.5  # of odometry's direction after a metre, where nobody tells it
 
@@ -20,6 +23,51 @@ def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:
         help="look for printed markers (splatnode marker) whose black square has this side, as 100mm, and take the "
         "metres from them; @0.2mm: you measured it to that (standard deviation; default: 0.5mm)",
     )
+
+
+def add_frame(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
+    """Adds the options --frame and --gravity, which apply to many recordings alike."""
+    parser._negative_number_matcher = re.compile(r"-[\d.]")  # else a direction that begins with a minus is no value
+    return (
+        parser.add_argument(
+            "--frame",
+            type=_parse_frame,
+            metavar="FRAME",
+            help="the frame of reference of results: first_camera, base (the robot's at the first image; needs "
+            "T_base_camera and metres), odometry (that of given poses) or upright (z up); base_link and odom mean the "
+            "same (default: that of given poses, else first_camera)",
+        ),
+        parser.add_argument(
+            "--gravity",
+            type=_parse_direction,
+            metavar="X,Y,Z",
+            help="down in the camera of the first photograph, for --frame upright: x right, y down, z forward, as "
+            "0,1,0 of a level camera",
+        ),
+    )
+
+
+def _parse_frame(text: str) -> str:
+    try:
+        return parse_frame_name(text).value
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _parse_direction(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+        return Gravity((x, y, z)).down
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"must be three numbers with commas, a direction, as 0,1,0; got {sanitize_text(text, 100)!r}"
+        ) from error
+
+
+def collect_frame_changes(args: argparse.Namespace) -> dict[str, Any]:
+    """Collects the changes that --frame and --gravity set."""
+    told = {"frame": args.frame, "gravity": None if args.gravity is None else list(args.gravity)}
+    return {key: value for key, value in told.items() if value is not None}
 
 
 def add_baseline(parser: argparse.ArgumentParser) -> argparse.Action:
@@ -131,7 +179,7 @@ def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     if args.baseline is not None:
         first, *further = ([*names, _parse_metres(metres)] for *names, metres in args.baseline)
         changes |= {"baseline": first, "further_baselines": further}
-    changes |= collect_marker_changes(args)
+    changes |= collect_marker_changes(args) | collect_frame_changes(args)
     if (args.stereo is None) != (args.stereo_baseline is None):
         raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
     if args.stereo_baseline is not None:

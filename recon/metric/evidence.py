@@ -38,6 +38,8 @@ class Evidence:
     motions: Mapping[str, Motion] = field(default_factory=dict)  # likewise
     gravities: Mapping[str, Gravity] = field(default_factory=dict)  # likewise
     depths: Mapping[str, CameraDepth] = field(default_factory=dict)  # of depth cameras, likewise
+    # T_base_camera (4, 4) in metres: where the photograph's camera stands on the robot's base, likewise
+    mounts: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
 
     def merge(self, further: Evidence) -> Evidence:
         """Returns this evidence merged with that of further images."""
@@ -45,7 +47,8 @@ class Evidence:
         sightings, pairs = (*self.sightings, *further.sightings), (*self.pairs, *further.pairs)
         tracked, motions = {**self.tracked, **further.tracked}, {**self.motions, **further.motions}
         gravities, depths = {**self.gravities, **further.gravities}, {**self.depths, **further.depths}
-        return Evidence(sightings, poses, pairs, tracked, motions, gravities, depths)
+        mounts = {**self.mounts, **further.mounts}
+        return Evidence(sightings, poses, pairs, tracked, motions, gravities, depths, mounts)
 
 
 NOTHING = Evidence()
@@ -54,7 +57,7 @@ NOTHING = Evidence()
 def gather_evidence(
     frames: Iterable[Frame | DroppedFrame], config: MetricConfig, tell: Tell = ignore_progress
 ) -> Evidence:
-    """Gathers the markers that `config` asks for, and the poses, motions, gravity, right and depth images.
+    """Gathers the markers that `config` asks for, and the poses, motions, gravity, mounts, right and depth images.
 
     Raises ValueError where intrinsics cannot be used.
     """
@@ -65,6 +68,7 @@ def gather_evidence(
         gravities={each.name: each.gravity for each in known if each.gravity is not None},
         depths={each.name: CameraDepth(each.camera_id, depth) for each in known if (depth := straighten_depth(each))},
         pairs=tuple(pair for pair in map(make_own_pair, known) if pair is not None),
+        mounts={each.name: mount for each in known if (mount := each.mount) is not None},
     )
     if config.marker_size_m is None:
         return came

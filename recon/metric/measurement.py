@@ -16,9 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.aruco import DICTIONARIES
-from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG
+from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG, Gravity
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.registration.undistortion import radial_of
+from splatnode.recon.result.reference_frame import FrameChoice
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import TWO_SIDED_95
 
@@ -83,8 +84,14 @@ class Baseline(NamedTuple):
 
 
 class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The size of a scene in metres, as it is configured."""
+    """The size of a scene in metres and its frame of reference, as they are configured."""
 
+    # Of all coordinates of results: first_camera, base (the robot's, at the first image; needs T_base_camera and
+    # metres), odometry (that of given poses or motions), upright (at the first camera, z up by gravity or the floor).
+    # Nothing: the first camera's, or that of given poses. base_link and odom mean the same. --frame sets it
+    frame: FrameChoice | None = None
+    # Down in the first image's camera: x right, y down, z forward; nothing: images or the floor tell. --gravity sets it
+    gravity: tuple[float, float, float] | None = None
     baseline: Baseline | None = None  # two photographs and the metres between their cameras
     further_baselines: tuple[Baseline, ...] = ()  # more of them: they make the scale surer, and check one another
     # Standard deviation of each measured distance, as a share of it
@@ -122,6 +129,8 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (*(() if self.baseline is None else (self.baseline,)), *self.further_baselines)
 
     def __post_init__(self) -> None:
+        if self.gravity is not None:
+            Gravity(self.gravity)  # raises ValueError where it is no direction
         if self.marker_dictionary not in DICTIONARIES:
             raise ValueError(
                 f"a marker's dictionary must be one of {', '.join(DICTIONARIES)}; got {self.marker_dictionary[:40]!a}"

@@ -23,8 +23,8 @@ from splatnode.recon.metric.odometry import (
     PoseSigmas,
     align_to_poses,
     estimate_scale_from_motions,
-    estimate_up,
 )
+from splatnode.recon.metric.reference_frame import express_in_frame, find_up
 from splatnode.recon.metric.stereo import (
     MetricDepth,
     StereoPair,
@@ -33,6 +33,7 @@ from splatnode.recon.metric.stereo import (
 )
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.placement import Placement
+from splatnode.recon.result.reference_frame import FIRST_CAMERA, FrameName, ReferenceFrame, encode_matrix
 from splatnode.recon.result.snapshot import GivenCameraPose, InGivenWorld, Snapshot, format_rounded_up
 from splatnode.recon.result.verdict import Scale, join_sentences
 
@@ -45,11 +46,12 @@ def apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evide
 
     `evidence` is what its photographs tell of what `config` asks for. A source that can say nothing is left out where
     another can. Where sources contradict each other the scene stays relative. Where poses are among what counts, the
-    world is theirs. Gravity, where it came with photographs, tells where up is.
+    world is theirs. Gravity, where it came with photographs, tells where up is. Last the scene is expressed in the
+    frame of reference that `config` asks for; where that is not known it is refused.
     """
     measured = _apply_metric_scale(snapshot, config, evidence)
-    up = estimate_up(make_metric_views(measured), evidence.gravities)
-    return measured if up is None else replace(measured, up=up)
+    up = find_up(measured, config, evidence)
+    return express_in_frame(measured if up is None else replace(measured, up=up), config, evidence)
 
 
 def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Snapshot:
@@ -75,7 +77,15 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
     metric = _transform_snapshot(snapshot, to_metres)
     if aligned is not None:
         metric = _add_given_poses(metric, config, evidence)
-    return replace(metric, scale=Scale(True, source, (low, high)))
+    return replace(metric, scale=Scale(True, source, (low, high), _describe_world(metric, aligned)))
+
+
+def _describe_world(metric: Snapshot, aligned: PoseAlignment | None) -> ReferenceFrame:
+    """The frame that the scene is in: that of given poses where it is aligned to them."""
+    if aligned is None:
+        return FIRST_CAMERA
+    T = encode_matrix(metric.cameras[0].T_world_camera)
+    return ReferenceFrame(FrameName.ODOMETRY, aligned.unit.source, None, T)
 
 
 def _collect_measurements(

@@ -23,7 +23,7 @@ def map_result(args: argparse.Namespace) -> int:
     with show_waiting("looking through the place"):
         folder = args.out or _find_maps_folder(args.result)
         made = occupancy_map(snapshot, args.voxel, None if args.up is None else np.array(args.up))
-        written = made.save(folder, args.band)
+        written = made.save(folder, args.band, relative=args.relative)
     x, y, z = made.states.shape
     shares = ", ".join(f"{100 * share:.1f} % {name.replace('_', ' ')}" for name, share in made.shares.items())
     say(f"{x} x {y} x {z} voxels of {made.voxel:.3g}, {made.scale.sentence}: {shares}")

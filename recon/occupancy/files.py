@@ -16,15 +16,15 @@ from splatnode.recon.result.export.result import OF_A_MAP, make_entries, read_di
 from splatnode.recon.result.export.staged import json_bytes, write_files
 
 
-def save(occupancy: OccupancyMap, folder: Path, band: Sequence[float] | None) -> list[Path]:
+def save(occupancy: OccupancyMap, folder: Path, band: Sequence[float] | None, relative: bool = False) -> list[Path]:
     """As `OccupancyMap.save`. What an earlier map in the folder had, and this one has not, is removed."""
     mesh = surface_mesh(occupancy)
     files = {
         "occupancy.npz": encode_npz(occupancy),
         "occupancy.bt": encode_octomap(occupancy),
         "collision.ply": encode_ply_mesh(mesh, occupancy.scale),
-        "collision.glb": encode_glb(mesh),
-        **({} if band is None else encode_nav2(occupancy, band)),
+        "collision.glb": encode_glb(mesh, occupancy.scale),
+        **({} if band is None else encode_nav2(occupancy, band, relative)),
     }
     superseded = {name: digest for name, digest in read_digests(folder / OF_A_MAP).items() if name not in files}
     manifest = {**occupancy.scale.record(), "files": make_entries(files)}

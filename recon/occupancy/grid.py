@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import RELATIVE, SURE, Scale
 
@@ -296,7 +297,10 @@ _LEVEL = 3.0  # times as far as along up the cameras' right axes must spread, to
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """x forward of the first camera and y to its left, both level; z up, 0 on the floor, if one was found."""
+    """z up, 0 on the floor, if one was found. x and y are the result's own where its frame has z up.
+
+    Else x is forward of the first camera and y to its left, both level.
+    """
 
     T_world_map: Array  # (4, 4)
     source: str  # of the direction of up, in words
@@ -306,6 +310,31 @@ class Upright:
     def height(self) -> str:
         """Says what heights count from."""
         return "z = 0 is the floor" if self.on_floor else "no floor was found: z = 0 is the height of the first camera"
+
+    @property
+    def is_of_result(self) -> bool:
+        """Whether x and y are the result's own, as of a base's, an odometry's or an upright frame."""
+        turned = np.abs(self.T_world_map[:3, :3] - np.eye(3)).max() > 1e-9
+        return not turned and not self.T_world_map[:2, 3].any()
+
+
+def make_level_frame(
+    Ts_world_camera: Sequence[Array], points: Array, unit: float, frame: ReferenceFrame
+) -> Upright | None:
+    """The map's frame with the x and y of a result whose frame has z up; None where it has not, or none can tell.
+
+    A base's and an upright frame have. That of given poses has where a floor is level in it. `points` (M, 3) are of
+    surfaces, `unit` is their median distance.
+    """
+    if frame.name is FrameName.FIRST_CAMERA:
+        return None
+    z, Ts = np.array([0.0, 0.0, 1.0]), np.stack(Ts_world_camera)
+    floor = find_floor(points, Ts[:, :3, 3], z, unit, TILT_OF_GIVEN)
+    if floor is None and frame.name is FrameName.ODOMETRY:
+        return None
+    T = np.eye(4)
+    T[2, 3] = Ts[0, 2, 3] - (0.0 if floor is None else floor.height(Ts[0, :3, 3], z))
+    return Upright(T, f"the z axis of the result's frame, {frame.name.value}", floor is not None)
 
 
 def upright(
@@ -373,7 +402,10 @@ class VoxelState(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class OccupancyMap:
-    """Cubes of side `voxel` in the map's frame: x forward of the first camera, y to its left, z up (REP 103)."""
+    """Cubes of side `voxel` in the map's frame, whose z is up (REP 103).
+
+    Its x and y are the result's where its frame has z up; else x is forward of the first camera and y to its left.
+    """
 
     states: npt.NDArray[np.uint8]  # (X, Y, Z) 0: not seen, 1: free, 2: occupied
     voxel: float  # side of a voxel, in the unit of the result
@@ -407,15 +439,18 @@ class OccupancyMap:
         found[inside] = self.states[tuple(index[inside].astype(np.intp).T)]
         return found
 
-    def save(self, folder: str | PathLike[str], band: Sequence[float] | None = None) -> list[Path]:
+    def save(
+        self, folder: str | PathLike[str], band: Sequence[float] | None = None, *, relative: bool = False
+    ) -> list[Path]:
         """Writes occupancy.npz, occupancy.bt, collision.ply and collision.glb; returns what was written.
 
-        With `band`, two heights in the map's frame, also map.pgm and map.yaml for nav2. Raises ValueError for a band
-        that is none or that the map does not reach, ResultWriteError where nothing can be written.
+        With `band`, two heights in the map's frame, also map.pgm and map.yaml for nav2, which takes lengths for metres:
+        a map without a unit is written with `relative` alone. Raises ValueError for a band that is none or that the map
+        does not reach, or without metres; ResultWriteError where nothing can be written.
         """
         from splatnode.recon.occupancy.files import save  # brings the formats
 
-        return save(self, Path(folder), band)
+        return save(self, Path(folder), band, relative)
 
 
 # Surfaces: which voxels a surface is in that two photographs confirm.
@@ -474,7 +509,9 @@ def occupancy_map(
     seen = _load_depth_observations(snapshot)
     points, unit = _sample(seen)
     told, how = _up(snapshot) if up is None else (up, "given")
-    frame = upright([camera.T_world_camera for camera in snapshot.cameras], points, told, unit, how)
+    Ts = [camera.T_world_camera for camera in snapshot.cameras]
+    own = make_level_frame(Ts, points, unit, snapshot.scale.frame) if up is None else None
+    frame = own or upright(Ts, points, told, unit, how)
     T = frame.T_world_map
     centres = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras])
     layout = choose_layout(

@@ -27,6 +27,7 @@ from splatnode.capture.frame import (
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.wire import Amount, Count, Finite, Header, Message, Name, Sequential, Text, WireError
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
+from splatnode.recon.result.reference_frame import FIRST_CAMERA, FrameName, ReferenceFrame, find_frame_problem
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
     GaussianArrays,
@@ -106,12 +107,27 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"camera {self.name[:60]!a}: {why}")
 
 
+class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A ReferenceFrame."""
+
+    name: FrameName
+    source: Text | None  # how it is known
+    sigma_deg: Amount | None  # of an upright one: standard deviation of its z axis
+    T_frame_first_camera: Matrix4  # row by row
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, of which msgspec makes its own error."""
+        if problem := find_frame_problem(np.array(self.T_frame_first_camera).reshape(4, 4)):
+            raise ValueError(problem)
+
+
 class ScaleRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A Scale."""
 
     metric: bool  # lengths are metres: a unit has one
     source: Text | None  # of the metres, or why there are none although they were asked for
     interval_95: tuple[Amount, Amount] | None  # of metres: a true length is that many times the stated one
+    frame: FrameRecord | UnsetType = UNSET  # of all coordinates; left out where it is the first camera's
 
 
 class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -127,7 +143,8 @@ class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     iterations: Count
     seconds: Annotated[dict[Name, Amount], msgspec.Meta(max_length=64)]
     final: bool
-    scale: ScaleRecord | UnsetType = UNSET  # left out of a relative scene of which nothing is to be said
+    # Left out of a relative scene in the first camera's frame of which nothing is to be said
+    scale: ScaleRecord | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,11 +233,22 @@ def make_thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
 
 def make_scale_record(scale: Scale) -> ScaleRecord:
     source = None if scale.source is None else sanitize_text(scale.source)
-    return ScaleRecord(scale.metric, source, scale.interval_95)
+    return ScaleRecord(scale.metric, source, scale.interval_95, _make_frame_record(scale.frame))
 
 
 def parse_scale(record: ScaleRecord) -> Scale:
-    return Scale(**msgspec.structs.asdict(record))
+    return Scale(record.metric, record.source, record.interval_95, _parse_frame(record.frame))
+
+
+def _make_frame_record(frame: ReferenceFrame) -> FrameRecord | UnsetType:
+    if frame == FIRST_CAMERA:
+        return UNSET
+    source = None if frame.source is None else sanitize_text(frame.source)
+    return FrameRecord(frame.name, source, frame.sigma_deg, frame.T_frame_first_camera)
+
+
+def _parse_frame(record: FrameRecord | UnsetType) -> ReferenceFrame:
+    return FIRST_CAMERA if isinstance(record, UnsetType) else ReferenceFrame(**msgspec.structs.asdict(record))
 
 
 def make_bounds_record(bounds: Bounds | None) -> BoundsRecord | None:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
+from splatnode.recon.result.reference_frame import FIRST_CAMERA, ReferenceFrame
 
 
 class Code(enum.Enum):
@@ -41,6 +42,7 @@ class Code(enum.Enum):
     OVERFIT = "OVERFIT"
     DIVERGED = "DIVERGED"
     UNDETERMINED = "UNDETERMINED"
+    FRAME_UNKNOWN = "FRAME_UNKNOWN"
     BUDGET_HIT = "BUDGET_HIT"
 
 
@@ -168,19 +170,24 @@ def _compute_squared_length_95(variances: Array) -> float:
     return mean * (1.0 - spread + _NORMAL_95 * spread**0.5) ** 3
 
 
-# The unit of a result's lengths, which every file that is written states.
+# The unit of a result's lengths, and the frame of its coordinates, which every file that is written states.
 
 TWO_SIDED_95 = 1.96  # standard deviations to either side that hold 95 % of a normal distribution
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Whether lengths are metres, and how that is known."""
+    """Whether lengths are metres, how that is known, and what coordinates count from."""
 
     metric: bool = False  # lengths are metres
     source: str | None = None  # of the metres, or why there are none although they were asked for
     # Of metres: a true length is at least and at most so many times the stated one, with a probability of 95 %
     interval_95: tuple[float, float] | None = None
+    frame: ReferenceFrame = FIRST_CAMERA  # that all coordinates are in
+
+    @property
+    def unit(self) -> str:
+        return "metres" if self.metric else "relative"
 
     @property
     def word(self) -> str:
@@ -193,7 +200,8 @@ class Scale:
 
     def record(self) -> dict[str, object]:
         """As JSON files state it."""
-        return {"scale": self.word, "scale_source": self.source, "scale_interval_95": self.interval_95}
+        known = {"scale": self.word, "scale_source": self.source, "scale_interval_95": self.interval_95}
+        return {"unit": self.unit, **known, **self.frame.record()}
 
 
 RELATIVE = Scale()

@@ -1,7 +1,8 @@
-"""Lens, depth image, pose, motion and gravity of one image, as a program gives them, as records of a frame."""
+"""Lens, depth image, pose, motion, gravity and mount of one image, as a program gives them, as records of a frame."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -24,6 +25,7 @@ from splatnode.capture.odometry import (
     Gravity,
     Motion,
     make_given_pose,
+    rigid_problem,
 )
 
 Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
@@ -98,6 +100,38 @@ def make_gravity(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Grav
         raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
     x, y, z = down.tolist()
     return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))
+
+
+Mounts: TypeAlias = "npt.ArrayLike | Mapping[str, npt.ArrayLike]"  # T_base_camera of all cameras, or by camera id
+
+
+def parse_mounts(T_base_camera: Mounts | None) -> dict[str, tuple[float, ...]]:
+    """Returns T_base_camera (4, 4) in metres as frames have it, by camera id; "" is of all.
+
+    Raises TypeError, ValueError.
+    """
+    if T_base_camera is None:
+        return {}
+    if isinstance(T_base_camera, Mapping):
+        return {camera_id: _parse_mount(T) for camera_id, T in T_base_camera.items()}
+    return {"": _parse_mount(T_base_camera)}
+
+
+def find_mount(mounts: Mapping[str, tuple[float, ...]], camera_id: str) -> tuple[float, ...] | None:
+    """Returns the mount of a camera by its id; None where none was given."""
+    return mounts.get(camera_id, mounts.get(""))
+
+
+def _parse_mount(T: npt.ArrayLike) -> tuple[float, ...]:
+    matrix = np.asarray(T, np.float64)
+    if matrix.shape != (4, 4):
+        raise TypeError(
+            f"T_base_camera must be (4, 4) in metres, or a mapping of such by camera id, got {matrix.shape}"
+        )
+    numbers = tuple(matrix.ravel().tolist())
+    if problem := rigid_problem(numbers):
+        raise ValueError(f"T_base_camera must be {problem}")
+    return numbers
 
 
 def parse_sigmas(sigmas: Any, what: str) -> Sigmas:

@@ -17,11 +17,14 @@ import numpy.typing as npt
 from splatnode.api.image_arguments import (
     DepthOf,
     Lens,
+    Mounts,
     Sigmas,
     append_motion,
+    find_mount,
     make_gravity,
     make_intrinsics,
     make_pose,
+    parse_mounts,
     parse_optional_depth,
 )
 from splatnode.capture.config import Camera, CaptureConfig, ProgramConfig
@@ -109,6 +112,7 @@ class Publisher:
         *,
         every_frame: bool = False,
         camera_id: str = "",
+        T_base_camera: Mounts | None = None,
         changes: Mapping[str, Any] | None = None,
     ) -> None:
         """`config`: None, or a YAML file as `splatnode capture` takes it, without `camera`. `changes` are laid over it.
@@ -117,6 +121,7 @@ class Publisher:
           coverage.
         - `camera_id`: of this publisher, and of images without their own: programs with different ids may send to one
           node. Up to 32 letters, digits, - and _.
+        - `T_base_camera`: (4, 4) in metres, the camera on the robot's base (x forward, y left, z up), or by camera id.
         - `changes`: such as `{"network": {"directory": "run"}, "spool": {"max_frames": 50}}`.
 
         Raises ValueError where the configuration cannot be used, and OSError where another process publishes already
@@ -128,6 +133,7 @@ class Publisher:
             settings = merge_config(settings, {"selection": {"every_frame": True}})
         own = parse_config(merge_config(settings, {"camera_id": camera_id} if camera_id else {}), ProgramConfig)
         known = {name: getattr(own, name) for name in own.__struct_fields__}
+        self._mounts = parse_mounts(own.T_base_camera if T_base_camera is None else T_base_camera)
         self._config = CaptureConfig(Camera("program", None), **known)
         self._lock = threading.RLock()
         self._closed = threading.Event()
@@ -314,6 +320,7 @@ class Publisher:
             gravity=told[1],
             motion=moved,
             depth=depth,
+            T_base_camera=find_mount(self._mounts, by),
         )
         if lens is not None:
             known = make_intrinsics(lens, made.width, made.height)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.api.depths import Depths, add_depths
-from splatnode.api.image_arguments import Sigmas, parse_sigmas
+from splatnode.api.image_arguments import Mounts, Sigmas, find_mount, make_gravity, parse_mounts, parse_sigmas
 from splatnode.api.photographs import (
     Images,
     LensChoice,
@@ -39,6 +39,7 @@ from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
 from splatnode.recon.replay_source import Source, add_poses, apply_masks
+from splatnode.recon.result.reference_frame import FrameChoice
 from splatnode.recon.rig_choice import apply_rig
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
@@ -256,6 +257,9 @@ def reconstruct(
     masks: Masks | None = None,
     depths: Depths | None = None,
     scale: Scale | None = None,
+    frame: FrameChoice | None = None,
+    T_base_camera: Mounts | None = None,
+    gravity: npt.ArrayLike | Mapping[str, npt.ArrayLike] | None = None,
     budget_s: float | None = None,
     preset: str = "balanced",
     config: Changes | None = None,
@@ -291,6 +295,11 @@ def reconstruct(
       files (16-bit PNG, .npy, .exr), or aligned arrays (H, W): uint16 millimetres, float metres; None: unknown.
     - `scale`: the metres between two cameras, `("a.jpg", "b.jpg", 0.5)` or by places in the list, `(0, 3, 0.5)`;
       `splatnode.Marker(0.1)`; `splatnode.Stereo`; or a list of these. None: lengths have no unit.
+    - `frame`: the frame of reference of results: `first_camera`, `base` (the robot's at the first image), `odometry`
+      (that of the poses) or `upright` (z up by gravity or the floor). None: that of the poses, else the first camera's.
+      Where it is not known the verdict is `FRAME_UNKNOWN`.
+    - `T_base_camera`: (4, 4) in metres, the camera on the robot's base (x forward, y left, z up), or by camera id.
+    - `gravity`: down (3,) in the first camera's frame, or a mapping by image name.
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: a mapping or a YAML file of what differs from the preset (`docs/configuration.md`).
     - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
@@ -309,9 +318,10 @@ def reconstruct(
     source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
-    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
+    metric = (sigmas_of(poses_sigma) or {}) | frame_changes(frame, gravity)
+    flags = {"budget_s": budget_s, "seed": seed, "metric": metric or None, "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
-    source, chosen = apply_rig(source, chosen, rig, telling)
+    source, chosen = apply_rig(_add_frame_evidence(source, T_base_camera, gravity), chosen, rig, telling)
     check_baseline(chosen, source)
     known = poses_given(poses, images, source.frames)
     if trusted and known is not None:
@@ -319,6 +329,36 @@ def reconstruct(
     given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
+
+
+def frame_changes(
+    frame: FrameChoice | None, gravity: npt.ArrayLike | Mapping[str, npt.ArrayLike] | None
+) -> dict[str, Any]:
+    """Returns the settings of `metric` for a frame of reference and for gravity of the first image.
+
+    Raises TypeError, ValueError.
+    """
+    told = None if gravity is None or isinstance(gravity, Mapping) else make_gravity(gravity, None)
+    changes = {"frame": frame, "gravity": None if told is None else list(told.down)}
+    return {key: value for key, value in changes.items() if value is not None}
+
+
+def _add_frame_evidence(source: Source, T_base_camera: Mounts | None, gravity: Any) -> Source:
+    """The frames with the mounts of their cameras, and with gravity by name. Raises TypeError, ValueError."""
+    mounts = parse_mounts(T_base_camera)
+    downs = {frame_name(Path(name)): make_gravity(each, None) for name, each in gravity.items()} if isinstance(
+        gravity, Mapping) else {}  # fmt: skip
+    frames = [each for each in source.frames if isinstance(each, Frame)]
+    unknown = [repr(each) for each in {*mounts} - {"", *(frame.camera_id for frame in frames)}]
+    unknown += [repr(each) for each in {*downs} - {frame.name for frame in frames}]
+    if unknown:
+        raise ValueError(f"T_base_camera must be by camera id and gravity by image name; unknown: {', '.join(unknown)}")
+    known = {each.name: replace(
+        each,
+        T_base_camera=find_mount(mounts, each.camera_id) or each.T_base_camera,
+        gravity=downs.get(each.name, each.gravity),
+    ) for each in frames}  # fmt: skip
+    return replace(source, frames=tuple(known.get(each.name, each) for each in source.frames))
 
 
 def _apply_given(

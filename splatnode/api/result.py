@@ -18,6 +18,7 @@ from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.npz_files import LANDMARKS, read_depths, read_landmarks
+from splatnode.recon.result.reference_frame import ReferenceFrame
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
@@ -40,8 +41,8 @@ Array = npt.NDArray[np.float64]
 class Camera:
     """A camera of the result: its pose, its lens, and how well they are known.
 
-    Axes are OpenCV's: x right, y down, z forward. The world is the frame of the first camera that was placed; its unit
-    is the metre where `Result.metric` is set, and none otherwise.
+    Axes are OpenCV's: x right, y down, z forward. The world is the frame that `Result.frame` names; its unit is the
+    metre where `Result.metric` is set, and none otherwise.
     """
 
     name: str  # of the photograph: its file's, or 0000.png, 0001.png, ... where it came as an array
@@ -222,6 +223,11 @@ class Result:
     def scale_interval(self) -> tuple[float, float] | None:
         """A true length is at least and at most so many times the stated one: 95 %. None where that is not known."""
         return self._snapshot.scale.interval_95
+
+    @property
+    def frame(self) -> ReferenceFrame:
+        """The frame of reference of all coordinates: `name`, how it is known, and `T_frame_first_camera`."""
+        return self._snapshot.scale.frame
 
     @property
     def depth_checks(self) -> tuple[DepthCheck, ...]:

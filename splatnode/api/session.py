@@ -10,10 +10,13 @@ import numpy.typing as npt
 
 from splatnode.api.image_arguments import (
     DepthOf,
+    Mounts,
     append_motion,
+    find_mount,
     make_gravity,
     make_intrinsics,
     make_pose,
+    parse_mounts,
     parse_optional_depth,
 )
 from splatnode.api.photographs import Lens, Picture, lenses, make_frame
@@ -22,6 +25,7 @@ from splatnode.api.reconstruct import (
     Scale,
     build_config,
     check_counts,
+    frame_changes,
     is_stereo,
     parse_matrix,
     sigmas_of,
@@ -43,6 +47,7 @@ from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.pipeline import OfflineResult, rebuild_from_scratch
 from splatnode.recon.replay_source import Source
+from splatnode.recon.result.reference_frame import FrameChoice
 from splatnode.recon.result.snapshot import Snapshot
 
 _EACH = 1e9  # frames a second: each is examined
@@ -71,6 +76,8 @@ class Session:
         poses_sigma: tuple[float, float] | None = None,
         poses_only_check: bool = False,
         scale: Scale | None = None,
+        frame: FrameChoice | None = None,
+        T_base_camera: Mounts | None = None,
         preset: str = "balanced",
         config: Changes | None = None,
         every_frame: bool = False,
@@ -81,12 +88,15 @@ class Session:
         """The arguments are those of `reconstruct`, without `budget_s`.
 
         `poses_sigma` is of poses that `add` gets without their own. Poses with sigmas are priors of cameras with a
-        known lens, unless `poses_only_check`. Images without a name are called 0000.png, 0001.png, ...
+        known lens, unless `poses_only_check`. While `frame` is not known the verdict is `FRAME_UNKNOWN`. Images without
+        a name are called 0000.png, 0001.png, ...
         """
         check_counts(threads=threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
-        flags = {"seed": seed, "metric": sigmas_of(poses_sigma)}
+        metric = (sigmas_of(poses_sigma) or {}) | frame_changes(frame, None)
+        flags = {"seed": seed, "metric": metric or None}
+        self._mounts = parse_mounts(T_base_camera)
         self._config = build_config(preset, config, flags, scale, of_pictures=True)
         self._only_checks = poses_only_check
         if self._config.budget_s is not None:
@@ -152,6 +162,7 @@ class Session:
             usual = metric.odometry_drift, metric.odometry_sigma_deg
             moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
             came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
+            came["T_base_camera"] = find_mount(self._mounts, frame.camera_id)
             beside = {"right": _make_right_image(right, baseline_m), "depth": parse_optional_depth(depth)}
             frame = replace(frame, **came, **beside)
             self._motion = moved

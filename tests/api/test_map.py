@@ -25,7 +25,7 @@ def test_a_saved_result_has_the_same_map(result, tmp_path):
     saved = splatnode.load(result.save(tmp_path / "out"))
     one, other = result.map(voxel=0.03), saved.map(voxel=0.03)
     assert np.array_equal(one.states, other.states) and np.allclose(one.T_world_map, other.T_world_map)
-    written = saved.map().save(tmp_path / "nav", band=(0.1, 0.3))
+    written = saved.map().save(tmp_path / "nav", band=(0.1, 0.3), relative=True)
     assert {"map.yaml", "occupancy.bt"} < {path.name for path in written}
 
 

@@ -1,7 +1,7 @@
 """collision.glb: the surface of the occupied voxels as binary glTF 2.0, for simulators and game engines.
 
-glTF's y axis is up: a node turns the map's frame, whose z is up. Lengths are in the unit of the result; glTF means
-metres, which they are only where the result is metric.
+glTF's y axis is up: a node turns the map's frame, whose z is up. Lengths are in the unit of the result, which
+`extras` of `asset` states; glTF means metres, which they are only where the result is metric.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import struct
 import numpy as np
 
 from splatnode.recon.occupancy.mesh import Mesh
+from splatnode.recon.result.verdict import RELATIVE, Scale
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _FLOAT, _UINT32 = 5126, 5125
@@ -19,10 +20,11 @@ _VERTICES, _INDICES = 34962, 34963
 _Z_UP = [1, 0, 0, 0, 0, 0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1]  # columns: x stays, y becomes -z, z becomes y
 
 
-def encode_glb(mesh: Mesh) -> bytes:
+def encode_glb(mesh: Mesh, scale: Scale = RELATIVE) -> bytes:
     """The file's bytes; a scene without a mesh where there are no triangles, as glTF knows no empty ones."""
     positions, indices = mesh.vertices.astype("<f4").tobytes(), mesh.triangles.astype("<u4").tobytes()
-    gltf: dict[str, object] = {"asset": {"version": "2.0", "generator": "splatnode"}, "scene": 0}
+    asset = {"version": "2.0", "generator": "splatnode", "extras": {"unit": scale.unit}}
+    gltf: dict[str, object] = {"asset": asset, "scene": 0}
     if not len(mesh.triangles):
         return _file(gltf | {"scenes": [{}]}, b"")
     views = [

@@ -15,18 +15,27 @@ _GREY = {VoxelState.NOT_SEEN: 205, VoxelState.FREE: 254, VoxelState.OCCUPIED: 0}
 _FREE_BELOW, _OCCUPIED_ABOVE = 0.196, 0.65
 
 
-def encode_nav2(occupancy: OccupancyMap, band: Sequence[float]) -> dict[str, bytes]:
+def encode_nav2(occupancy: OccupancyMap, band: Sequence[float], relative: bool = False) -> dict[str, bytes]:
     """map.pgm and map.yaml of the voxels that reach into the band of heights (low, high) in the map's frame.
 
     A cell is occupied where any of these voxels is, free where all of them are. Raises ValueError for a band that is
-    none, or that the map does not reach.
+    none, or that the map does not reach, and, unless `relative`, for a map without metres: nav2 takes every length for
+    metres.
     """
+    if not (occupancy.scale.metric or relative):
+        raise ValueError(
+            "a map for nav2 must be in metres, which nav2 takes every length for; this result is "
+            f"{occupancy.scale.sentence}. Reconstruct with something that gives metres, as --marker 100mm or --poses "
+            "FILE, leave out --band for the other files, or ask for a map without a unit: --relative"
+        )
     cells = project_band(occupancy, band)
     x, y = occupancy.origin[:2].tolist()
     low, high = band
     yaml = (
         f"# seen from above: heights {low:g} to {high:g}, {occupancy.scale.sentence}\n"
+        f"# unit: {occupancy.scale.unit}\n"
         f"# {occupancy.upright.height}\n"
+        f"# {_describe_axes(occupancy)}\n"
         "image: map.pgm\n"
         "mode: trinary\n"
         f"resolution: {occupancy.voxel!r}\n"
@@ -37,8 +46,16 @@ def encode_nav2(occupancy: OccupancyMap, band: Sequence[float]) -> dict[str, byt
     )
     grey = np.vectorize(_GREY.__getitem__, otypes=[np.uint8])(cells)
     rows = np.ascontiguousarray(grey.T[::-1])  # the first row is that of the largest y
-    header = f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n"
+    stated = f"# splatnode: unit {occupancy.scale.unit}, {occupancy.voxel!r} a pixel\n"
+    header = f"P5\n{stated}{rows.shape[1]} {rows.shape[0]}\n255\n"
     return {"map.pgm": header.encode() + rows.tobytes(), "map.yaml": yaml.encode()}
+
+
+def _describe_axes(occupancy: OccupancyMap) -> str:
+    """Says what the origin is in."""
+    if occupancy.upright.is_of_result:
+        return f"x and y are of the result's frame: {occupancy.scale.frame.name.value}"
+    return "x is forward of the first camera, y to its left"
 
 
 def project_band(occupancy: OccupancyMap, band: Sequence[float]) -> npt.NDArray[np.uint8]:

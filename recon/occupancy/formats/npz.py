@@ -9,6 +9,7 @@ import numpy as np
 from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState
 
 AXES = "states[i, j, k] along x, y, z of the map: x forward of the first camera, y to its left, z up"
+AXES_OF_RESULT = "states[i, j, k] along x, y, z of the map: x and y of the result's frame, z up"
 
 
 def encode_npz(occupancy: OccupancyMap) -> bytes:
@@ -20,9 +21,11 @@ def encode_npz(occupancy: OccupancyMap) -> bytes:
         origin=occupancy.origin,
         voxel=np.float64(occupancy.voxel),
         T_world_map=occupancy.T_world_map,
-        axes=np.array(AXES),
+        axes=np.array(AXES_OF_RESULT if occupancy.upright.is_of_result else AXES),
         meaning=np.array(", ".join(f"{state.value}: {state.name.lower()}" for state in VoxelState)),
+        unit=np.array(occupancy.scale.unit),
         scale=np.array(occupancy.scale.sentence),
+        world=np.array(occupancy.scale.frame.sentence),
         up=np.array(occupancy.upright.source),
         height=np.array(occupancy.upright.height),
     )

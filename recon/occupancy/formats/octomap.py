@@ -42,7 +42,8 @@ def encode_octomap(occupancy: OccupancyMap) -> bytes:
         heights.append(np.full(len(inner), height))
         count += int((bits > 0).sum())
     order = np.lexsort([-np.concatenate(heights), np.concatenate(paths)])
-    header = f"# Octomap OcTree binary file\nid OcTree\nsize {count}\nres {occupancy.voxel!r}\ndata\n"
+    head = f"# Octomap OcTree binary file\n# unit: {occupancy.scale.unit}\n"  # OctoMap skips further comments
+    header = f"{head}id OcTree\nsize {count}\nres {occupancy.voxel!r}\ndata\n"
     return header.encode() + np.concatenate(words)[order].tobytes()
 
 

@@ -11,7 +11,7 @@ from splatnode.recon.result.verdict import Scale
 def encode_ply_mesh(mesh: Mesh, scale: Scale) -> bytes:
     header = (
         "ply\nformat binary_little_endian 1.0\n"
-        f"comment splatnode: scale {scale.word}, frame of the map, z up\n"
+        f"comment splatnode: scale {scale.word}, unit {scale.unit}, frame of the map, z up\n"
         f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
         f"element face {len(mesh.triangles)}\nproperty list uchar uint vertex_indices\nend_header\n"
     )

@@ -1,7 +1,7 @@
 """cameras.json: our own file of cameras, which every result has and from which other formats are made.
 
-The cameras are for the images at modelled size, with the centre of the top-left pixel at (0.5, 0.5). The file says
-whether the world's unit is the metre.
+The cameras are for the images at modelled size, with the centre of the top-left pixel at (0.5, 0.5). The file states
+the world's unit and its frame of reference.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
 from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES, SceneFileError
 from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame, encode_matrix, find_frame_problem
 from splatnode.recon.result.snapshot import MAX_COORDINATE, CameraEstimate, GivenCameraPose, find_camera_problem
 from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale
 
@@ -57,6 +58,11 @@ CONSISTENT_DEPTH_MEANING = (
 FRAME_SET_MEANING = (
     "camera_id says which of several cameras took the photograph, and photographs of one frame_set were taken "
     "together; null: there is one camera, or nothing tells"
+)
+
+FRAME_MEANING = (
+    "of all coordinates: first_camera, base (the robot's, at the first image), odometry (that of the given poses) or "
+    "upright (at the first camera, z up); p_frame = T_frame_first_camera @ p_first_camera, in the file's unit"
 )
 
 GIVEN_MEANING = (
@@ -109,6 +115,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
     return json_bytes(
         {
             **scale.record(),
+            "frame_meaning": FRAME_MEANING,
             "axes": "OpenCV: x right, y down, z forward",
             "T_world_camera": "p_world = T_world_camera @ p_camera",
             "stamp_ns": STAMP_MEANING,
@@ -161,6 +168,10 @@ class _File(msgspec.Struct, frozen=True):
     scale: Text | None = None
     scale_source: str | None = None
     scale_interval_95: tuple[Low, High] | None = None
+    frame: FrameName = FrameName.FIRST_CAMERA
+    frame_source: str | None = None
+    frame_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] | None = None
+    T_frame_first_camera: tuple[Row4, Row4, Row4, Row4] | None = None
 
 
 def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstimate, ...]:
@@ -176,11 +187,20 @@ def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstim
 
 
 def decode_scale(data: bytes, name: str = "cameras.json") -> Scale:
-    """The scale that a cameras.json of ours states. Raises SceneFileError."""
+    """The unit and the frame that a cameras.json of ours states. Raises SceneFileError."""
     with guard_untrusted(SceneFileError, name):
         parsed = _parse_file(data, name)
         source = parsed.scale_source and sanitize_text(parsed.scale_source)
-        return Scale(parsed.scale == "metric", source, parsed.scale_interval_95)
+        return Scale(parsed.scale == "metric", source, parsed.scale_interval_95, _make_frame(parsed, name))
+
+
+def _make_frame(parsed: _File, name: str) -> ReferenceFrame:
+    """The frame of reference; that of the first camera where the file is older than frames. Raises SceneFileError."""
+    T = np.eye(4) if parsed.T_frame_first_camera is None else np.array(parsed.T_frame_first_camera)
+    if problem := find_frame_problem(T):
+        raise SceneFileError(f"{name}: {problem}")
+    source = parsed.frame_source and sanitize_text(parsed.frame_source)
+    return ReferenceFrame(parsed.frame, source, parsed.frame_sigma_deg, encode_matrix(T))
 
 
 def _parse_file(data: bytes, name: str) -> _File:
@@ -190,8 +210,9 @@ def _parse_file(data: bytes, name: str) -> _File:
         parsed = record_in(data, _File)
     except msgspec.MsgspecError as error:
         raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error}") from error
-    if not (parsed.scale_source or "").isprintable():
-        raise SceneFileError(f"{name}: scale_source must be printable text")
+    for field, text in (("scale_source", parsed.scale_source), ("frame_source", parsed.frame_source)):
+        if not (text or "").isprintable():
+            raise SceneFileError(f"{name}: {field} must be printable text")
     return parsed
 
 

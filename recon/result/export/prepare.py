@@ -103,8 +103,9 @@ def format_number_row(values: Sequence[float]) -> str:
 
 
 def format_text_file(head: str, lines: Sequence[str], scale: Scale) -> bytes:
-    """The comment `head`, a comment that states the scale, and the lines."""
-    return ("\n".join([f"# {head}", f"# scale: {scale.sentence}", *lines]) + "\n").encode()
+    """The comment `head`, comments that state the unit and the frame, and the lines."""
+    stated = [f"# unit: {scale.unit}", f"# scale: {scale.sentence}", f"# frame: {scale.frame.sentence}"]
+    return ("\n".join([f"# {head}", *stated, *lines]) + "\n").encode()
 
 
 # Which Gaussians of a scene an export keeps: all, those that two photographs have seen, the near, those in a box.

@@ -25,7 +25,7 @@ def result(tmp_path_factory):
 
 
 def test_a_map_is_written_beside_the_scene(result, capsys):
-    assert command_line.main(["occupancy", str(result), "--band", "0.1", "0.5"]) == 0
+    assert command_line.main(["occupancy", str(result), "--band", "0.1", "0.5", "--relative"]) == 0
     told = capsys.readouterr().out
     assert "not seen" in told and "up: the floor" in told and "relative (no metric unit)" in told
     assert {path.name for path in (result / "occupancy").iterdir()} == ALWAYS | {"map.pgm", "map.yaml"}
@@ -76,7 +76,7 @@ def test_of_a_result_that_is_not_sure_there_is_none(tmp_path, capsys, snapshot, 
 def test_a_map_of_an_earlier_band_or_result_does_not_stay(tmp_path, capsys):
     write_result_folder(room_snapshot(), tmp_path, seed=0, preset_name="fast")
     folder = tmp_path / "occupancy"
-    assert command_line.main(["occupancy", str(tmp_path), "--band", "0.1", "0.5"]) == 0
+    assert command_line.main(["occupancy", str(tmp_path), "--band", "0.1", "0.5", "--relative"]) == 0
     assert command_line.main(["occupancy", str(tmp_path), "--voxel", "0.1"]) == 0
     assert {path.name for path in folder.iterdir()} == ALWAYS
     (folder / "mine.txt").write_text("somebody else's")
@@ -86,7 +86,7 @@ def test_a_map_of_an_earlier_band_or_result_does_not_stay(tmp_path, capsys):
 
 
 def test_a_voxel_of_numpy_is_written_as_a_number(tmp_path):
-    occupancy_map(room_snapshot(), np.float64(0.05)).save(tmp_path, (0.1, 0.5))
+    occupancy_map(room_snapshot(), np.float64(0.05)).save(tmp_path, (0.1, 0.5), relative=True)
     assert "resolution: 0.05\n" in (tmp_path / "map.yaml").read_text()
     assert b"\nres 0.05\n" in (tmp_path / "occupancy.bt").read_bytes()
 

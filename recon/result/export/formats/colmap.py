@@ -21,6 +21,7 @@ from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale
 
+UNIT = "unit.txt"  # beside binary files, which have no place for it; COLMAP does not look at it
 _TURNED, _MOVED = 1e-4, 1e-4  # radians, and parts of the spread of all cameras, by which relative poses may differ
 
 Array = npt.NDArray[np.float64]
@@ -165,7 +166,8 @@ def encode_colmap(
         for i, (mean, colour) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
     ]
     if any(character.isspace() for camera in cameras for character in camera.name):
-        return _encode_binary(camera_ids, images, points) | (_pack_rigs(rigged, images) if rigged else {})
+        stated = {UNIT: format_text_file("the unit and the frame of the binary files beside this one", [], scale)}
+        return _encode_binary(camera_ids, images, points) | (_pack_rigs(rigged, images) if rigged else {}) | stated
     text = _encode_text(camera_ids, images, points, scale)
     return text | (_format_rigs(rigged, images, scale) if rigged else {})
 

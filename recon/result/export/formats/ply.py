@@ -116,7 +116,7 @@ def _header(num_gaussians: int, num_bases: int, scale: Scale) -> bytes:
     # Some readers take the third line for the element and read lines until end_header, so the comment comes last.
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {num_gaussians}"]
     lines += [f"property float {field}" for field in _property_names(num_bases)]
-    lines += [f"comment splatnode: scale {scale.word}, OpenCV axes of the first camera", "end_header"]
+    lines += [f"comment splatnode: scale {scale.word}, unit {scale.unit}, frame {scale.frame.name.value}", "end_header"]
     return ("\n".join(lines) + "\n").encode()
 
 

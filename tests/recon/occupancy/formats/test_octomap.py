@@ -20,7 +20,9 @@ class Tree:
     def __init__(self, data: bytes) -> None:
         stream = io.BytesIO(data)
         assert stream.readline() == b"# Octomap OcTree binary file\n"
-        self.header = dict(iter(lambda: stream.readline().decode().strip().partition(" ")[::2], ("data", "")))
+        rows = list(iter(lambda: stream.readline().decode().strip(), "data"))
+        self.header = dict(row.partition(" ")[::2] for row in rows if not row.startswith("#"))  # as readHeader does
+        self.comments = [row for row in rows if row.startswith("#")]
         self.leaves: list[tuple[tuple[int, int, int], int, int]] = []  # least key, side, state
         self.nodes = 1
         self._node(stream, (0, 0, 0), 1 << LEVELS)
@@ -58,6 +60,7 @@ def test_every_voxel_is_read_as_it_was(first, shape):
     states[: shape[0] // 2] = 1  # what is alike is one leaf
     tree = Tree(encode_octomap(small_map(states, 0.05, first)))
     assert tree.header == {"id": "OcTree", "size": str(tree.nodes), "res": "0.05"}
+    assert tree.comments == ["# unit: relative"]
     assert np.array_equal(tree.states(np.array(first), shape), states)
 
 
