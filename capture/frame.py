@@ -353,10 +353,11 @@ def make_frame(
     camera: str = "",
     camera_id: str = "",
     depth: DepthImage | None = None,
+    T_base_camera: tuple[float, ...] | None = None,
 ) -> Frame | DroppedFrame:
     """Makes a Frame of what a camera or a file gave; drops it, with the reason, where it is out of a Frame's bounds."""
     try:
-        came = given_pose, motion, gravity, right, exposure, camera, camera_id, depth
+        came = given_pose, motion, gravity, right, exposure, camera, camera_id, depth, T_base_camera
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")

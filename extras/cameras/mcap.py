@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from splatnode.extras.logged.messages import (
     read_times,
     rgb,
 )
+from splatnode.extras.logged.robot_motion import RobotMotion, read_robot_motion
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +50,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     pace: Pace = "fastest"  # recorded: at the pace of the log; fastest: as fast as frames are taken
     intrinsics: Intrinsics | None = None  # the lens, of images of its aspect ratio, instead of what the file tells
+    base_frame: str = "base_link"  # of the robot: where the camera stands on it is read from tf and tf_static
+    # In which tf, or else a topic of odometry, tells where the robot is: the images carry that as their poses; "": none
+    odometry_frame: str = "odom"
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -129,10 +134,16 @@ def _select_topic(config: Config) -> Topic:
 
 def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
     known = config.intrinsics or _lens(config.file, topic)
+    robot, sensor = read_robot_motion(config.file), _sensor(config.file, topic)
+    if not (robot.says_nothing or robot.has_frame(sensor)):
+        event(log, logging.WARNING, "camera_not_on_robot", topic=sanitize_text(topic.name), frame=sanitize_text(sensor))
     index, told = 0, False
     try:
         for message, time in read_in_order(config.file, topic, read_times(config.file, topic)):
             item = _frame(message, time, index, config, known)
+            if isinstance(item, Frame):
+                at_ns = time.log_ns if item.captured_at is None else item.captured_at.ns
+                item = _add_motion(item, robot, sensor, config, at_ns)
             if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
                 sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
                 event(log, logging.WARNING, "lens_of_another_size", topic=sanitize_text(topic.name), **sizes)
@@ -161,6 +172,19 @@ def _frame(
     fits = known is not None and same_aspect(known, width, height)
     own = known.resized(width, height) if known is not None and fits else None
     return make_frame(index, name, time.stream_ns, image, own, captured_at=time.captured_at)
+
+
+def _add_motion(frame: Frame, robot: RobotMotion, sensor: str, config: Config, at_ns: int) -> Frame:
+    """The frame with its camera's place on the robot, its pose by odometry, and gravity, as far as the log tells."""
+    if robot.says_nothing or not sensor:
+        return frame
+    mount = robot.find_pose(config.base_frame, sensor, at_ns)
+    return replace(
+        frame,
+        T_base_camera=None if mount is None else tuple(mount.ravel().tolist()),
+        given_pose=robot.make_given_pose(config.odometry_frame, sensor, at_ns),
+        gravity=robot.make_gravity(sensor, at_ns),
+    )
 
 
 def _lens(file: Path, topic: Topic) -> Intrinsics | None:

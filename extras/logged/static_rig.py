@@ -8,7 +8,7 @@ Sources: tf2_msgs/TFMessage and geometry_msgs of ROS 2; Foxglove's FrameTransfor
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -23,6 +23,7 @@ from splatnode.extras.logged.mcap import Topic, messages, topics
 from splatnode.extras.logged.messages import Cdr, Fields, UnusableMessage, read_picture
 
 _STATIC = "tf_static"  # the last part of the topic on which ROS says what does not move
+_NS = 10**9
 _MOST_FRAMES = 10_000  # coordinate frames of a log
 _SAME = 1e-6  # metres, and sines of angles: a transform that changes by less stands still
 _LEAST_NORM = 1e-6  # of a quaternion
@@ -38,6 +39,7 @@ class Transform:
     child: str
     translation: tuple[float, ...]  # x, y, z
     rotation: tuple[float, ...]  # quaternion x, y, z, w
+    stamp_ns: int = field(default=0, compare=False)  # when it held; 0: not told
 
     @property
     def matrix(self) -> Array:
@@ -64,16 +66,23 @@ class _Quaternion(msgspec.Struct, frozen=True):
     w: float = 0.0
 
 
+class _Time(msgspec.Struct, frozen=True):
+    sec: int = 0
+    nsec: int = 0
+
+
 class _FrameTransform(msgspec.Struct, frozen=True):
     parent_frame_id: str
     child_frame_id: str
     translation: _Vector = _Vector()
     rotation: _Quaternion = _Quaternion(w=1.0)
+    timestamp: _Time = _Time()
 
     @property
     def transform(self) -> Transform:
         shift, turn = (msgspec.structs.astuple(each) for each in (self.translation, self.rotation))
-        return Transform(self.parent_frame_id, self.child_frame_id, shift, turn)
+        stamp_ns = max(0, self.timestamp.sec * _NS + self.timestamp.nsec)
+        return Transform(self.parent_frame_id, self.child_frame_id, shift, turn, stamp_ns)
 
 
 class _FrameTransforms(msgspec.Struct, frozen=True):
@@ -83,9 +92,8 @@ class _FrameTransforms(msgspec.Struct, frozen=True):
 def parse_tf_message(data: bytes) -> list[Transform]:
     values, found = Cdr(data), []
     for _ in range(values.integer()):
-        values.time_ns()
-        parent, child = values.text(), values.text()
-        found.append(Transform(parent, child, values.doubles(3), values.doubles(4)))
+        stamp_ns, parent, child = values.time_ns(), values.text(), values.text()
+        found.append(Transform(parent, child, values.doubles(3), values.doubles(4), stamp_ns))
     return found
 
 
@@ -109,7 +117,9 @@ def _transform_of(fields: Fields) -> Transform:
     shift, turn = fields.message(4), fields.message(5)
     rotation = tuple(_number(turn, number) for number in (1, 2, 3, 4))
     translation = tuple(_number(shift, number) for number in (1, 2, 3))
-    return Transform(fields.text(2), fields.text(3), translation, rotation if any(rotation) else (0.0, 0.0, 0.0, 1.0))
+    rotation = rotation if any(rotation) else (0.0, 0.0, 0.0, 1.0)
+    stamp = fields.message(1)
+    return Transform(fields.text(2), fields.text(3), translation, rotation, stamp.integer(1) * _NS + stamp.integer(2))
 
 
 def _number(fields: Fields, number: int) -> float:
@@ -118,7 +128,7 @@ def _number(fields: Fields, number: int) -> float:
 
 
 # By the schema's name and the messages' encoding, as MCAP has them.
-_TRANSFORMS: dict[tuple[str, str], Callable[[bytes], list[Transform]]] = {
+TRANSFORMS: dict[tuple[str, str], Callable[[bytes], list[Transform]]] = {
     ("tf2_msgs/msg/TFMessage", "cdr"): parse_tf_message,
     ("foxglove.FrameTransform", "json"): parse_frame_transform_json,
     ("foxglove.FrameTransform", "protobuf"): parse_frame_transform_protobuf,
@@ -133,14 +143,14 @@ def read_static_transforms(file: Path) -> dict[str, Transform]:
     Of ROS what is on tf_static, of Foxglove what never changes. Raises UnusableMessage where a message cannot be read,
     and what reading the file raises.
     """
-    told = [topic for topic in topics(file) if topic.kind in _TRANSFORMS and _may_be_static(topic)]
+    told = [topic for topic in topics(file) if topic.kind in TRANSFORMS and may_be_static(topic)]
     found: dict[str, Transform] = {}
     moving: set[str] = set()
     for message in messages(file, {topic.name for topic in told}):
-        if message.topic.kind not in _TRANSFORMS:
+        if message.topic.kind not in TRANSFORMS:
             continue
         with guard_untrusted(UnusableMessage, sanitize_text(message.topic.name)):
-            for each in _TRANSFORMS[message.topic.kind](message.data):
+            for each in TRANSFORMS[message.topic.kind](message.data):
                 if each.child in moving:
                     continue
                 before = found.setdefault(each.child, each)
@@ -153,7 +163,8 @@ def read_static_transforms(file: Path) -> dict[str, Transform]:
     return {child: each for child, each in found.items() if child not in moving}
 
 
-def _may_be_static(topic: Topic) -> bool:
+def may_be_static(topic: Topic) -> bool:
+    """Whether a topic of transforms may tell what does not move."""
     return topic.encoding != "cdr" or topic.name.rpartition("/")[2] == _STATIC
 
 
