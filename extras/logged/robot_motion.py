@@ -96,7 +96,7 @@ def _make_matrix(row: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Inertia:
-    """What an IMU measured, in its frame."""
+    """A measurement of an IMU, in its frame."""
 
     frame: str
     stamp_ns: int

@@ -39,7 +39,7 @@ def add_frame(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
         ),
         parser.add_argument(
             "--gravity",
-            type=_parse_direction,
+            type=_direction_argument,
             metavar="X,Y,Z",
             help="down in the camera of the first photograph, for --frame upright: x right, y down, z forward, as "
             "0,1,0 of a level camera",
@@ -54,19 +54,26 @@ def _parse_frame(text: str) -> str:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _parse_direction(text: str) -> tuple[float, float, float]:
+def _direction_argument(text: str) -> str:
+    """The text itself, where it is a direction: a batch passes it on."""
     try:
-        x, y, z = (float(part) for part in text.split(","))
-        return Gravity((x, y, z)).down
+        _parse_direction(text)
+        return text
     except ValueError as error:
         raise argparse.ArgumentTypeError(
             f"must be three numbers with commas, a direction, as 0,1,0; got {sanitize_text(text, 100)!r}"
         ) from error
 
 
+def _parse_direction(text: str) -> tuple[float, float, float]:
+    """Raises ValueError."""
+    x, y, z = (float(part) for part in text.split(","))
+    return Gravity((x, y, z)).down
+
+
 def collect_frame_changes(args: argparse.Namespace) -> dict[str, Any]:
     """Collects the changes that --frame and --gravity set."""
-    told = {"frame": args.frame, "gravity": None if args.gravity is None else list(args.gravity)}
+    told = {"frame": args.frame, "gravity": None if args.gravity is None else _parse_direction(args.gravity)}
     return {key: value for key, value in told.items() if value is not None}
 
 

@@ -208,7 +208,8 @@ def _find_floor_up(snapshot: Snapshot) -> Up | None:
     if floor is None:
         return None
     x, y, z = (floor.normal / np.linalg.norm(floor.normal)).tolist()
-    return Up((x, y, z), FLOOR_SIGMA_DEG, f"the floor, a plane through {100 * floor.share:.0f} % of the surface")
+    known = f"the floor, a plane through {100 * floor.share:.0f} % of the surface, with cameras taken as held upright"
+    return Up((x, y, z), FLOOR_SIGMA_DEG, known)
 
 
 def make_upright_frame(T_world_camera: Array, up: Array) -> Array:

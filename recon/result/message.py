@@ -107,7 +107,7 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"camera {self.name[:60]!a}: {why}")
 
 
-class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ReferenceFrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A ReferenceFrame."""
 
     name: FrameName
@@ -127,7 +127,7 @@ class ScaleRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     metric: bool  # lengths are metres: a unit has one
     source: Text | None  # of the metres, or why there are none although they were asked for
     interval_95: tuple[Amount, Amount] | None  # of metres: a true length is that many times the stated one
-    frame: FrameRecord | UnsetType = UNSET  # of all coordinates; left out where it is the first camera's
+    frame: ReferenceFrameRecord | UnsetType = UNSET  # of all coordinates; left out where it is the first camera's
 
 
 class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -240,14 +240,14 @@ def parse_scale(record: ScaleRecord) -> Scale:
     return Scale(record.metric, record.source, record.interval_95, _parse_frame(record.frame))
 
 
-def _make_frame_record(frame: ReferenceFrame) -> FrameRecord | UnsetType:
+def _make_frame_record(frame: ReferenceFrame) -> ReferenceFrameRecord | UnsetType:
     if frame == FIRST_CAMERA:
         return UNSET
     source = None if frame.source is None else sanitize_text(frame.source)
-    return FrameRecord(frame.name, source, frame.sigma_deg, frame.T_frame_first_camera)
+    return ReferenceFrameRecord(frame.name, source, frame.sigma_deg, frame.T_frame_first_camera)
 
 
-def _parse_frame(record: FrameRecord | UnsetType) -> ReferenceFrame:
+def _parse_frame(record: ReferenceFrameRecord | UnsetType) -> ReferenceFrame:
     return FIRST_CAMERA if isinstance(record, UnsetType) else ReferenceFrame(**msgspec.structs.asdict(record))
 
 

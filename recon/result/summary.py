@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatnode.capture.process.terminal import say
+from splatnode.recon.result.reference_frame import FIRST_CAMERA
 from splatnode.recon.result.snapshot import Snapshot, describe_moving, format_widest_bounds
 
 
@@ -25,6 +26,8 @@ def print_summary(snapshot: Snapshot, out: Path) -> None:
             say(f"how well the cameras are known: {known}")
         if snapshot.scale.source is not None:
             say(f"lengths: {snapshot.scale.sentence}")
+        if snapshot.scale.frame != FIRST_CAMERA:
+            say(f"frame: {snapshot.scale.frame.sentence}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
         say(

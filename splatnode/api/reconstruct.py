@@ -272,7 +272,8 @@ def reconstruct(
 ) -> Result:
     """Reconstructs images: the same cameras and Gaussians, to the bit, as `splatnode replay`.
 
-    A rejection is a result, too: ask `verdict.publishable`. Several threads may call this at once.
+    A rejection is a result, too: ask `verdict.publishable`. Several threads may call this at once. Raises TypeError and
+    ValueError for wrong arguments, and FileNotFoundError.
 
     - `images`: a folder, a video, an image topic `"drive.mcap#/front/image"`, an episode `"pusht#3/CAMERA"` of a
       LeRobot data set, a list of paths in one folder, or a list of arrays (H, W, 3) uint8 RGB or PIL images. Grey
@@ -295,52 +296,47 @@ def reconstruct(
       files (16-bit PNG, .npy, .exr), or aligned arrays (H, W): uint16 millimetres, float metres; None: unknown.
     - `scale`: the metres between two cameras, `("a.jpg", "b.jpg", 0.5)` or by places in the list, `(0, 3, 0.5)`;
       `splatnode.Marker(0.1)`; `splatnode.Stereo`; or a list of these. None: lengths have no unit.
-    - `frame`: the frame of reference of results: `first_camera`, `base` (the robot's at the first image), `odometry`
-      (that of the poses) or `upright` (z up by gravity or the floor). None: that of the poses, else the first camera's.
-      Where it is not known the verdict is `FRAME_UNKNOWN`.
-    - `T_base_camera`: (4, 4) in metres, the camera on the robot's base (x forward, y left, z up), or by camera id.
-    - `gravity`: down (3,) in the first camera's frame, or a mapping by image name.
+    - `frame`: of reference: `first_camera`, `base` (the robot's, at the first image), `odometry` (that of the poses) or
+      `upright` (z up). None: that of the poses, else the first camera's. Unknown: the verdict is `FRAME_UNKNOWN`.
+    - `T_base_camera`: (4, 4) in metres, the camera on the base (x forward, y left, z up), or by camera id. `gravity`:
+      down (3,) in the first camera's frame, or a mapping by image name.
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: a mapping or a YAML file of what differs from the preset (`docs/configuration.md`).
     - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
     - `only_seen`: leaves out what no two images confirm, and the far background.
-    - `seed`: of random numbers. None: the configuration's, 0.
-    - `threads`: at most, of torch and of the compiled core. None: as many as there are processors.
-    - `tell`: the progress callback, in the calling thread: a step with `doing`, `done`, `of`, or a line of text. An
-      exception in it cancels the work.
-
-    Raises TypeError and ValueError for wrong arguments, and FileNotFoundError.
+    - `seed`: of random numbers (None: 0). `threads`: at most, of torch and of the compiled core (None: all processors).
+    - `tell`: gets steps (`doing`, `done`, `of`) and lines of text, in the calling thread; an exception in it cancels.
     """
-    telling = tell or ignore_progress
     check_counts(views=views, threads=threads)
+    telling = tell or ignore_progress
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     loaded = load_frames(images, views, every_frame, telling, several)
     source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
     trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
-    metric = (sigmas_of(poses_sigma) or {}) | frame_changes(frame, gravity)
-    flags = {"budget_s": budget_s, "seed": seed, "metric": metric or None, "registration": hold_poses(trusted)}
+    metric = frame_changes(frame, gravity, poses_sigma)
+    flags = {"budget_s": budget_s, "seed": seed, "metric": metric, "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     source, chosen = apply_rig(_add_frame_evidence(source, T_base_camera, gravity), chosen, rig, telling)
     check_baseline(chosen, source)
-    known = poses_given(poses, images, source.frames)
-    if trusted and known is not None:
-        source, known = _hold_cameras(source, known, poses_sigma, chosen, own), None  # they are the photographs' own
+    source, known = _hold_cameras(source, poses_given(poses, images, source.frames), poses_sigma, chosen, own, trusted)
     given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
 
 
 def frame_changes(
-    frame: FrameChoice | None, gravity: npt.ArrayLike | Mapping[str, npt.ArrayLike] | None
-) -> dict[str, Any]:
-    """Returns the settings of `metric` for a frame of reference and for gravity of the first image.
+    frame: FrameChoice | None,
+    gravity: npt.ArrayLike | Mapping[str, npt.ArrayLike] | None,
+    poses_sigma: PosesSigma | None,
+) -> dict[str, Any] | None:
+    """Returns the settings of `metric` for the frame of reference, gravity of the first image, and poses; None: none.
 
     Raises TypeError, ValueError.
     """
     told = None if gravity is None or isinstance(gravity, Mapping) else make_gravity(gravity, None)
     changes = {"frame": frame, "gravity": None if told is None else list(told.down)}
-    return {key: value for key, value in changes.items() if value is not None}
+    return {key: value for key, value in changes.items() if value is not None} | (sigmas_of(poses_sigma) or {}) or None
 
 
 def _add_frame_evidence(source: Source, T_base_camera: Mounts | None, gravity: Any) -> Source:
@@ -371,13 +367,16 @@ def _apply_given(
 
 def _hold_cameras(
     source: Source,
-    known: Mapping[str, npt.NDArray[np.float64]],
+    known: Mapping[str, npt.NDArray[np.float64]] | None,
     sigma: PosesSigma | None,
     config: ReconstructionConfig,
     own: Mapping[str, Sigmas],
-) -> Source:
-    """The frames with the poses that hold their cameras."""
-    return add_poses(source, known, None if sigmas_of(sigma) is None else config.metric.poses_sigmas, own)
+    trusted: bool,
+) -> tuple[Source, Mapping[str, npt.NDArray[np.float64]] | None]:
+    """The frames with the poses that hold their cameras, where they are trusted; and those that do not."""
+    if known is None or not trusted:
+        return source, known
+    return add_poses(source, known, None if sigmas_of(sigma) is None else config.metric.poses_sigmas, own), None
 
 
 def build_config(

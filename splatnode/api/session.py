@@ -28,7 +28,6 @@ from splatnode.api.reconstruct import (
     frame_changes,
     is_stereo,
     parse_matrix,
-    sigmas_of,
 )
 from splatnode.api.result import Result, result_of
 from splatnode.capture.frame import Baseline, Frame, RightImage, Stamp, grey
@@ -94,8 +93,7 @@ class Session:
         check_counts(threads=threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
-        metric = (sigmas_of(poses_sigma) or {}) | frame_changes(frame, None)
-        flags = {"seed": seed, "metric": metric or None}
+        flags = {"seed": seed, "metric": frame_changes(frame, None, poses_sigma)}
         self._mounts = parse_mounts(T_base_camera)
         self._config = build_config(preset, config, flags, scale, of_pictures=True)
         self._only_checks = poses_only_check

@@ -16,6 +16,7 @@ from splatnode.capture.process.terminal import ProgressStep
 from splatnode.recon.locating.outcome import LocalizationBounds
 from splatnode.recon.occupancy.grid import Upright
 from splatnode.recon.result.depth_check import DepthCheck
+from splatnode.recon.result.reference_frame import ReferenceFrame
 from splatnode.recon.result.verdict import Bounds, Verdict
 from tests.reference.comments import field_comments
 
@@ -26,7 +27,7 @@ What `import splatnode` gives. Each name is loaded when it is first used, so tha
 
 Arrays are NumPy's. Axes are OpenCV's: x right, y down, z forward; quaternions are wxyz; the centre of the top-left
 pixel is at (0.5, 0.5). The world is the frame of the first camera that was placed, or that of the poses that were
-given. Records are frozen; they and results can be pickled, and used by several threads.
+given, or [another one](frames.md). Records are frozen; they and results can be pickled, and used by several threads.
 
 This page is made from the code by `python -m tests.reference`; change it there.
 """
@@ -59,6 +60,7 @@ _FURTHER = (
     Bounds,
     LocalizationBounds,
     Upright,
+    ReferenceFrame,
     DroppedFrame,
     Stamp,
     ProgressStep,

@@ -17,7 +17,7 @@ from splatnode.recon.daemon.node import RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.occupancy.message import MapHeader, MapRecord
 from splatnode.recon.result.export.format import list_format_names
-from splatnode.recon.result.message import BoundsRecord, CameraRecord, ScaleRecord, SceneHeader
+from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
 from tests.conftest import ROOT
 
@@ -79,6 +79,7 @@ def test_no_verdict_is_explained_that_there_is_not():
 SECTIONS = {
     "SceneHeader": SceneHeader,
     "ScaleRecord": ScaleRecord,
+    "ReferenceFrameRecord": ReferenceFrameRecord,
     "MapHeader": MapHeader,
     "MapRecord": MapRecord,
     "CameraRecord": CameraRecord,

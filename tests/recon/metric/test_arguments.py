@@ -73,3 +73,26 @@ def test_drift_is_a_share_of_the_way_and_degrees():
             parser.parse_args(["--poses-drift", wrong])
     with pytest.raises(ValueError, match="which poses drift"):
         collect_drift_changes(parser.parse_args(["--poses-drift", "2%"]))
+
+
+def test_frame_and_gravity_become_the_configuration():
+    assert (configured().frame, configured().gravity) == (None, None)
+    for told, meant in (("base_link", "base"), ("odom", "odometry"), ("upright", "upright")):
+        assert configured("--frame", told).frame == meant
+    assert configured("--gravity", "-0.5,1,0").gravity == (-0.5, 1.0, 0.0)
+    args = build_parser().parse_args(["batch", "all", "--out", "out", "--frame", "odom", "--gravity", "-1,0,0"])
+    assert replay_options(args) == ["--frame", "odometry", "--gravity", "-1,0,0"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--frame", "world"], "must be one of first_camera, base, odometry, upright, base_link, odom; got 'world'"),
+        (["--gravity", "0,0,0"], "must be three numbers with commas, a direction"),
+        (["--gravity", "down"], "must be three numbers with commas, a direction"),
+    ],
+)
+def test_what_is_no_frame_and_no_gravity_is_told(capsys, options, said):
+    with pytest.raises(SystemExit):
+        configured(*options)
+    assert said in capsys.readouterr().err

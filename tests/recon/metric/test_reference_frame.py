@@ -11,21 +11,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from splatnode.capture.diorama.render import look_at
 from splatnode.capture.odometry import Gravity, Motion, make_given_pose
 from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.measurement import Baseline, MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.reference_frame import UnknownFrame, check_frame, make_upright_frame
+from splatnode.recon.metric.reference_frame import UnknownFrame, check_frame, make_upright_frame, transform_rigidly
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import make_scale_record, parse_scale
 from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame, encode_matrix, parse_frame_name
 from splatnode.recon.result.report import build_report
-from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
 from splatnode.recon.result.verdict import Code, Scale
 from tests.recon.metric.test_poses import NAMES, TRUE, UNIT, scene
+from tests.recon.occupancy.test_floor import room
 
 # A camera 0.3 m before the base and 1.2 m above it, which looks ahead: REP 103's optical frame on a base.
 AHEAD = np.array([[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.2], [0.0, 0.0, 0.0, 1.0]])
@@ -100,6 +102,27 @@ def test_gravity_may_be_told_of_the_first_image():
     assert moved.scale.frame.source == "gravity as it was told for the first image"
     with pytest.raises(ValueError, match="direction of three numbers"):
         MetricConfig(gravity=(0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, -1.1, 2.0)])
+def test_a_floor_tells_where_up_is_however_the_world_is_turned(turn):
+    points = room(np.random.default_rng(0), 3000, 6000, 9000).astype(np.float32)
+    count = len(points)
+    shapes = np.tile([1.0, 0, 0, 0], (count, 1)), np.full((count, 3), 0.01), np.full(count, 0.5)
+    quats, scales, opacities = (each.astype(np.float32) for each in shapes)
+    seen = GaussianArrays(points, quats, scales, opacities, np.zeros((count, 1, 3), np.float32), np.zeros(count, int))
+    Ts = [look_at(np.array([-1.0, y, 1.5]), np.array([2.0, 0.0, 0.5])) for y in (-1.0, 0.0, 1.0)]
+    cameras = tuple(replace(old, T_world_camera=T) for old, T in zip(scene().cameras, Ts, strict=False))
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), [3.0, -1.0, 2.0]
+    known = transform_rigidly(replace(scene(), cameras=cameras, gaussians=seen), world)
+    moved = apply_metric_scale(known, asked("upright", metric=False))
+    first = moved.cameras[0].T_world_camera
+    off = np.degrees(np.arccos((first[:3, :3].T @ UP) @ (Ts[0][:3, :3].T @ UP)))
+    assert off < 0.3 and moved.scale.frame.sigma_deg == 1.0 and "the floor" in (moved.scale.frame.source or "")
+    assert moved.up is not None and moved.up.direction == (0.0, 0.0, 1.0)
+    unconfirmed = replace(known, gaussians=replace(seen, source_frame=np.full(count, -1)))
+    assert apply_metric_scale(unconfirmed, asked("upright", metric=False)).verdict.code is Code.FRAME_UNKNOWN
 
 
 def test_a_camera_that_looks_straight_down_has_an_upright_frame():

@@ -6,8 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from splatnode.recon.metric.reference_frame import transform_rigidly
+from splatnode.recon.occupancy.formats.nav2 import encode_nav2
 from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
+from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Scale
 from tests.support.exported import make_snapshot
@@ -130,3 +134,30 @@ def test_depths_of_other_photographs_are_told(room, shape):
 def test_what_cannot_be_used_is_told(room, arguments, said):
     with pytest.raises(ValueError, match=said):
         occupancy_map(room, **arguments)
+
+
+@pytest.mark.parametrize("name", [FrameName.BASE, FrameName.ODOMETRY, FrameName.UPRIGHT])
+def test_a_map_has_the_x_and_y_of_a_frame_whose_z_is_up(room, name):
+    lowered = np.eye(4)
+    lowered[:3, 3] = [5.0, -2.0, -0.4]  # the frame's origin is .4 above the floor
+    moved = transform_rigidly(room, lowered)
+    found = occupancy_map(replace(moved, scale=Scale(True, "a marker", None, ReferenceFrame(name))))
+    np.testing.assert_allclose(found.T_world_map[:2, :4], np.eye(4)[:2], atol=1e-12)
+    np.testing.assert_allclose(found.T_world_map[2], [0, 0, 1, -0.4], atol=0.01)
+    assert found.upright.is_of_result and found.upright.on_floor and name.value in found.upright.source
+    free = corners(found, VoxelState.FREE)
+    assert free[..., 0].max() < WALL + 5.0 and free[..., 2].min() > -0.41
+    assert b"x and y are of the result's frame" in encode_nav2(found, (0.3, 0.6))["map.yaml"]
+
+
+def test_poses_in_a_world_whose_z_is_not_up_give_a_map_no_axes(room):
+    tilted = np.eye(4)
+    tilted[:3, :3] = Rotation.from_euler("x", 90, degrees=True).as_matrix()  # y is down, as of a tracker
+    moved = transform_rigidly(room, tilted)
+    frame = ReferenceFrame(FrameName.ODOMETRY)
+    found = occupancy_map(replace(moved, scale=Scale(True, "poses", None, frame)))
+    np.testing.assert_allclose(found.T_world_map[:3, 2], tilted[:3, 2], atol=0.01)
+    assert not found.upright.is_of_result and "the floor" in found.upright.source
+    first = occupancy_map(replace(room, scale=Scale(True, "a marker")))
+    assert not first.upright.is_of_result  # the first camera's frame has none
+    assert b"x is forward of the first camera" in encode_nav2(first, (0.3, 0.6))["map.yaml"]
