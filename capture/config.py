@@ -82,7 +82,7 @@ Mount: TypeAlias = tuple[Row, Row, Row, Row]
 def check_mount(T_base_camera: Mount | None) -> None:
     """Raises ValueError where the matrix is no rigid motion in metres."""
     if T_base_camera is not None and (problem := rigid_problem([number for row in T_base_camera for number in row])):
-        raise ValueError(f"T_base_camera must be {problem}")
+        raise ValueError(f"the mount T_base_camera must be {problem}")
 
 
 def mount_camera(

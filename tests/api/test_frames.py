@@ -9,8 +9,9 @@ import splatnode
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.result.reference_frame import FrameName
 from splatnode.recon.result.verdict import Code
-from tests.api.conftest import QUICK, SMALL
+from tests.api.conftest import SMALL
 
+QUICK = {"optimize": {"iterations": 5}}
 TRUE = [T for T, _ in synthetic.scene_cameras(SMALL)]
 APART = float(np.linalg.norm(TRUE[3][:3, 3] - TRUE[0][:3, 3]))
 MOUNT = np.array([[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, 1.2], [0.0, 0.0, 0.0, 1.0]])

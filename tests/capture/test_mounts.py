@@ -50,7 +50,7 @@ def test_recordings_and_messages_keep_the_mount(tmp_path):
     frame = Frame(0, "a.png", 5, np.full((48, 64, 3), 90, np.uint8), None, T_base_camera=NUMBERS)
     with recording.Recorder(tmp_path / "new") as recorder:
         recorder.write(frame)
-    (again,) = recording.read(tmp_path / "new").frames
+    (again,) = list(recording.read(tmp_path / "new").frames())
     assert isinstance(again, Frame) and again.T_base_camera == NUMBERS
     header = FrameHeader(session="0" * 32, sequence=0, mono_ns=0, frame_id=0, **describe_stored_frame(frame))
     assert frame_in(header, 0, arrays_of(frame)).T_base_camera == NUMBERS
