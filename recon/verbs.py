@@ -107,6 +107,17 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
+def _doctor_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rates",
+        nargs="*",
+        type=positive,
+        metavar="VIEWS",
+        help="measure the seconds of each step of a growing scene with so many views (default: 3 6 12; two minutes)",
+    )
+    add_json(parser)
+
+
 VERBS = (
     REPLAY,
     Verb(
@@ -153,8 +164,8 @@ VERBS = (
     ),
     Verb(
         "doctor",
-        "tell what is installed and what is missing",
-        add_json,
+        "tell what is installed and what is missing, or how fast this machine is",
+        _doctor_arguments,
         import_lazily("splatnode.recon.doctor", "doctor"),
     ),
 )
