@@ -42,6 +42,11 @@ def _recon_arguments(parser: argparse.ArgumentParser) -> None:
         help="where it keeps what it goes on from when it is started again; another folder begins with nothing",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
+    parser.add_argument(
+        "--finish",
+        action="store_true",
+        help="finalize all scenes, merge those of each map, and end; a node that runs already does it, and this waits",
+    )
     add_marker(parser)
 
 
