@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -20,9 +21,10 @@ from splatnode.recon import core
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.locating.localize import localize_image
-from splatnode.recon.locating.outcome import Located
+from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.occupancy.grid import NoMap, occupancy_map
 from splatnode.recon.pipeline import rebuild_from_scratch
+from splatnode.recon.result.snapshot import Landmarks
 
 VIEWS = (3, 6, 12)
 FEWEST, MOST = 2, 48
@@ -91,11 +93,7 @@ def _measure(count: int, config: ReconstructionConfig, tell: Tell) -> Rates:
     add_s, _ = _time(lambda: work.add_frame(last))
     update_s, _ = _time(work.update)
     finalize_s, (*_, snapshot) = _time(lambda: list(rebuild_from_scratch(work)))
-    tried = []
-    landmarks = snapshot.landmarks
-    for camera in synthetic.evaluation_cameras(capture)[:_QUERIES] if landmarks is not None else ():
-        image = synthetic.render_image(capture, camera)
-        tried.append(_time(lambda image=image: localize_image(landmarks, image, None)))
+    tried = _localize(capture, snapshot.landmarks)
     map_s = None
     with suppress(NoMap):
         map_s, _ = _time(lambda: occupancy_map(snapshot))
@@ -110,6 +108,15 @@ def _measure(count: int, config: ReconstructionConfig, tell: Tell) -> Rates:
         verdict=snapshot.verdict.code.value,
         gaussians=len(snapshot.gaussians),
     )
+
+
+def _localize(capture: synthetic.Config, landmarks: Landmarks | None) -> list[tuple[float, Located | NotLocated]]:
+    """Seconds and outcomes of query images between those of the scene; none where there is no scene."""
+    if landmarks is None:
+        return []
+    queries = synthetic.evaluation_cameras(capture)[:_QUERIES]
+    images = [synthetic.render_image(capture, camera) for camera in queries]
+    return [_time(partial(localize_image, landmarks, image, None)) for image in images]
 
 
 def _time(work: Callable[[], Made]) -> tuple[float, Made]:
