@@ -188,7 +188,7 @@ def _wait_for_running_node(config: DaemonConfig, stopping: threading.Event) -> i
 
 class Daemon:
     def __init__(self, config: DaemonConfig, stopping: threading.Event, finish: bool = False) -> None:
-        """With `finish` it ends by itself, once all that came is in a final scene and maps are merged.
+        """If `finish`, the daemon ends by itself once every keyframe is in a final scene and the maps are merged.
 
         Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
@@ -273,7 +273,7 @@ class Daemon:
         event(log, logging.INFO, "stopped")
 
     def _end_if_finished(self) -> None:
-        """Of a node that finishes: merges what is final, then stops."""
+        """Merges the final scenes of a node that finishes, then stops it."""
         if self._finish is None:
             return
         if self._merged is not None:
@@ -288,7 +288,7 @@ class Daemon:
             self._merged, self._merged_s = self._start_thread(self._merge_maps), time.monotonic()
 
     def _describe_left(self) -> str:
-        """What is left to be done; empty where all is final."""
+        """Describes the work that is left; empty where all is final."""
         waiting, places = self._worker.count_waiting(), self._worker.num_unfinished
         left = [f"keyframes that no scene shows yet: {waiting}"] if waiting else []
         left += [f"places that are not final yet: {places}"] if places else []
