@@ -68,7 +68,7 @@ def _choose_times(cameras: Sequence[CameraEstimate]) -> list[int]:
 def _make_scene_messages(snapshot: Snapshot, ns: int) -> list[Message]:
     verdict, gaussians, landmarks = snapshot.verdict, snapshot.gaussians, snapshot.landmarks
     said = " ".join(part for part in (f"{verdict.code.value}:", verdict.message, verdict.advice) if part)
-    said += f" Lengths are {snapshot.scale.sentence}."
+    said += f" Lengths are {snapshot.scale.sentence}. The frame is {snapshot.scale.frame.sentence}."
     level = _INFO if verdict.publishable else _WARNING
     log = {"timestamp": make_time(ns), "level": level, "message": said, "name": "splatnode", "file": "", "line": 0}
     found: list[Message] = [("/verdict", ns, log)]

@@ -137,5 +137,6 @@ def _format_text(snapshot: Snapshot) -> str:
     counts = f"{len(snapshot.cameras)} cameras, {len(snapshot.gaussians)} Gaussians; lengths {snapshot.scale.sentence}"
     dropped = [f"- {escape_text(frame.name)}: {frame.reason}" for frame in snapshot.dropped]
     left_out = ["Left out:", "\n".join(dropped)] if dropped else []
-    lines = [f"# {verdict.code.value}", verdict.message, verdict.advice, counts, *left_out]
+    frame = f"Frame: {snapshot.scale.frame.sentence}"
+    lines = [f"# {verdict.code.value}", verdict.message, verdict.advice, counts, frame, *left_out]
     return "\n\n".join(line for line in lines if line)

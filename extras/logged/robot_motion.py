@@ -35,7 +35,8 @@ _MOST_FRAMES = 10_000  # coordinate frames of a log
 _LONGEST_GAP_S = 1.0  # between two transforms: what lies farther apart is not interpolated
 _BEYOND_S = 0.1  # before the first and after the last transform: it is taken to stand still so long
 _WINDOW_S = 0.25  # before and after an image: of accelerations, whose mean is what gravity does
-_LEAST_SAMPLES = 3
+_LEAST_SAMPLES, _MOST_SAMPLES = 3, 500
+_DEEPEST = 100  # coordinate frames above each other
 _STANDARD_GRAVITY = 9.80665  # m/s²
 _MOST_OFF = 1.5  # m/s² by which the mean acceleration may differ from it: else the robot speeds up, or brakes
 _LEAST_NORM = 1e-6  # of a quaternion
@@ -143,9 +144,9 @@ class RobotMotion:
         return T
 
     def _list_ancestors(self, frame: str) -> list[str]:
-        """The frame and those above it; as far as they are no circle."""
+        """The frame and those above it, no more than any robot has; as far as they are no circle."""
         found = [frame]
-        while (link := self.links.get(found[-1])) is not None and link.parent not in found:
+        while (link := self.links.get(found[-1])) is not None and link.parent not in found and len(found) < _DEEPEST:
             found.append(link.parent)
         return found
 
@@ -167,7 +168,7 @@ class RobotMotion:
             low, high = np.searchsorted(table[:, 0], [at_s - _WINDOW_S, at_s + _WINDOW_S])
             if T_sensor_imu is None or high - low < _LEAST_SAMPLES:
                 continue
-            accelerations = _turn_back(table[low:high], at_s)
+            accelerations = _turn_back(table[low : high : -(-(high - low) // _MOST_SAMPLES)], at_s)
             mean = accelerations.mean(0)
             off = abs(float(np.linalg.norm(mean)) - _STANDARD_GRAVITY)
             if off > _MOST_OFF:

@@ -10,12 +10,13 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.text import LONGEST_TEXT
+from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.levels_of_detail import find_far_shell
 from splatnode.recon.result.npz_files import read_depths
 from splatnode.recon.result.placement import Placement
+from splatnode.recon.result.reference_frame import ReferenceFrame
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, format_rounded_up
 from splatnode.recon.result.stored_snapshot import read_up
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry, group_edges, walk_edges
@@ -128,6 +129,7 @@ def scale_and_up(whole: MapSet, of: JoinedMap, scenes: Sequence[str]) -> tuple[S
     if not further:
         return scale, up
     worst = _find_largest_sigmas(whole, of.name, further)
+    scale = replace(scale, frame=_combine_frames(scale.frame, worst, of.name))
     return _combine_scales(scale, worst, of.name, len(further)), up and _combine_up(up, worst, of.name)
 
 
@@ -161,6 +163,16 @@ def _combine_scales(scale: Scale, worst: _Sigmas | None, first: str, further: in
 def _set_source(scale: Scale, source: str) -> Scale:
     """Sets the source, unless it is longer than files may have it."""
     return replace(scale, source=source) if len(source) <= LONGEST_TEXT else scale
+
+
+def _combine_frames(frame: ReferenceFrame, worst: _Sigmas | None, first: str) -> ReferenceFrame:
+    """The frame of the first scene, in which the further ones may be turned; its first camera stays that of a map."""
+    if frame.source is None:
+        return frame
+    source = sanitize_text(f"{frame.source}, in {first}", LONGEST_TEXT)
+    if frame.sigma_deg is None or worst is None:
+        return replace(frame, source=source)
+    return replace(frame, source=source, sigma_deg=min(math.hypot(frame.sigma_deg, worst.deg), 180.0))
 
 
 def _combine_up(up: Up, worst: _Sigmas | None, first: str) -> Up:

@@ -44,7 +44,7 @@ _AXES = {
 class ReferenceFrame:
     """The frame that all coordinates of a result are in."""
 
-    name: FrameName = FrameName.FIRST_CAMERA
+    name: FrameName = FrameName.FIRST_CAMERA  # which it is
     source: str | None = None  # how it is known, in words; None: the first camera's needs no word
     sigma_deg: float | None = None  # of an upright one: standard deviation of its z axis in each direction, degrees
     # The first camera's pose in it, in the result's unit: p_frame = T_frame_first_camera @ p_first_camera

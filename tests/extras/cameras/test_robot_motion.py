@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -168,6 +169,19 @@ def test_transforms_that_are_no_tree_or_no_motion_harm_nothing(tmp_path):
     file = write_drive(tmp_path / "drive.mcap", images=2, further=(circle, far, short))
     assert all(frame.given_pose is not None for frame in read(file))
     assert read_robot_motion(file).find_pose("a", OPTICAL, START_NS) is None
+
+
+def test_a_log_that_is_made_to_take_long_does_not(tmp_path):
+    chain = [(f"f{n + 1}", f"f{n}", np.eye(4)) for n in range(5000)] + [("f0", OPTICAL, T_LINK_OPTICAL)]
+    dense = [ros2.imu(START_NS + n, "imu_link", (0.0, 0.0, -9.81), turn=(1.0, 2.0, 3.0)) for n in range(3000)]
+    shots = [ros2.compressed(START_NS + n, OPTICAL, IMAGE) for n in range(40)]
+    body = [ros2.transforms(ros2.STATIC, START_NS, *chain), ros2.transforms(ros2.STATIC, START_NS, IMU)]
+    file = mcap_files.write(tmp_path / "a.mcap", [*body, *dense, *shots])
+    begun = time.process_time()
+    assert [frame.mount for frame in read(file, base_frame="f5000")] == [None] * 40
+    assert time.process_time() - begun < 20.0
+    on_base = ros2.transforms(ros2.STATIC, START_NS, *BODY, IMU)
+    assert all(frame.gravity for frame in read(mcap_files.write(tmp_path / "b.mcap", [on_base, *dense, *shots[:3]])))
 
 
 def test_messages_are_read_as_they_are_defined():

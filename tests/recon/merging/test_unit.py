@@ -18,6 +18,12 @@ from tests.support.walk import write_walk
 
 SOURCE = "marker 0 of 100 mm in 3 photographs, known to 1.1 %"
 FIRST = {"scale": "metric", "scale_source": SOURCE, "scale_interval_95": [math.exp(-0.01), math.exp(0.01)]}
+FRAME = {
+    "frame": "upright",
+    "frame_source": "gravity",
+    "frame_sigma_deg": 0.3,
+    "T_frame_first_camera": [[1.0, 0.0, 0.0, 0.25], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]],
+}
 UP = {"direction": [0.0, -1.0, 0.0], "sigma_deg": 0.3, "source": "gravity of 4 photographs"}
 SCENES = ("scene-0001", "scene-0002", "scene-0003", "scene-0004")
 
@@ -49,6 +55,7 @@ def link(first: int, second: int, sigma: float, retracted: str | None = None) ->
 
 def test_a_merged_map_is_known_as_well_as_the_links_know_its_scenes(tmp_path):
     out = metric_walk(tmp_path / "out", sigma_scale=0.02, sigma_deg=0.4)
+    change(out / "scene-0001" / "cameras.json", **FRAME)
     assert main(["merge", str(out)]) == 0
     folder = out / "map-scene-0001"
     told = json.loads((folder / "cameras.json").read_text())
@@ -59,6 +66,8 @@ def test_a_merged_map_is_known_as_well_as_the_links_know_its_scenes(tmp_path):
     )
     up = json.loads((folder / "report.json").read_text())["up"]
     assert up["sigma_deg"] == pytest.approx(0.5) and up["source"].endswith(", in scene-0001")
+    assert told["frame"] == "upright" and told["frame_source"] == "gravity, in scene-0001"
+    assert told["frame_sigma_deg"] == pytest.approx(0.5) and told["T_frame_first_camera"][0][3] == 0.25
     for name in ("levels.json", "report.json", "manifest.json"):
         assert json.loads((folder / name).read_text())["scale_interval_95"] == told["scale_interval_95"], name
 
