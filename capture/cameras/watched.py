@@ -75,6 +75,7 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     motion: Motion | None = None
     gravity: Gravity | None = None
     exposure: ExposureSettings | None = None
+    T_base_camera: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)] | None = None
 
 
 class UnusableSidecar(ValueError):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens, same_aspect
@@ -17,6 +17,7 @@ from splatnode.recon.locating.localize import (
 )
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.result.export.staged import json_bytes, write_file
+from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.npz_files import read_landmarks
 from splatnode.recon.result.snapshot import Landmarks
 
@@ -41,7 +42,9 @@ def locate(args: argparse.Namespace) -> int:
         say(f"the lens was not given to {of_other_lens} of them, which have another aspect ratio than its images")
     say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
     if args.json is not None:
-        told = {"result": str(args.result), "scale": "metric" if landmarks.metric else "relative"}
+        world = replace(StoredResult.create_from_path(args.result).scale(), metric=landmarks.metric)
+        told = {"result": str(args.result), "unit": world.unit, "scale": world.word, "frame": None}  # nobody tells it
+        told |= world.frame.record() if (args.result / "cameras.json").is_file() else {}
         write_file(args.json, json_bytes({**told, "photographs": records}))
         say(f"results: {args.json}")
     return EXIT_REFUSED if refused else EXIT_GOOD

@@ -20,6 +20,7 @@ TOLD = {
     "motion": {"chain": "wheels", "T_start_current": POSE, "sigma_m": 0.1, "sigma_deg": 3.0},
     "gravity": {"down": [0, 1, 0]},
     "exposure": {"time_s": 0.01, "iso": 200},
+    "T_base_camera": POSE,
 }
 
 
@@ -38,6 +39,7 @@ def test_what_the_file_tells_goes_with_the_image(tmp_path):
     assert (frame.intrinsics.fx, frame.intrinsics.width) == (50, 64)
     assert frame.given_pose.T_world_camera == tuple(POSE) and frame.given_pose.sigma_m == 0.001
     assert (frame.motion.chain, frame.gravity.down) == ("wheels", (0, 1, 0))
+    assert frame.T_base_camera == tuple(POSE)
     assert frame.exposure == ExposureSettings(0.01, 200) and frame.image.shape == (48, 64, 3)
 
 
@@ -55,6 +57,7 @@ def test_what_it_does_not_tell_is_as_without_it(tmp_path):
         ({"given_pose": {"T_world_camera": POSE[:12]}}, "length >= 16"),
         ({"given_pose": {"T_world_camera": [2.0, *POSE[1:]]}}, "a rigid motion"),
         ({"gravity": {"down": [0, 0, 0]}}, "not zero"),
+        ({"T_base_camera": [2.0, *POSE[1:]]}, "T_base_camera must be a rigid motion"),
         ({"intrinsics": TOLD["intrinsics"] | {"width": 96}}, "aspect ratio"),
         ({"captured_at": {"ns": -1, "clock": "utc"}}, "a.json cannot be used"),
         (" " * 70_000, "at most 65536"),

@@ -13,7 +13,10 @@ from splatnode.capture.image_file import encode_png
 from splatnode.capture.recording import Recorder
 from splatnode.command_line import main
 from splatnode.recon.locating.localize import stream_query_frames as named
+from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
+from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
+from splatnode.recon.result.verdict import Scale
 from tests.support.located import PLACE, known_place, photograph
 
 
@@ -40,7 +43,12 @@ def test_a_folder_of_photographs_is_placed(result, photographs, tmp_path, capsys
     out = capsys.readouterr().out
     assert "0.png: placed at (" in out and "3.png: placed at (" in out and "2 of 2 photographs were placed" in out
     told = json.loads(found.read_text())
+    assert (told["unit"], told["frame"]) == ("relative", None)  # without cameras.json nobody tells the frame
     assert told["scale"] == "relative" and [each["name"] for each in told["photographs"]] == ["0.png", "3.png"]
+    frame = ReferenceFrame(FrameName.BASE, "T_base_camera of 0.png")
+    (result / "cameras.json").write_bytes(encode_cameras((), Scale(True, "a marker", None, frame)))
+    assert main(["locate", str(result), str(photographs / "0.png"), "--json", str(found)]) == 0
+    assert json.loads(found.read_text())["frame"] == "base"
     first = told["photographs"][0]
     assert first["placed"] and np.shape(first["T_world_camera"]) == (4, 4) and np.shape(first["covariance"]) == (6, 6)
     assert first["width"] == PLACE.width and first["claim"]["rotation_deg"] > 0 and first["points"] > 100
