@@ -16,7 +16,7 @@ from splatnode.capture.frame import (
     make_optional_field,
     read_optional_field,
 )
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers
 from splatnode.capture.process.text import LONGEST_NAME
 
 _Name = Annotated[str, msgspec.Meta(min_length=1, max_length=LONGEST_NAME)]
@@ -40,7 +40,7 @@ class FrameMeta(msgspec.Struct, frozen=True, kw_only=True):
     exposure: ExposureSettings | UnsetType = UNSET
     camera: _Name | UnsetType = UNSET
     camera_id: _Name | UnsetType = UNSET
-    T_base_camera: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)] | UnsetType = UNSET
+    T_base_camera: MountNumbers | UnsetType = UNSET
 
 
 def describe_frame(frame: Frame) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import msgspec
 import numpy as np
@@ -61,6 +61,13 @@ def rigid_problem(numbers: Sequence[float]) -> str:
     if turned or np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _EXACT:
         return "a rigid motion: a rotation, a translation, and 0 0 0 1"
     return ""
+
+
+# T_base_camera as records have it: 16 numbers row by row, in metres.
+MountNumbers: TypeAlias = Annotated[
+    tuple[Annotated[float, msgspec.Meta(ge=-LARGEST_M, le=LARGEST_M)], ...],
+    msgspec.Meta(min_length=16, max_length=16),
+]
 
 
 def make_rigid(T: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -37,7 +37,7 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
+from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers
 from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.records import record_in
@@ -75,7 +75,7 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     motion: Motion | None = None
     gravity: Gravity | None = None
     exposure: ExposureSettings | None = None
-    T_base_camera: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)] | None = None
+    T_base_camera: MountNumbers | None = None
 
 
 class UnusableSidecar(ValueError):
