@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.odometry import Gravity
 from splatnode.capture.process.text import measurement_argument, parse_measurement, sanitize_text
-from splatnode.recon.result.reference_frame import parse_frame_name
 
+# As `FrameChoice` in recon/result/reference_frame.py has them, which help does not wait for
+FRAMES = ("first_camera", "base", "odometry", "upright", "base_link", "odom")
+_SHORTEST, _LONGEST = 1e-6, 1e6  # of a direction, whose length does not count
 DRIFT_DEG = 0.5  # of odometry's direction after a metre, where nobody tells it
 
 
@@ -31,7 +33,7 @@ def add_frame(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
     return (
         parser.add_argument(
             "--frame",
-            type=_parse_frame,
+            choices=FRAMES,
             metavar="FRAME",
             help="the frame of reference of results: first_camera, base (the robot's at the first image; needs "
             "T_base_camera and metres), odometry (that of given poses) or upright (z up); base_link and odom mean the "
@@ -45,13 +47,6 @@ def add_frame(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
             "0,1,0 of a level camera",
         ),
     )
-
-
-def _parse_frame(text: str) -> str:
-    try:
-        return parse_frame_name(text).value
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _direction_argument(text: str) -> str:
@@ -68,7 +63,9 @@ def _direction_argument(text: str) -> str:
 def _parse_direction(text: str) -> tuple[float, float, float]:
     """Raises ValueError."""
     x, y, z = (float(part) for part in text.split(","))
-    return Gravity((x, y, z)).down
+    if not _SHORTEST <= math.hypot(x, y, z) <= _LONGEST:
+        raise ValueError("it has no length")
+    return x, y, z
 
 
 def collect_frame_changes(args: argparse.Namespace) -> dict[str, Any]:

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import argparse
+from typing import get_args
 
 import pytest
 
 from splatnode.command_line import build_parser
 from splatnode.extras.batch.verb import replay_options
 from splatnode.recon.config import ReconstructionConfig, apply_changes
-from splatnode.recon.metric.arguments import add_poses, collect_drift_changes, collect_metric_changes, trusts_poses
+from splatnode.recon.metric.arguments import (
+    FRAMES,
+    add_poses,
+    collect_drift_changes,
+    collect_metric_changes,
+    trusts_poses,
+)
+from splatnode.recon.result.reference_frame import FrameChoice, parse_frame_name
 
 
 def configured(*options: str):
@@ -77,17 +85,18 @@ def test_drift_is_a_share_of_the_way_and_degrees():
 
 def test_frame_and_gravity_become_the_configuration():
     assert (configured().frame, configured().gravity) == (None, None)
+    assert get_args(FrameChoice) == FRAMES
     for told, meant in (("base_link", "base"), ("odom", "odometry"), ("upright", "upright")):
-        assert configured("--frame", told).frame == meant
+        assert parse_frame_name(configured("--frame", told).frame or "").value == meant
     assert configured("--gravity", "-0.5,1,0").gravity == (-0.5, 1.0, 0.0)
     args = build_parser().parse_args(["batch", "all", "--out", "out", "--frame", "odom", "--gravity", "-1,0,0"])
-    assert replay_options(args) == ["--frame", "odometry", "--gravity", "-1,0,0"]
+    assert replay_options(args) == ["--frame", "odom", "--gravity", "-1,0,0"]
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--frame", "world"], "must be one of first_camera, base, odometry, upright, base_link, odom; got 'world'"),
+        (["--frame", "world"], "--frame: invalid choice: 'world'"),
         (["--gravity", "0,0,0"], "must be three numbers with commas, a direction"),
         (["--gravity", "down"], "must be three numbers with commas, a direction"),
     ],
