@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_files import read_depth_file
-from splatnode.capture.depth_image import DepthImage
+from splatnode.capture.depth_image import DepthImage, check_unit
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.process.files import read_bounded
@@ -61,7 +61,9 @@ class RgbdFolder:
         return item
 
     def _read(self, path: Path) -> DepthImage:
-        return read_depth_file(path, self.unit_m, self.depth_intrinsics, self.noise)
+        made = read_depth_file(path, self.unit_m, self.depth_intrinsics, self.noise)
+        check_unit(made)  # the layout tells the unit, and the file may have another one
+        return made
 
 
 def find_rgbd_folder(folder: Path) -> RgbdFolder | None:

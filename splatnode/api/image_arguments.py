@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -10,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_files import read_depth_file
-from splatnode.capture.depth_image import DepthImage, make_depth_image
+from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit, make_depth_image
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.odometry import (
@@ -25,6 +26,9 @@ from splatnode.capture.odometry import (
     Motion,
     make_given_pose,
 )
+from splatnode.capture.process.notices import notify
+
+log = logging.getLogger(__name__)
 
 Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 DepthOf: TypeAlias = "DepthImage | npt.NDArray[Any] | str | PathLike[str] | None"
@@ -127,3 +131,11 @@ def parse_depth(given: Any) -> DepthImage:
 def parse_optional_depth(given: DepthOf) -> DepthImage | None:
     """As `parse_depth`; None stays None."""
     return None if given is None else parse_depth(given)
+
+
+def parse_single_depth(given: DepthOf) -> DepthImage | None:
+    """As `parse_optional_depth`, of one image at a time: what speaks against its unit is notified."""
+    found = parse_optional_depth(given)
+    if found is not None and (doubt := describe_doubtful_unit(found)):
+        notify(log, f"the depth image: {doubt}")
+    return found

@@ -22,7 +22,7 @@ from splatnode.api.image_arguments import (
     make_gravity,
     make_intrinsics,
     make_pose,
-    parse_optional_depth,
+    parse_single_depth,
 )
 from splatnode.capture.config import Camera, CaptureConfig, ProgramConfig
 from splatnode.capture.daemon import CaptureSession
@@ -198,7 +198,7 @@ class Publisher:
             mask,
             (make_pose(pose, _pair(pose_sigma)), make_gravity(gravity, gravity_sigma)),
             (motion, _pair(motion_sigma)),
-            parse_optional_depth(depth),
+            parse_single_depth(depth),
         )
         deadline = time.monotonic() + wait_s
         while True:

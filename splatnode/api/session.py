@@ -14,7 +14,7 @@ from splatnode.api.image_arguments import (
     make_gravity,
     make_intrinsics,
     make_pose,
-    parse_optional_depth,
+    parse_single_depth,
 )
 from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
@@ -152,7 +152,7 @@ class Session:
             usual = metric.odometry_drift, metric.odometry_sigma_deg
             moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
             came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
-            beside = {"right": _make_right_image(right, baseline_m), "depth": parse_optional_depth(depth)}
+            beside = {"right": _make_right_image(right, baseline_m), "depth": parse_single_depth(depth)}
             frame = replace(frame, **came, **beside)
             self._motion = moved
             self._given.add(frame.name)

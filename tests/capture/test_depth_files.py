@@ -191,6 +191,18 @@ def test_a_damaged_depth_image_costs_its_depth_alone(tmp_path, caplog):
     assert "1.png: its depth image is left out" in caplog.text
 
 
+@pytest.mark.parametrize("layout", ["TUM RGB-D", "ScanNet"])
+def test_depth_of_another_unit_than_the_layouts_is_left_out_with_its_median(tmp_path, caplog, layout):
+    LAYOUTS[layout](tmp_path)
+    metres = np.random.default_rng(0).integers(1, 4, (48, 64)).astype(np.uint16)
+    for path in tmp_path.glob("depth/*.png"):
+        write_png(path, metres)
+    frames = [each for each in folder.stream(folder.Config(folder=tmp_path)) if isinstance(each, Frame)]
+    assert not any(each.depth for each in frames)
+    holds = "steps of 0.2 mm" if layout == "TUM RGB-D" else "whole millimetres"
+    assert f"left out: depth images of 16 bits hold {holds}; the median is 2: probably metres" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [("x rgb/a.png\n", "a time and a file"), ("1.0 ../a.png\n", "a file in this folder"), ("#\n", "lists no files")],
