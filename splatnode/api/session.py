@@ -11,6 +11,7 @@ import numpy.typing as npt
 from splatnode.api.image_arguments import (
     DepthOf,
     append_motion,
+    check_camera_id,
     make_gravity,
     make_intrinsics,
     make_pose,
@@ -32,8 +33,8 @@ from splatnode.capture.keyframe_selection import Config as Selection
 from splatnode.capture.keyframe_selection import Selector
 from splatnode.capture.lens_file import assign_lens, check_fits
 from splatnode.capture.odometry import Motion
+from splatnode.capture.process.notices import give_warnings
 from splatnode.capture.process.terminal import Tell, ignore_progress
-from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.quality import Limits
 from splatnode.recon import threads as limits
 from splatnode.recon.config import apply_changes
@@ -64,6 +65,7 @@ class Session:
     Most frames of a camera's loop add too little and are not taken. Thread-safe. As a context manager it closes itself.
     """
 
+    @give_warnings()
     def __init__(
         self,
         *,
@@ -104,6 +106,7 @@ class Session:
         self._snapshot: Snapshot | None = None
         self._lock = threading.RLock()
 
+    @give_warnings()
     def add(
         self,
         image: Picture,
@@ -223,7 +226,7 @@ class Session:
         self, image: Picture, number: int, name: str, captured_at: Stamp | None, lens: Lens | None, camera: str | None
     ) -> Frame:
         made = make_frame(image, number, name, time.monotonic_ns(), captured_at)
-        made = made if camera is None else replace(made, camera_id=sanitize_text(camera, LONGEST_NAME))
+        made = made if camera is None else replace(made, camera_id=check_camera_id(camera, "camera"))
         if lens is not None:
             known = make_intrinsics(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])

@@ -265,5 +265,7 @@ def test_a_photograph_may_have_its_own_lens_and_camera(arrays):
         session.add(arrays[1], name="b.png", intrinsics=wide, camera="gripper")
         with pytest.raises(ValueError, match="got those of 100 x 100 for 320 x 240"):
             session.add(arrays[2], intrinsics=splatnode.Intrinsics(100, 100, 90, 90, 50, 50, "given"))
+        with pytest.raises(ValueError, match="camera must be at most 255 printable letters"):
+            session.add(arrays[2], camera="a\n")
         frames = [session._frames[name] for name in ("a.png", "b.png")]
     assert [(each.intrinsics.fx, each.camera_id) for each in frames] == [(300, ""), (200, "gripper")]
