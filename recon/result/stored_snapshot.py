@@ -23,9 +23,10 @@ from splatnode.capture.image_file import (
     find_common_range,
     read_image_file,
 )
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast, raise_shortage
-from splatnode.capture.process.text import guard_untrusted, is_printable
+from splatnode.capture.process.text import guard_untrusted, is_printable, sanitize_text
 from splatnode.recon.result.depth_check import StoredDepthCheck
 from splatnode.recon.result.export.cameras import decode_cameras
 from splatnode.recon.result.export.limits import SceneFileError, read_json_file
@@ -96,7 +97,7 @@ def _read_gaussians(scene: Path) -> GaussianArrays:
             return read_gaussians(scene, sources)
         except SceneFileError as error:
             raise_shortage(error)
-            log.warning("it is not known which photographs the Gaussians come from: %s", error)
+            notify(log, f"it is not known which photographs the Gaussians come from: {sanitize_text(error)}")
     return read_gaussians(scene)
 
 

@@ -12,6 +12,7 @@ from splatnode.api.live_map import LiveMap, NodeMap
 from splatnode.api.result import Camera, Result, camera_of, result_of
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config, read_yaml
+from splatnode.capture.process.notices import give_warnings
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.sources import LiveSource
@@ -117,6 +118,7 @@ class Node:
         self.close()
 
 
+@give_warnings()
 def connect(
     address: str | PathLike[str] | None = None,
     *,

@@ -32,6 +32,7 @@ from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame, Stamp
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
+from splatnode.capture.process.notices import give_warnings
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
@@ -242,6 +243,7 @@ def _name(photograph: object, of_pictures: bool) -> str:
 Changes = Mapping[str, Any] | str | PathLike[str]
 
 
+@give_warnings()
 def reconstruct(
     images: Images,
     *,
@@ -300,7 +302,8 @@ def reconstruct(
     - `tell`: the progress callback, in the calling thread: a step with `doing`, `done`, `of`, or a line of text. An
       exception in it cancels the work.
 
-    Raises TypeError and ValueError for wrong arguments, and FileNotFoundError.
+    Raises TypeError and ValueError for wrong arguments, and FileNotFoundError. What of an input is left out, or is
+    probably not meant, is an `InputWarning`, a former name a `DeprecationWarning`.
     """
     telling = tell or ignore_progress
     check_counts(views=views, threads=threads)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
+from splatnode.capture.process.notices import give_warnings
 from splatnode.recon import core
 from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.result import copy_result
@@ -340,6 +341,7 @@ class StoredFiles:
         copy_result(self.folder, out)
 
 
+@give_warnings()
 def load(folder: str | PathLike[str]) -> Result:
     """The result in a folder that `Result.save`, `splatnode replay` or a node wrote; a refusal, too.
 
