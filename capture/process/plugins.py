@@ -90,7 +90,8 @@ class EntryPoint:
         if missing:
             raise BrokenPlugin(
                 f"the plug-in {self.name!r} of {self.group} must have {', '.join(needs)}; {self.target} of "
-                f"{self.package} has no {' and no '.join(missing)}. Install a version of that package that has them, or remove it"
+                f"{self.package} has no {' and no '.join(missing)}. Install a version of that package that has "
+                "them, or remove it"
             )
         return loaded
 

@@ -225,6 +225,11 @@ class Result:
         return self._snapshot.scale.interval_95
 
     @property
+    def scale_source(self) -> str | None:
+        """What gives the metres, or why there are none although something was asked for. None: nothing was."""
+        return self._snapshot.scale.source
+
+    @property
     def depth_checks(self) -> tuple[DepthCheck, ...]:
         """The judgement of the images on each camera's depth images; empty where none came."""
         return self._snapshot.depth_checks

@@ -24,6 +24,7 @@ from splatnode.api.reconstruct import (
     build_config,
     check_counts,
     is_stereo,
+    merge_former_argument,
     parse_matrix,
     sigmas_of,
 )
@@ -71,7 +72,7 @@ class Session:
         *,
         intrinsics: Lens | None = None,
         poses_sigma: tuple[float, float] | None = None,
-        poses_only_check: bool = False,
+        check_poses: bool = False,
         scale: Scale | None = None,
         preset: str = "balanced",
         config: Changes | None = None,
@@ -79,18 +80,20 @@ class Session:
         seed: int | None = None,
         threads: int | None = None,
         tell: Tell | None = None,
+        poses_only_check: bool | None = None,
     ) -> None:
         """The arguments are those of `reconstruct`, without `budget_s`.
 
         `poses_sigma` is of poses that `add` gets without their own. Poses with sigmas are priors of cameras with a
-        known lens, unless `poses_only_check`. Images without a name are called 0000.png, 0001.png, ...
+        known lens, unless `check_poses`. Images without a name are called 0000.png, 0001.png, ...
         """
         check_counts(threads=threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
         flags = {"seed": seed, "metric": sigmas_of(poses_sigma)}
         self._config = build_config(preset, config, flags, scale, of_pictures=True)
-        self._only_checks = poses_only_check
+        former = "poses_only_check", poses_only_check
+        self._only_checks = merge_former_argument(*former, "check_poses", check_poses)
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress

@@ -51,6 +51,8 @@ def test_a_scene_in_metres_with_more_depth_and_the_same_cameras(arrays, depths, 
     assert (
         made.scale_interval is not None and made.scale_interval[0] <= 1 / metres_ratio(made) <= made.scale_interval[1]
     )
+    assert made.scale_source is not None and "depth images of 4 photographs" in made.scale_source
+    assert result.scale_source is None
     (check,) = made.depth_checks
     assert check.code is DepthCode.FITS and result.depth_checks == ()
     assert splatnode.load(made.save(tmp_path / "out")).depth_checks == made.depth_checks
