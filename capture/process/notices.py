@@ -9,6 +9,8 @@ import warnings
 from collections.abc import Iterator
 from contextvars import ContextVar
 
+from splatnode.capture.process.text import sanitize_lines
+
 _GIVES_WARNINGS: ContextVar[bool] = ContextVar("splatnode_gives_warnings", default=False)
 _OURS, _BETWEEN = "splatnode.", ("contextlib",)  # modules whose lines are none of the program that calls
 
@@ -33,9 +35,9 @@ def gives_warnings() -> bool:
 
 
 def notify(log: logging.Logger, text: str, kind: type[Warning] = InputWarning) -> None:
-    """Tells `text`, which must be printable: a warning of the log, or under `give_warnings` a Python warning."""
+    """Tells `text`: a warning of the log, or under `give_warnings` a Python warning, whose text only shows."""
     if gives_warnings():
-        warnings.warn(text, kind, stacklevel=_find_caller())
+        warnings.warn(sanitize_lines(text), kind, stacklevel=_find_caller())
     else:
         log.warning("%s", text)
 

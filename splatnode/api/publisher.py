@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.entrance import enter_api
 from splatnode.api.image_arguments import (
     DepthOf,
     Lens,
@@ -44,7 +45,6 @@ from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.config import merge_config, parse_config, read_yaml
 from splatnode.capture.process.files import LockHeld
-from splatnode.capture.process.notices import give_warnings
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.process.unfailing import Unfailing
 from splatnode.capture.reader import ReaderState
@@ -105,7 +105,7 @@ class Publisher:
     or `splatnode capture`, sends what still waits.
     """
 
-    @give_warnings()
+    @enter_api()
     def __init__(
         self,
         config: str | PathLike[str] | None = None,
@@ -157,7 +157,7 @@ class Publisher:
             self._session = CaptureSession(self._config, self._server, resources)
             self._resources = resources.pop_all()
 
-    @give_warnings()
+    @enter_api()
     def publish(
         self,
         image: Picture,

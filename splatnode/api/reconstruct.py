@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.api.depths import Depths, add_depths
+from splatnode.api.entrance import enter_api
 from splatnode.api.image_arguments import Sigmas, parse_sigmas
 from splatnode.api.photographs import (
     Images,
@@ -33,7 +34,7 @@ from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame, Stamp
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.notices import give_warnings, notify
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
@@ -246,7 +247,7 @@ def _name(photograph: object, of_pictures: bool) -> str:
 Changes = Mapping[str, Any] | str | PathLike[str]
 
 
-@give_warnings()
+@enter_api()
 def reconstruct(
     images: Images,
     *,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
+from splatnode.api.entrance import enter_api
 from splatnode.api.image_arguments import (
     DepthOf,
     append_motion,
@@ -34,7 +35,6 @@ from splatnode.capture.keyframe_selection import Config as Selection
 from splatnode.capture.keyframe_selection import Selector
 from splatnode.capture.lens_file import assign_lens, check_fits
 from splatnode.capture.odometry import Motion
-from splatnode.capture.process.notices import give_warnings
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.capture.quality import Limits
 from splatnode.recon import threads as limits
@@ -66,7 +66,7 @@ class Session:
     Most frames of a camera's loop add too little and are not taken. Thread-safe. As a context manager it closes itself.
     """
 
-    @give_warnings()
+    @enter_api()
     def __init__(
         self,
         *,
@@ -109,7 +109,7 @@ class Session:
         self._snapshot: Snapshot | None = None
         self._lock = threading.RLock()
 
-    @give_warnings()
+    @enter_api()
     def add(
         self,
         image: Picture,
@@ -177,6 +177,7 @@ class Session:
             left_out = {each.name: each.reason for each in work.dropped}
             return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)
 
+    @enter_api()
     def finish(self) -> Result:
         """Judges all photographs with all evidence, and makes their scene anew; the session is closed then.
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import splatnode
+from splatnode.api.entrance import sanitize_error
 from splatnode.capture.process import config_keys
 from splatnode.capture.process.notices import InputWarning, give_warnings, gives_warnings, notify
 from tests.api.test_publisher import changes, picture, publisher
@@ -85,3 +86,39 @@ def test_a_key_is_told_to_a_program_though_the_log_had_it_before(caplog):
     assert [record.message for record in caplog.records] == ["a is called b now"]
     with give_warnings(), pytest.warns(DeprecationWarning, match="a is called b now"):
         config_keys._tell_of_key("a is called b now")
+
+
+HOSTILE = "x\x1b[31m\u202e"
+
+
+def test_errors_have_text_that_only_shows_whoever_wrote_it(result, tmp_path):
+    saved = result.save(tmp_path / "saved")
+    report = (saved / "report.json").read_text()
+    (saved / "report.json").write_text(report.replace('"OK', '"\\u001b[31mOK', 1))
+    for attempt in (
+        lambda: splatnode.load(saved),
+        lambda: splatnode.connect(f"a/{HOSTILE}"),
+        lambda: splatnode.Session(config={"prior": {"kind": HOSTILE}}),
+        lambda: splatnode.Session(config={"size": HOSTILE}),
+        lambda: splatnode.reconstruct([np.zeros((8, 8, 3), np.uint8)], depths={f"{HOSTILE}.png": np.zeros((8, 8))}),
+        lambda: splatnode.Publisher(changes={"network": {HOSTILE: 3}}),
+    ):
+        with pytest.raises((ValueError, TypeError)) as raised:
+            attempt()
+        error: BaseException | None = raised.value
+        while error is not None:
+            assert str(error).replace("\n", "").isprintable(), repr(str(error))
+            error = error.__cause__ or error.__context__
+
+
+def test_an_error_keeps_its_lines_and_what_is_no_text():
+    error = OSError(2, "no\x1bthing", "file")
+    error.__cause__ = ValueError("one\ntwo\x07")
+    sanitize_error(error)
+    assert error.args == (2, "no\\x1bthing") and error.filename == "file"
+    assert str(error.__cause__) == "one\n  two\\x07"
+
+
+def test_a_warning_has_text_that_only_shows(caplog):
+    with give_warnings(), pytest.warns(InputWarning, match=r"x\\x1b\[31m\\u202e"):
+        notify(logging.getLogger("splatnode.test"), HOSTILE)
