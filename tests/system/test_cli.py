@@ -58,6 +58,8 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.library_lines",
         "splatnode.capture.process.logs",
         "splatnode.capture.process.plugins",
+        "splatnode.capture.process.python",
+        "splatnode.capture.process.start",
         "splatnode.capture.process.system",
         "splatnode.capture.process.terminal",
         "splatnode.capture.process.text",
