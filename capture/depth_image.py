@@ -201,7 +201,7 @@ def check_unit(depth: DepthImage) -> None:
 
 
 def describe_wrong_unit(depth: DepthImage) -> str:
-    """What tells that the values of a depth image have another unit; empty where nothing does."""
+    """Describes what tells that the values of a depth image have another unit; empty where nothing does."""
     known, unit_m = _find_known(depth), depth.unit_m
     if known.size < LEAST_KNOWN:
         return ""
@@ -223,7 +223,7 @@ def describe_wrong_unit(depth: DepthImage) -> str:
 
 
 def describe_doubtful_unit(depth: DepthImage) -> str:
-    """What speaks against the unit of a depth image, though it may be right; empty where nothing does."""
+    """Describes what speaks against the unit of a depth image, though it may be right; empty where nothing does."""
     if problem := describe_wrong_unit(depth):
         return problem
     known = _find_known(depth)

@@ -91,7 +91,7 @@ def _parse_own_camera(shown: str, name: str, given: Any) -> RigCamera:
 
 @contextlib.contextmanager
 def _name_camera(shown: str, name: object, expected: str = "") -> Iterator[None]:
-    """What is wrong in here is an UnusableRig that names the file and the camera, and what was expected of it."""
+    """Makes what is wrong in here an UnusableRig that names the file and the camera, and what was expected of it."""
     try:
         yield
     except UnusableRig:

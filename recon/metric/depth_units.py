@@ -10,7 +10,7 @@ from splatnode.capture.process.text import sanitize_name
 
 
 def describe_doubtful_units(frames: Iterable[Frame | DroppedFrame]) -> str:
-    """What speaks against the units of depth images, by the first of those that it is about; empty: nothing does."""
+    """Describes what speaks against the units of depth images, by the first that it is about; empty: nothing does."""
     depths = {each.name: each.depth for each in frames if isinstance(each, Frame) and each.depth is not None}
     doubts = {name: doubt for name, depth in depths.items() if (doubt := describe_doubtful_unit(depth))}
     if not doubts:
