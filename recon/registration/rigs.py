@@ -80,7 +80,7 @@ class RigEstimate:
 
     @property
     def num_given(self) -> int:
-        """Returns of how many cameras the given pose counts: the rig's own, and those whose mounts it holds; 0: of none."""
+        """Returns of how many cameras the given poses count: the rig's own, and those whose mounts it holds."""
         held = {mount.camera_id for mount in self.mounts if mount.given}
         return 1 + len(held) if held else 0
 
