@@ -237,7 +237,8 @@ def _judge(
             made,
             code=DepthCode.CONTRADICTS,
             message=f"{who} contradict the images at {100 * (1 - agreeing):.0f} % of {num_points} points, so they were "
-            "left out. Check that each goes with its photograph, its unit and its noise",
+            "left out. Check that each goes with its photograph, that it is depth and no disparity, its unit and its "
+            "noise",
         )
     return made
 

@@ -226,7 +226,7 @@ class Result:
 
     @property
     def scale_source(self) -> str | None:
-        """Returns what gives the metres, or why there are none although asked for. None: nothing was asked for."""
+        """The scale source, or why there is none although one was asked for. None: nothing was asked for."""
         return self._snapshot.scale.source
 
     @property
