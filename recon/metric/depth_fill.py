@@ -86,7 +86,7 @@ def make_depth_view(keyframe: Keyframe, registration: Registration, camera: Regi
 
 def warp_depth(view: DepthView, K: Map, shape: tuple[int, int]) -> MeasuredDepth:
     """The depth image as the pinhole K (3, 3) of its camera sees it, in `shape` (h, w)."""
-    z, sigma = view.smoothed
+    z, sigma = view.surface
     own = find_depth_lens(view.depth, view.lens)
     T_camera_depth = view.depth.matrix
     height, width = shape

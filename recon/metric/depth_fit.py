@@ -49,7 +49,7 @@ class DepthView:
     lens: Intrinsics  # of the camera's image; at any size
 
     @cached_property
-    def smoothed(self) -> tuple[Array, Array]:
+    def surface(self) -> tuple[Array, Array]:
         """(H, W) z of the depth image without its noise, and its standard deviation, metres."""
         return smooth_depth(self.depth)
 
@@ -135,7 +135,7 @@ def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
     step = max(1, -(-sum(len(view.points) for view in views) // _MOST_POINTS))
     scale = max(max(view.depth.values.shape) for view in views) / REFERENCE_PX
     aside = any(view.depth.T_camera_depth[3::4][:3] != (0.0, 0.0, 0.0) for view in views)
-    map_parallel(lambda view: view.smoothed, views)
+    map_parallel(lambda view: view.surface, views)
     samples = _collect_samples(views, unit, step)
     for _ in range(4 if aside else 1):  # where a depth camera stands beside, its pixels depend on the unit
         ratio, _ = samples.look((0.0, 0.0), scale)
@@ -167,7 +167,7 @@ def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Sam
         pixels.append(seen[kept])
         log_z.append(np.log(points[kept, 2]))
     return _Samples(
-        [view.smoothed for view in views], np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z)
+        [view.surface for view in views], np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z)
     )
 
 

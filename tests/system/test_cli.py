@@ -58,6 +58,8 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.library_lines",
         "splatnode.capture.process.logs",
         "splatnode.capture.process.plugins",
+        "splatnode.capture.process.python",
+        "splatnode.capture.process.start",
         "splatnode.capture.process.system",
         "splatnode.capture.process.terminal",
         "splatnode.capture.process.text",
@@ -380,7 +382,7 @@ def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):
         raise RuntimeError("the compiled core is missing. Run: python recon/core/compile.py")
 
     monkeypatch.setattr(core, "library", missing)
-    assert doctor.doctor(argparse.Namespace(json=False)) == 2
+    assert doctor.doctor(argparse.Namespace(json=False, rates=None)) == 2
     assert "Run: python recon/core/compile.py" in capsys.readouterr().out
 
 
