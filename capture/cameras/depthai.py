@@ -252,7 +252,8 @@ def read(dai: ModuleType, source: Source, config: Config, hold: Callable[[], Non
         except dai.MessageQueue.QueueException as error:
             raise CameraUnavailable(f"the camera ended its stream: {error}") from error
         if message is None:
-            raise CameraUnavailable(f"no frame for {config.frame_timeout_s:g} s; is the camera still plugged in?")
+            hint = "" if config.depth == "none" else " If it is, it may measure no depth: try camera.depth: none"
+            raise CameraUnavailable(f"no frame for {config.frame_timeout_s:g} s; is the camera still plugged in?{hint}")
         if not held and time.monotonic() < settled:
             continue
         if not held:

@@ -485,6 +485,14 @@ def test_depth_goes_with_the_colour_frames(monkeypatch, platform, depth):
     assert [each.calls[0][0] for each in fake.told if isinstance(each, _Control)] == ["setAutoExposureLock"]  # colour's
 
 
+def test_a_device_that_gives_no_pair_says_what_to_try(monkeypatch):
+    use(monkeypatch, FakeDepth([shot(), None]))
+    frames = stream(Config(depth="required", lock_exposure=False))
+    next(frames)
+    with pytest.raises(CameraUnavailable, match="still plugged in. If it is, it may measure no depth: try"):
+        next(frames)
+
+
 LACKING = [
     ({"there": ("A",)}, "has no pair of stereo cameras"),
     ({"baseline": None}, "are not calibrated .no calibration data"),
