@@ -16,8 +16,13 @@ from torch import Tensor
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.extras.evaluate import methods
-from splatnode.extras.evaluate.dataset import Split, load_scene
-from splatnode.extras.evaluate.demo import compute_max_capture_bytes, write_held_out_images, write_training_images
+from splatnode.extras.evaluate.dataset import (
+    Split,
+    compute_max_capture_bytes,
+    load_scene,
+    write_held_out_images,
+    write_training_images,
+)
 from splatnode.extras.evaluate.protocol import (
     INTERPOLATED_START,
     PerceptualNetworks,

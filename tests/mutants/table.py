@@ -480,7 +480,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "extras/evaluate/camera_errors.py",
+        "extras/evaluate/protocol.py",
         (
             "centre error is the largest and not the root mean square",
             "math.sqrt(float(((moved - target) ** 2).sum(1).mean()))",
@@ -617,7 +617,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "viewer",
-        "viewer/colours.py",
+        "viewer/analysis.py",
         ("a hidden Gaussian counts as seen", "_BEHIND = 1.05", "_BEHIND = 100.0"),
     ),
     *_list_mutants(

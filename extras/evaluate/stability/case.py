@@ -13,8 +13,8 @@ import numpy.typing as npt
 from msgspec.structs import replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
 from splatnode.extras.evaluate.dataset import TrueCamera
+from splatnode.extras.evaluate.protocol import CameraErrors, compare_cameras
 from splatnode.extras.evaluate.stability.perturbations import Sampler, TrialImage
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius, umeyama

@@ -12,9 +12,8 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.extras.evaluate.camera_errors import compare_cameras
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split
-from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
+from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, compare_cameras, evaluate
 from splatnode.extras.evaluate.report import Timing, measure_timing
 from splatnode.extras.evaluate.rivals.colmap import (
     Mapper,
@@ -36,8 +35,8 @@ from splatnode.extras.evaluate.stability.case import (
     score_cameras,
 )
 from splatnode.extras.evaluate.stability.perturbations import TrialImage
-from splatnode.extras.jobs import call
-from splatnode.extras.jobs.cores import now
+from splatnode.extras.jobs import calls
+from splatnode.extras.jobs.calls import now
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
@@ -164,7 +163,7 @@ class TrialResult:
     measured: ProbeResult | None
 
 
-def judge_trial(case: TrialCase, row: int, name: str, seed: int, method: str, answer: call.Answer) -> Trial:
+def judge_trial(case: TrialCase, row: int, name: str, seed: int, method: str, answer: calls.Answer) -> Trial:
     """The trial of a case that `run_trial` was called for; its photographs are not looked at."""
     head = {
         "row": row,

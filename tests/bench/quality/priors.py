@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.priors.mast3r.global_alignment import align_views
 from splatnode.recon.priors.mast3r.network import Mast3r
 from splatnode.recon.priors.stereo import StereoConfig

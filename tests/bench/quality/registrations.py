@@ -20,8 +20,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from splatnode.extras.evaluate.stability.campaign import ROWS
 from splatnode.extras.evaluate.stability.case import ROUGH, MatrixRow, classify_outcome, score_cameras
-from splatnode.extras.evaluate.stability.matrix import ROWS
 from splatnode.extras.evaluate.stability.perturbations import Sampler, load_scenes_by_motion, load_trial_scenes
 from splatnode.extras.evaluate.stability.trial import ensure_registration, list_registered_cameras
 from splatnode.extras.evaluate.stability.windows import campaign

@@ -7,7 +7,7 @@ import argparse
 import pytest
 
 from splatnode.command_line import build_parser
-from splatnode.extras.batch.verb import replay_options
+from splatnode.extras.verbs import replay_options
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.metric.arguments import add_poses, collect_drift_changes, collect_metric_changes, trusts_poses
 

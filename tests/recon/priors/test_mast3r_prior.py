@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching

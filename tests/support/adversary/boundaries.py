@@ -28,8 +28,7 @@ from splatnode.capture.messaging.wire import Limits, WireError, decode
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.status import CaptureStatus, Heartbeat
-from splatnode.extras.evaluate.colmap_model import EvaluationFileError
-from splatnode.extras.evaluate.dataset import load_scene
+from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
 from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig

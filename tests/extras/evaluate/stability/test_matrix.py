@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
+from splatnode.extras.evaluate.stability.campaign import ROWS, select_rows
 from splatnode.extras.evaluate.stability.case import Demand
-from splatnode.extras.evaluate.stability.matrix import ROWS, select_rows
 from splatnode.extras.evaluate.stability.perturbations import (
     Sampler,
     ScenesByMotion,
