@@ -17,14 +17,14 @@ from splatnode.capture.process.terminal import say, show_progress, show_waiting
 from splatnode.recon.result.rendering import use_threads
 from splatnode.recon.result.stored_snapshot import load_images
 from splatnode.recon.result.submap_index import is_map_set
-from splatnode.viewer.further import find_chosen, load_viewers
 from splatnode.viewer.pictures import update_picture, write_movie, write_series
 from splatnode.viewer.probe import open3d_installed, probe_window
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import BUDGET, FixedSource, LiveSource, Maps, MapSource, Source, load_result, map_moment
 from splatnode.viewer.splash import splash
 from splatnode.viewer.state import Moment, ViewerState
-from splatnode.viewer.web import stage as web
+from splatnode.viewer.verbs import find_chosen, load_viewers
+from splatnode.viewer.web import server as web
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
 

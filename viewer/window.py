@@ -19,7 +19,7 @@ from splatnode.capture.image_file import encode_png
 from splatnode.recon.result.export import ResultWriteError, write_files
 from splatnode.viewer import text
 from splatnode.viewer.editing import EditError
-from splatnode.viewer.panel.panel import Panel
+from splatnode.viewer.panel import Panel
 from splatnode.viewer.session import Session
 from splatnode.viewer.stage import Image, WindowStage
 from splatnode.viewer.state import Engine, help_lines, open3d_draws
