@@ -19,10 +19,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import exif, heif_file, image_header
-from splatnode.capture.exif import exif_time
+from splatnode.capture import heif_file, image_header
+from splatnode.capture import image_header as exif
 from splatnode.capture.frame import ExposureSettings, Intrinsics, Stamp
-from splatnode.capture.image_header import ImageHeader, UnusableImage, read_header
+from splatnode.capture.image_header import ImageHeader, UnusableImage, exif_time, read_header
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.library_lines import catch_library_lines
 from splatnode.capture.process.system import outlast

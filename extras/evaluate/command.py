@@ -40,9 +40,8 @@ from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.report import bound_result_bytes, write_result_folder
+from splatnode.recon.result.report import bound_result_bytes, print_summary, write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.summary import print_summary
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 # Of the search for a held-out view's pose, half of them at half the resolution: 33.0 dB in the mean, as 100 at full.

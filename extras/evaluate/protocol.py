@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split
 from splatnode.extras.evaluate.regions import (
     UNKNOWN,

@@ -23,11 +23,10 @@ from torch.nn import functional
 
 from splatnode.recon.networks import weights as networks_weights
 from splatnode.recon.networks.weights import find
-from splatnode.recon.priors import classical, multi_view_consistency, stereo
+from splatnode.recon.priors import classical, stereo
+from splatnode.recon.priors import stereo as multi_view_consistency
 from splatnode.recon.priors.classical import ClassicalPrior
-from splatnode.recon.priors.multi_view_consistency import DepthMap
-from splatnode.recon.priors.patchmatch import Planes, make_level
-from splatnode.recon.priors.stereo import SparsePoints, StereoView
+from splatnode.recon.priors.stereo import DepthMap, Planes, SparsePoints, StereoView, make_level
 
 # PatchmatchNet's image networks: a pyramid of features, and depth made twice as fine along a photograph's edges.
 

@@ -16,7 +16,8 @@ from splatnode.recon import preparation
 from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.matching import features, pair_matching, two_view
+from splatnode.recon.matching import features, pair_matching
+from splatnode.recon.matching import pair_matching as two_view
 from splatnode.recon.matching.dynamic_objects import moving_points
 from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import UnusableFrame, prepare_all

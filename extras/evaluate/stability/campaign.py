@@ -1,7 +1,7 @@
 """All trials of a plan, some at a time; what is on the disk already is not run again; and its verb.
 
 The matrix has all rows, by number: every `MatrixRow` of the modules in `_FAMILIES`. A new row is one function in one of
-these files; a new file of rows is that file and its name in `_FAMILIES`. Those of `lens_assumptions` are made from its
+these files; a new file of rows is that file and its name in `_FAMILIES`. Those of `degradations.ROWS` are made from its
 kinds.
 """
 
@@ -23,11 +23,18 @@ from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import read_json
 from splatnode.extras.evaluate.report import check_same_cores, describe_machine, explain_missing_seconds
 from splatnode.extras.evaluate.runner import Journal
-from splatnode.extras.evaluate.stability import cases, degradations, lens_assumptions
-from splatnode.extras.evaluate.stability.case import MatrixRow, TrialCase
+from splatnode.extras.evaluate.stability import cases, degradations
 from splatnode.extras.evaluate.stability.perturbations import Sampler, ScenesByMotion, load_scenes_by_motion
 from splatnode.extras.evaluate.stability.report import Rate, make_report, summarise
-from splatnode.extras.evaluate.stability.trial import FAILED, Trial, find_method, judge_trial, run_trial
+from splatnode.extras.evaluate.stability.trial import (
+    FAILED,
+    MatrixRow,
+    Trial,
+    TrialCase,
+    find_method,
+    judge_trial,
+    run_trial,
+)
 from splatnode.extras.evaluate.stability.windows.campaign import run_windows_verb
 from splatnode.extras.jobs.calls import Engine, Task, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
@@ -41,7 +48,7 @@ ROWS: tuple[MatrixRow, ...] = tuple(
     sorted(
         (
             *(found for family in _FAMILIES for found in vars(family).values() if isinstance(found, MatrixRow)),
-            *lens_assumptions.ROWS,
+            *degradations.ROWS,
         ),
         key=lambda r: r.number,
     )

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.lens import project, unproject
+from splatnode.capture.lenses import project, unproject
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split
 from splatnode.extras.evaluate.protocol import CameraErrors, PerceptualNetworks, compare_cameras
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image

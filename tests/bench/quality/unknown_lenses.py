@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses.lens import unproject
+from splatnode.capture.lenses import unproject
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig, preset

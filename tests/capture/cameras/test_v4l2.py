@@ -12,11 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture import v4l2_device
 from splatnode.capture.cameras import v4l2
-from splatnode.capture.cameras.v4l2 import Config, find, stream
+from splatnode.capture.cameras import v4l2 as v4l2_device
+from splatnode.capture.cameras.v4l2 import Config, Device, System, find, stream
 from splatnode.capture.frame import CameraUnavailable, Clock, DroppedFrame, Frame, Intrinsics
-from splatnode.capture.v4l2_device import Device, System
 
 IMAGE = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8), (0, 0), 3)
 JPEG = cv2.imencode(".jpg", cv2.cvtColor(IMAGE, cv2.COLOR_RGB2BGR))[1].tobytes()

@@ -9,10 +9,9 @@ import socket
 import pytest
 import zmq
 
-from splatnode.capture.messaging import gate as gate_module
+from splatnode.capture.messaging import network as gate_module
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.gate import PLACES
-from splatnode.capture.messaging.network import CAPTURE_PREVIEW, files_for_strangers
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, PLACES, files_for_strangers
 from splatnode.capture.messaging.pubsub import Publisher, Subscriber
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.crowd import network_of, next_to_go

@@ -12,8 +12,9 @@ from msgspec.structs import replace as replace_fields
 from splatnode.recon import modelling
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.modelling import refine_scene
-from splatnode.recon.optimize import monitor, training
-from splatnode.recon.optimize.monitor import SHORT, RefinementWatch, examine, start_watch
+from splatnode.recon.optimize import training
+from splatnode.recon.optimize import training as monitor
+from splatnode.recon.optimize.training import SHORT, RefinementWatch, examine, start_watch
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
@@ -83,7 +84,7 @@ def test_without_point_maps_nothing_is_expected():
 
 def test_an_overfitted_scene_gives_way_to_the_best_before_it(truth, monkeypatch):
     monkeypatch.setattr(
-        "splatnode.recon.optimize.monitor.compute_photometric_misfit", lambda scene: 0.1
+        "splatnode.recon.optimize.training.compute_photometric_misfit", lambda scene: 0.1
     )  # the photographs fit
     watching = start_watch(truth, SHORT + 1)
     better = replace(truth, iterations=150)

@@ -12,7 +12,7 @@ from splatnode.capture import recording
 from splatnode.capture.config import CaptureConfig, PreviewHeader, decode_preview
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage, decode_image
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network
 from splatnode.capture.messaging.messages import (
     ConsumerStatus,
     Delivery,
@@ -175,7 +175,7 @@ def _read_store(files: tuple[stored.Files, stored.Files], folder: Path) -> objec
 
 def _read_keys(files: stored.Files, folder: Path) -> object:
     stored.lay(files, folder / "keys")
-    return keys.read_keys(folder / "keys")
+    return network.read_keys(folder / "keys")
 
 
 def _read_recording(files: stored.Files, folder: Path) -> object:
@@ -215,7 +215,7 @@ _YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.c
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
 _SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
 _CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))
-_KEYS = Reader((keys.KeyFileError,), (f"{_MESSAGING}.keys",))
+_KEYS = Reader((network.KeyFileError,), (f"{_MESSAGING}.keys",))
 
 
 def _formats(name: str) -> Reader:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture import exif, image_header
-from splatnode.capture.exif import exif_time
+from splatnode.capture import image_header
+from splatnode.capture import image_header as exif
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.image_file import ORIENTATION, check_whole, measure_values, upright_size
-from splatnode.capture.image_header import UnusableImage
+from splatnode.capture.image_header import UnusableImage, exif_time
 from splatnode.capture.lens_file import UnusableLens, read_lens
 from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
 from splatnode.capture.pose_files import PosesFileError, read_poses

@@ -73,7 +73,7 @@ from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import match

@@ -17,8 +17,8 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.command_line import build_parser
 from splatnode.extras.evaluate.dataset import load_scene, write_capture
-from splatnode.extras.evaluate.stability.case import CameraError, FiniteBounds
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
+from splatnode.extras.evaluate.stability.trial import CameraError, FiniteBounds
 from splatnode.extras.evaluate.stability.windows import campaign
 from splatnode.extras.evaluate.stability.windows.campaign import (
     Plan,
