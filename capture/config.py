@@ -83,6 +83,8 @@ class Camera(Plugin):
 class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Configures what a program of one's own sends in place of a camera: as CaptureConfig has it, without a camera."""
 
+    former_keys = former_names.KEYS
+
     quality: Limits = Limits()
     selection: keyframe_selection.Config = keyframe_selection.Config()
     preview: Config = Config()

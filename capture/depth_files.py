@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import math
 import struct
 import zlib
@@ -17,8 +18,12 @@ from splatnode.capture.depth_image import MOST_PIXELS, DepthImage, DepthNoise, m
 from splatnode.capture.frame import LARGEST_SIDE, Intrinsics
 from splatnode.capture.image_file import UnusableImage, decode_values, read_image_file
 from splatnode.capture.process.library_lines import ignore_file_warnings
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
+log = logging.getLogger(__name__)
+
+_LEAST_PAIRED = 0.5  # share of the photographs with a depth image
 SUFFIXES = {".png", ".tif", ".tiff", ".npy", ".exr"}
 
 # Of OpenEXR: single-part files of scan lines, not compressed or by zlib, as Record3D and OpenCV write them.
@@ -31,17 +36,35 @@ _MOST_HEADER = 1000  # bytes of an array's header in .npy
 
 
 def find_depth_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The files of a folder that have the names of these photographs, whatever their suffixes.
+    """The files of a folder that have the names of these photographs, whatever their suffixes. Few are notified.
 
     Raises FileNotFoundError, and ValueError where there is none.
     """
+    names = list(names)
     if not folder.is_dir():
         raise FileNotFoundError(f"{fspath(folder)!r} is not there; give a folder of depth images")
     files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in SUFFIXES}
     found = {name: files[Path(name).stem] for name in names if Path(name).stem in files}
     if not found:
         raise ValueError(f"no depth image in {fspath(folder)!r} has the name of a photograph; name both alike")
+    if told := describe_few_pairs(len(found), len(names)):
+        notify(log, told)
     return found
+
+
+def is_few(num_found: int, num_photographs: int) -> bool:
+    """Whether so few photographs have a depth image that people should know."""
+    return num_found < _LEAST_PAIRED * num_photographs
+
+
+def describe_few_pairs(num_found: int, num_photographs: int) -> str:
+    """How many photographs have a depth image of their name, where these are few; else empty."""
+    if not is_few(num_found, num_photographs):
+        return ""
+    return (
+        f"{num_found} of {num_photographs} photographs have a depth image: those of other names count for none. Name "
+        "both alike"
+    )
 
 
 def read_depth_file(

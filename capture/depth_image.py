@@ -17,6 +17,11 @@ MOST_PIXELS = 1 << 25  # of a depth image: 33 million
 FARTHEST_M = 1000.0  # what is farther was not measured by any depth camera
 MILLIMETRE = 0.001  # metres: the unit of most images of 16 bits
 ALIGNED = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+NEAREST_M = 0.05  # of a median: what is nearer no depth camera measures, and the unit is another one
+USUAL_FARTHEST_M = 100.0  # of a median: what is farther is rare, and probably has another unit
+LEAST_KNOWN = 1000  # pixels with a depth, of which values are judged
+_MOST_METRES = 20  # of a median: up to here, whole numbers are metres as rooms have them
+_LEAST_DISTINCT = 20  # values of whole numbers in an image: of fewer it is probably no depth in millimetres
 _UNITS_M = (1e-6, 1.0)  # of a step of 16 bits
 _MOST_SIGMA = 1.0  # of each term of the noise: beyond, nothing was measured
 _LEAST_SIGMA = 1e-9  # metres, or per metre: what is below makes weights overflow
@@ -160,7 +165,8 @@ def make_depth_image(
 ) -> DepthImage:
     """A depth image of an array (H, W): whole numbers are millimetres, floats are metres, unless `unit_m` tells.
 
-    `noise` may name a kind of `NOISES`. Raises ValueError.
+    `noise` may name a kind of `NOISES`. Raises ValueError, where `unit_m` does not tell also of values that have
+    another unit.
     """
     array = np.asarray(values)
     if array.ndim == 3 and array.shape[2] == 1:
@@ -181,7 +187,59 @@ def make_depth_image(
         raise ValueError(f"T_camera_depth must be (4, 4), got {matrix.shape}")
     model = find_noise(noise) if isinstance(noise, str) else noise
     unit = unit_m if unit_m is not None else (MILLIMETRE if whole else 1.0)
-    return DepthImage(_clear_unknown(kept), float(unit), intrinsics, tuple(matrix.ravel().tolist()), model, confidence)
+    lies = tuple(matrix.ravel().tolist())
+    made = DepthImage(_clear_unknown(kept), float(unit), intrinsics, lies, model, confidence)
+    if unit_m is None:
+        check_unit(made)
+    return made
+
+
+def check_unit(depth: DepthImage) -> None:
+    """Raises ValueError where the values of a depth image are so small or large that their unit is another one."""
+    if problem := describe_wrong_unit(depth):
+        raise ValueError(problem)
+
+
+def describe_wrong_unit(depth: DepthImage) -> str:
+    """Describes what tells that the values of a depth image have another unit; empty where nothing does."""
+    known, unit_m = _find_known(depth), depth.unit_m
+    if known.size < LEAST_KNOWN:
+        return ""
+    median = float(np.median(known))
+    if depth.values.dtype == np.uint16 and median * unit_m < NEAREST_M:
+        holds = "whole millimetres" if unit_m == MILLIMETRE else f"steps of {1000 * unit_m:g} mm"
+        probably = (
+            "probably metres; give float metres, or multiply by 1000"
+            if median < _MOST_METRES
+            else "probably another unit; give float metres, or tell unit_m"
+        )
+        return f"depth images of 16 bits hold {holds}; the median is {median:g}: {probably}"
+    if depth.values.dtype == np.float32 and median * unit_m > FARTHEST_M:
+        return (
+            f"depth images of floats hold {'metres' if unit_m == 1.0 else f'steps of {unit_m:g} m'}; the median is "
+            f"{median:g}: probably millimetres; divide by 1000, or tell unit_m=0.001"
+        )
+    return ""
+
+
+def describe_doubtful_unit(depth: DepthImage) -> str:
+    """Describes what speaks against the unit of a depth image, though it may be right; empty where nothing does."""
+    if problem := describe_wrong_unit(depth):
+        return problem
+    known = _find_known(depth)
+    if known.size < LEAST_KNOWN:
+        return ""
+    median = float(np.median(known)) * depth.unit_m
+    if depth.values.dtype == np.float32 and median > USUAL_FARTHEST_M:
+        return f"the median depth is {median:.4g} m: where floats are no metres, tell their unit (unit_m)"
+    if depth.values.dtype == np.uint16 and (count := len(np.unique(known))) < _LEAST_DISTINCT:
+        return f"{known.size} pixels have {count} different depths alone: check that values are millimetres of 16 bits"
+    return ""
+
+
+def _find_known(depth: DepthImage) -> npt.NDArray[Any]:
+    """(M,) the values above 0."""
+    return depth.values[depth.values > 0]
 
 
 def _clear_unknown(values: npt.NDArray[Any]) -> npt.NDArray[Any]:

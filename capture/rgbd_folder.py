@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -13,11 +13,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.depth_files import read_depth_file
-from splatnode.capture.depth_image import DepthImage
+from splatnode.capture.depth_files import describe_few_pairs, is_few, read_depth_file
+from splatnode.capture.depth_image import DepthImage, check_unit
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast, raise_shortage
 from splatnode.capture.process.text import guard_untrusted, sanitize_name, sanitize_text
@@ -28,6 +29,7 @@ _MAX_TEXT_BYTES = 50_000_000
 _MOST_LINES, _MOST_S = 500_000, 1e11  # of a list of files, and of a time in it
 _TUM_STEPS = 5000.0  # of depth a metre
 _TUM_APART_S = 0.02  # between a photograph and its depth image, as TUM's associate.py has it
+_PHOTOGRAPH_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 _DEPTH_SUFFIXES = (".png", ".exr", ".npy", ".tif", ".tiff")
 
 
@@ -46,6 +48,7 @@ class RgbdFolder:
     intrinsics: Intrinsics | None = None  # of the photographs, for their size
     depth_intrinsics: Intrinsics | None = None  # of the depth camera; None: depth is aligned with the photographs
     noise: str = "structured_light"  # the kind of the depth camera
+    told: str = ""  # what people should know of the pairs; empty: nothing
 
     def attach_depth(self, item: Frame | DroppedFrame, file: str) -> Frame | DroppedFrame:
         """The photograph of `file` with its depth image; without, which the log tells, where that cannot be used."""
@@ -55,13 +58,15 @@ class RgbdFolder:
         try:
             return replace(item, depth=outlast(lambda: self._read(path), item.name))
         except (UnusableImage, ValueError) as error:
-            log.warning("%s: its depth image is left out: %s", item.name, error)
+            notify(log, f"{item.name}: its depth image is left out: {sanitize_text(error)}")
         except OSError as error:
-            log.warning("%s: its depth image cannot be read: %s", item.name, error.strerror)
+            notify(log, f"{item.name}: its depth image cannot be read: {error.strerror}")
         return item
 
     def _read(self, path: Path) -> DepthImage:
-        return read_depth_file(path, self.unit_m, self.depth_intrinsics, self.noise)
+        made = read_depth_file(path, self.unit_m, self.depth_intrinsics, self.noise)
+        check_unit(made)  # the layout tells the unit, and the file may have another one
+        return made
 
 
 def find_rgbd_folder(folder: Path) -> RgbdFolder | None:
@@ -90,13 +95,28 @@ def _open_tum(folder: Path) -> RgbdFolder:
     if len(places) != 1:
         raise RgbdFolderError(f"{str(folder / 'rgb.txt')!r} must list files of one folder, got {len(places)} folders")
     depths.sort()
-    times, found = [time for time, _ in depths], {}
+    times, found, offsets = [time for time, _ in depths], {}, []
     for time, file in colours:
         at = bisect.bisect_left(times, time)
         near = min(depths[max(0, at - 1) : at + 1], key=lambda each: abs(each[0] - time))
+        offsets.append(near[0] - time)
         if abs(near[0] - time) <= _TUM_APART_S:
             found[Path(file).name] = folder / near[1]
-    return RgbdFolder("TUM RGB-D", places.pop(), found, 1.0 / _TUM_STEPS)
+    told = _describe_pairs(len(found), offsets)
+    return RgbdFolder("TUM RGB-D", places.pop(), found, 1.0 / _TUM_STEPS, told=told)
+
+
+def _describe_pairs(num_found: int, offsets: Sequence[float]) -> str:
+    """How many photographs got a depth image, where fewer than most did; `offsets` (s) are to the nearest of each."""
+    if not is_few(num_found, len(offsets)):
+        return ""
+    median_s = float(np.median(offsets))
+    by = f"{1000 * median_s:+.0f} ms" if abs(median_s) < 10 else f"{median_s:+.3g} s"
+    return (
+        f"{num_found} of {len(offsets)} photographs have a depth image within {1000 * _TUM_APART_S:.0f} ms of "
+        f"their time (rgb.txt, depth.txt); the nearest is {by} away in the median. Where the clocks differ by so much, "
+        "add it to the times of one file; where depth comes less often, this is right"
+    )
 
 
 def _read_list(path: Path) -> list[tuple[float, str]]:
@@ -131,8 +151,8 @@ def _open_scannet(folder: Path) -> RgbdFolder:
     for name in ("color", "depth"):
         path, first = folder / "intrinsic" / f"intrinsic_{name}.txt", _first_size(folder / name)
         lenses.append(_make_lens(_read_matrix(path), first, str(path)) if path.is_file() and first else None)
-    depths = _list_by_stem(folder / "depth")
-    return RgbdFolder("ScanNet", folder / "color", _pair(folder / "color", depths), None, lenses[0], lenses[1])
+    paired, told = _pair(folder / "color", _list_by_stem(folder / "depth"))
+    return RgbdFolder("ScanNet", folder / "color", paired, None, lenses[0], lenses[1], told=told)
 
 
 class _Metadata(msgspec.Struct, frozen=True):
@@ -154,7 +174,8 @@ def _open_record3d(folder: Path) -> RgbdFolder:
         raise RgbdFolderError(
             f"{str(folder / 'depth')!r} has no depth images (.exr, .png, .npy): export from Record3D as EXR and RGB"
         )
-    return RgbdFolder("Record3D", folder / "rgb", _pair(folder / "rgb", depths), None, lens, noise="lidar")
+    paired, told = _pair(folder / "rgb", depths)
+    return RgbdFolder("Record3D", folder / "rgb", paired, None, lens, noise="lidar", told=told)
 
 
 def _list_by_stem(folder: Path) -> dict[str, Path]:
@@ -162,8 +183,11 @@ def _list_by_stem(folder: Path) -> dict[str, Path]:
     return {path.stem: path for path in sorted(files)}
 
 
-def _pair(photographs: Path, depths: Mapping[str, Path]) -> dict[str, Path]:
-    return {path.name: depths[path.stem] for path in photographs.iterdir() if path.stem in depths}
+def _pair(photographs: Path, depths: Mapping[str, Path]) -> tuple[dict[str, Path], str]:
+    """The depth images of photographs that have the same name, and what people should know of the pairs."""
+    files = [path for path in photographs.iterdir() if path.suffix.lower() in _PHOTOGRAPH_SUFFIXES]
+    found = {path.name: depths[path.stem] for path in files if path.stem in depths}
+    return found, describe_few_pairs(len(found), len(files))
 
 
 def _first_size(folder: Path) -> tuple[int, int] | None:

@@ -35,7 +35,7 @@ class RigCamera:
             raise ValueError(f"a camera id must be 1 to {LONGEST_NAME} printable letters, got {self.camera_id[:40]!a}")
         if not (LEAST_SIGMA <= self.sigma_m <= LARGEST_M and LEAST_SIGMA <= self.sigma_deg <= 180):
             raise ValueError(
-                f"the sigmas of a camera on its rig must be {LEAST_SIGMA:g} or more, up to {LARGEST_M:g} m and "
+                f"the sigmas of {self.camera_id} on its rig must be {LEAST_SIGMA:g} or more, up to {LARGEST_M:g} m and "
                 f"180 degrees; got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
             )
         if self.T_rig_camera is not None and (problem := rigid_problem(self.T_rig_camera)):

@@ -11,7 +11,8 @@ Lengths are metres, cameras look along z, x right, y down. Of a camera without T
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.lens_file import read_lenses
-from splatnode.capture.process.config_text import MAX_BYTES, parse_yaml
+from splatnode.capture.lens_file import UnusableLens, read_lenses
+from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
 from splatnode.capture.process.files import read_text
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
@@ -30,6 +31,16 @@ from splatnode.capture.rig import SIGMA_DEG, SIGMA_M, Rig, RigCamera
 Array = npt.NDArray[np.float64]
 
 _READ = "a rig: rig.yaml, COLMAP's rig_config.json, or Kalibr's camchain"
+
+
+_OF_COLMAP = (
+    "Each has image_prefix, and cam_from_rig_rotation [w, x, y, z] and cam_from_rig_translation [x, y, z] unless it is "
+    "the ref_sensor"
+)
+_OF_KALIBR = (
+    "There must be cam0, cam1 and so on, each but the first with T_cn_cnm1, a matrix (4, 4) of its pose against the "
+    "camera before"
+)
 
 
 class UnusableRig(ValueError):
@@ -43,16 +54,15 @@ class _Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     metric: bool = True
 
 
-class _File(msgspec.Struct, frozen=True):
-    cameras: dict[str, _Camera]
-
-
 def read_rig(path: Path) -> Rig:
     """Returns the rig that a file gives. Raises UnusableRig."""
     shown = sanitize_text(str(path))
     text = read_text(path, MAX_BYTES, UnusableRig, shown, _READ)
     with guard_untrusted(UnusableRig, shown):
-        content = parse_yaml(text, shown)  # JSON is YAML
+        try:
+            content = parse_yaml(text, shown)  # JSON is YAML
+        except ConfigError as error:  # on several lines, of which the first says it; it names the file already
+            raise UnusableRig(f"{sanitize_text(' '.join(str(error).split()))}; it must give {_READ}") from error
         if isinstance(content, list):
             return _parse_colmap(shown, content)
         if isinstance(content, Mapping) and "cameras" in content:
@@ -63,17 +73,38 @@ def read_rig(path: Path) -> Rig:
 
 
 def _parse_own(shown: str, content: Mapping[str, Any]) -> Rig:
-    try:
-        cameras = record_of(content, _File).cameras
-        if any(not camera.metric and camera.T_rig_camera is not None for camera in cameras.values()):
-            raise ValueError("it has no metres: its scene had none. Measure it, or leave T_rig_camera out")
-        return Rig(
-            tuple(
-                RigCamera(name, _flatten(camera.T_rig_camera), camera.sigma_m, camera.sigma_deg)
-                for name, camera in cameras.items()
-            )
+    cameras = content["cameras"]
+    if not isinstance(cameras, Mapping):
+        raise UnusableRig(
+            f"{shown}: cameras must be a mapping of camera ids to T_rig_camera, got {type(cameras).__name__}"
         )
-    except (ValueError, msgspec.ValidationError) as error:
+    return _make_rig(shown, [_parse_own_camera(shown, str(name), each) for name, each in cameras.items()])
+
+
+def _parse_own_camera(shown: str, name: str, given: Any) -> RigCamera:
+    with _name_camera(shown, name):
+        camera = record_of({} if given is None else given, _Camera)
+        if not camera.metric and camera.T_rig_camera is not None:
+            raise ValueError("it has no metres: its scene had none. Measure it, or leave T_rig_camera out")
+        return RigCamera(name, _flatten(camera.T_rig_camera), camera.sigma_m, camera.sigma_deg)
+
+
+@contextlib.contextmanager
+def _name_camera(shown: str, name: object, expected: str = "") -> Iterator[None]:
+    """Makes what is wrong in here an UnusableRig that names the file and the camera, and what was expected of it."""
+    try:
+        yield
+    except UnusableRig:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, np.linalg.LinAlgError, msgspec.ValidationError) as error:
+        said = f"it has no {error}" if isinstance(error, KeyError) else sanitize_text(error).replace("`", "")
+        raise UnusableRig(f"{shown}: camera {sanitize_text(name, 60)!r}: {said}{expected}") from error
+
+
+def _make_rig(shown: str, cameras: Sequence[RigCamera]) -> Rig:
+    try:
+        return Rig(tuple(cameras))
+    except ValueError as error:
         raise UnusableRig(f"{shown}: {error}") from error
 
 
@@ -85,44 +116,39 @@ def _parse_colmap(shown: str, content: list[Any]) -> Rig:
     """The first rig: cameras are called as the folders of their images are."""
     if len(content) != 1:
         raise UnusableRig(f"{shown} must have one rig, it has {len(content)}; leave the one that took the images")
-    try:
-        found = []
-        for given in content[0]["cameras"]:
-            name = sanitize_text(PurePosixPath(str(given["image_prefix"])).name, LONGEST_NAME)
-            T_camera_rig = np.eye(4)
-            if not given.get("ref_sensor", False):
-                if "cam_from_rig_rotation" not in given:
-                    found.append(RigCamera(name))
-                    continue
-                w, x, y, z = map(float, given["cam_from_rig_rotation"])
-                T_camera_rig[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-                T_camera_rig[:3, 3] = [float(number) for number in given["cam_from_rig_translation"]]
-            found.append(RigCamera(name, _invert(T_camera_rig)))
-        return Rig(tuple(found))
-    except (KeyError, TypeError, ValueError) as error:
-        raise UnusableRig(
-            f"{shown} must have one rig with `cameras`, each with image_prefix, and cam_from_rig_rotation [w, x, y, z] "
-            f"and cam_from_rig_translation [x, y, z] unless it is the ref_sensor: {sanitize_text(error)}"
-        ) from error
+    listed = content[0].get("cameras") if isinstance(content[0], Mapping) else None
+    if not isinstance(listed, list) or not all(isinstance(each, Mapping) for each in listed):
+        raise UnusableRig(f"{shown} must have one rig with `cameras`, a list of mappings. {_OF_COLMAP}")
+    return _make_rig(shown, [_parse_colmap_camera(shown, number, given) for number, given in enumerate(listed)])
+
+
+def _parse_colmap_camera(shown: str, number: int, given: Mapping[str, Any]) -> RigCamera:
+    with _name_camera(shown, given.get("image_prefix", number), f". {_OF_COLMAP}"):
+        name = sanitize_text(PurePosixPath(str(given["image_prefix"])).name, LONGEST_NAME)
+        T_camera_rig = np.eye(4)
+        if not given.get("ref_sensor", False):
+            if "cam_from_rig_rotation" not in given:
+                return RigCamera(name)
+            w, x, y, z = map(float, given["cam_from_rig_rotation"])
+            T_camera_rig[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+            T_camera_rig[:3, 3] = [float(number) for number in given["cam_from_rig_translation"]]
+        return RigCamera(name, _invert(T_camera_rig))
 
 
 def _parse_kalibr(path: Path, shown: str, content: Mapping[str, Any]) -> Rig:
     """Cameras are called cam0, cam1 and so on, as their lenses are; the rig is cam0."""
-    lenses = read_lenses(path).by_key
     try:
-        T_camera_rig, found = np.eye(4), []
-        for number in range(len(content)):
-            given = content[f"cam{number}"]
-            if number:
+        lenses = read_lenses(path).by_key
+    except UnusableLens as error:  # it names the file already
+        raise UnusableRig(str(error)) from error
+    T_camera_rig, found = np.eye(4), []
+    for name in (f"cam{number}" for number in range(len(content))):
+        with _name_camera(shown, name, f". {_OF_KALIBR}"):
+            given = content.get(name, {})
+            if name != "cam0":
                 T_camera_rig = np.reshape([float(x) for row in given["T_cn_cnm1"] for x in row], (4, 4)) @ T_camera_rig
-            name = f"cam{number}"
             found.append(RigCamera(name, _invert(T_camera_rig), intrinsics=lenses.get(name)))
-        return Rig(tuple(found))
-    except (KeyError, TypeError, ValueError) as error:
-        raise UnusableRig(
-            f"{shown} must have cam0, cam1 and so on, each but the first with T_cn_cnm1, a matrix (4, 4) of its pose "
-            f"against the camera before: {sanitize_text(error)}"
-        ) from error
+    return _make_rig(shown, found)
 
 
 def _invert(T: Array) -> tuple[float, ...]:

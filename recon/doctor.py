@@ -17,7 +17,7 @@ from splatnode.capture.cameras import v4l2
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.capture.process.system import EXTRAS, REQUIRED
-from splatnode.capture.process.terminal import say, show_waiting
+from splatnode.capture.process.terminal import say, show_progress, show_waiting
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
 
@@ -42,7 +42,9 @@ class Finding:
 
 
 def doctor(args: argparse.Namespace) -> int:
-    """Prints the findings; 2 when something is missing that everything needs."""
+    """Prints the findings, or the rates that are asked for; 2 when something is missing that everything needs."""
+    if args.rates is not None:
+        return _print_rates(args)
     with show_waiting("looking at what is installed"):
         found = findings()
     if args.json:
@@ -51,6 +53,22 @@ def doctor(args: argparse.Namespace) -> int:
         for finding in found:
             say(f"{finding.state:9}{finding.name:14}{finding.detail}")
     return 2 if any(finding.state == "missing" for finding in found) else 0
+
+
+def _print_rates(args: argparse.Namespace) -> int:
+    """Prints the seconds of each step with each number of views. Raises ValueError for a wrong number."""
+    from splatnode.recon import rates  # brings what reconstructs
+
+    views = args.rates or rates.VIEWS
+    with show_progress(quiet=args.json) as tell:
+        found = rates.measure_rates(views, tell=tell)
+    if args.json:
+        print(json.dumps(rates.record_rates(found), indent=1))
+        return 0
+    for line in rates.format_rates(found):
+        say(line)
+    say(f"The built-in capture, {core.default_threads()} threads, {core.instruction_sets()[0]}, preset balanced.")
+    return 0
 
 
 def findings() -> list[Finding]:

@@ -219,7 +219,7 @@ def _find_rig(conclusion: ReconstructionSummary) -> OnRig | None:
         return None
     mounts = {each.camera_id: each for each in reversed(rig.mounts)}
     told = tuple((m.camera_id, m.T_rig_camera, m.sigma, m.sigma_deg) for m in reversed(mounts.values()))
-    return OnRig(told, rig.metres_per_unit, rig.scale_sigma)
+    return OnRig(told, rig.metres_per_unit, rig.scale_sigma, rig.num_given)
 
 
 def _falloffs(scene: Scene) -> dict[str, float]:

@@ -8,6 +8,7 @@ Either way the final scene is made afresh from all frames: it depends on which f
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import is_resampled
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import threads
@@ -29,6 +31,7 @@ from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match
+from splatnode.recon.metric.depth_units import describe_doubtful_units
 from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.modelling import (
@@ -45,6 +48,8 @@ from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene
+
+log = logging.getLogger(__name__)
 
 DEPTH_SHARE = 0.4  # of the seconds that the cameras left of a budget: the refinement needs most of them
 
@@ -253,6 +258,8 @@ def reconstruct_source(
     most; None: as many as the process may use.
     Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
     """
+    if doubt := describe_doubtful_units(source.frames):
+        notify(log, doubt)
     with threads.apply_thread_limit(most_threads):
         evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
         snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)

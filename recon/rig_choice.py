@@ -2,24 +2,32 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import combinations
 from os import PathLike
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.lens_file import Lenses, describe_image
 from splatnode.capture.multi_camera import CameraSet
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import Tell
 from splatnode.capture.process.text import sanitize_text
-from splatnode.capture.rig import Rig
+from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import read_rig
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.replay_source import Source
 
+log = logging.getLogger(__name__)
+
 # Standard deviations of a camera's pose by a log's static transforms, which are drawn more often than calibrated
 DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = 0.005, 0.5
+LONGEST_BASELINE_M = 20.0  # between two cameras of a robot; beyond, the file is probably in millimetres
 _TRUSTED = ("given", "calibration")  # sources of a lens that a rig's does not replace
 
 
@@ -28,10 +36,66 @@ def apply_rig(
 ) -> tuple[Source, ReconstructionConfig]:
     """The frames with the lenses of their rig, and the configuration with it: that of a file, or of their recording.
 
-    Raises as `choose_rig` and `add_rig_lenses`.
+    What of the rig does not count is notified. Raises as `choose_rig` and `add_rig_lenses`.
     """
     rig = choose_rig(None if file is None else Path(file), given.cameras, tell)
-    return (given, config) if rig is None else (add_rig_lenses(given, rig), hold_rig(config, rig))
+    if rig is None:
+        return given, config
+    with_lenses = add_rig_lenses(given, rig)
+    for text in describe_rig_use(rig, [each.camera_id for each in given.frames if isinstance(each, Frame)]):
+        notify(log, text)
+    return with_lenses, hold_rig(config, rig)
+
+
+def describe_rig_use(rig: Rig, camera_ids: Iterable[str]) -> Iterator[str]:
+    """Describes what of a rig does not count for images of these cameras, and what of it is probably not meant."""
+    ids = list(camera_ids)
+    there = set(ids) - {""}
+    if not there:
+        return
+    used = [each for each in rig.cameras if each.camera_id in there]
+    absent = [each.camera_id for each in rig.cameras if each.camera_id not in there]
+    further = sorted(there - {each.camera_id for each in used})
+    if absent:
+        yield (
+            f"no image is of {_join(absent)} of the rig, so the rig counts for {_join(e.camera_id for e in used)} "
+            "alone. Name the cameras as the rig does (--cameras, camera_ids), or leave those out of it"
+        )
+    if further:
+        yield (
+            f"the rig does not have {_join(further)}, whose images are there: these images alone tell where it stands. "
+            f"The rig has {_join(each.camera_id for each in rig.cameras)}; name the cameras as it does, or add it"
+        )
+    if unnamed := ids.count(""):
+        yield f"{unnamed} of {len(ids)} images are of no camera that is named: the rig does not count for these"
+    unplaced = [each.camera_id for each in used if each.matrix is None]
+    if unplaced:
+        few = len(used) - len(unplaced) < 2
+        yield (
+            f"the rig does not tell where {_join(unplaced)} stands (T_rig_camera, or cam_from_rig of COLMAP): the "
+            "images alone tell it. "
+            + ("The rig gives no metres: give two cameras or more a pose" if few else "The others give the metres")
+        )
+    yield from _describe_lengths(used)
+
+
+def _describe_lengths(cameras: Iterable[RigCamera]) -> Iterator[str]:
+    placed = [each for each in cameras if each.matrix is not None]
+    centres = {each.camera_id: each.matrix[:3, 3] for each in placed if each.matrix is not None}
+    apart = [(float(np.linalg.norm(centres[a] - centres[b])), a, b) for a, b in combinations(centres, 2)]
+    longest = max(apart, default=None)
+    if longest is not None and longest[0] > LONGEST_BASELINE_M:
+        yield (
+            f"the rig has {_join([longest[1]])} and {_join([longest[2]])} {longest[0]:.3g} m apart: its poses are "
+            "metres. Where they are millimetres, divide the translations by 1000; else all lengths are 1000 times too "
+            "large"
+        )
+    elif longest is not None and longest[0] <= max(each.sigma_m for each in placed):
+        yield f"the rig has {_join(centres)} in one place, within their sigma_m: it gives no metres"
+
+
+def _join(camera_ids: Iterable[str]) -> str:
+    return sanitize_text(", ".join(camera_ids), 200)
 
 
 def choose_rig(file: Path | None, cameras: CameraSet | None, tell: Tell) -> Rig | None:
@@ -79,9 +143,9 @@ def add_rig_lenses(given: Source, rig: Rig) -> Source:
 def _check_names(rig: Rig, frames: list[Frame]) -> None:
     there = {frame.camera_id for frame in frames} - {""}
     if frames and sum(camera.camera_id in there for camera in rig.cameras) < 2:
-        known = ", ".join(camera.camera_id for camera in rig.cameras)
         raise ValueError(
-            f"a rig must name two or more of the cameras of the images; it has {sanitize_text(known, 200)}, and the "
-            f"images are of {sanitize_text(', '.join(sorted(there)), 200) or 'no cameras that are named'}. Name the "
+            f"a rig must name two or more of the cameras of the images; it has "
+            f"{_join(each.camera_id for each in rig.cameras)}, and the "
+            f"images are of {_join(sorted(there)) or 'no cameras that are named'}. Name the "
             "cameras as the rig does: --cameras A,B with a folder or a film of each in their order"
         )

@@ -41,6 +41,11 @@ def _recon_arguments(parser: argparse.ArgumentParser) -> None:
         help="where it keeps what it goes on from when it is started again; another folder begins with nothing",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
+    parser.add_argument(
+        "--finish",
+        action="store_true",
+        help="finalize all scenes, merge those of each map, and end; a node that runs already does it, and this waits",
+    )
     add_marker(parser)
 
 
@@ -106,6 +111,17 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
+def _doctor_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rates",
+        nargs="*",
+        type=positive,
+        metavar="VIEWS",
+        help="measure the seconds of each step of a growing scene with so many views (default: 3 6 12; two minutes)",
+    )
+    add_json(parser)
+
+
 VERBS = (
     REPLAY,
     Verb(
@@ -152,8 +168,8 @@ VERBS = (
     ),
     Verb(
         "doctor",
-        "tell what is installed and what is missing",
-        add_json,
+        "tell what is installed and what is missing, or how fast this machine is",
+        _doctor_arguments,
         import_lazily("splatnode.recon.doctor", "doctor"),
     ),
 )

@@ -22,7 +22,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import splatnode.capture.verbs
 import splatnode.recon.verbs
@@ -116,7 +116,7 @@ class _Parser(argparse.ArgumentParser):
 def list_verbs() -> tuple[Verb, ...]:
     """All verbs: those of the core, whose names no other has, then those that are installed beside it."""
     own = {verb.name for verb in VERBS}
-    further = {verb.name: verb for verb in plugins.load_all(plugins.VERBS).values()}
+    further = {verb.name: verb for verb in plugins.load_all(plugins.VERBS, _try_verb).values()}
     return *VERBS, *(verb for name, verb in further.items() if name not in own)
 
 
@@ -130,13 +130,26 @@ def build_parser(wanted: str | None = None) -> argparse.ArgumentParser:
     parser.set_defaults(verb=None)
     verbs = parser.add_subparsers(metavar="VERB")
     for verb in [verb for verb in VERBS if verb.name == wanted] or list_verbs():
-        subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
-        verb.add_arguments(subparser)
+        subparser = _add_verb(verbs, verb)
         subparser.add_argument(
             "--debug", action="store_true", help="show the traceback of an error, and all that is logged"
         )
         subparser.set_defaults(verb=verb.name, run=verb.run)
     return parser
+
+
+def _add_verb(verbs: Any, verb: Verb) -> argparse.ArgumentParser:
+    subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
+    verb.add_arguments(subparser)
+    return subparser
+
+
+def _try_verb(verb: Verb) -> None:
+    """Raises what a verb of another package fails with when it is offered."""
+    parser = argparse.ArgumentParser()
+    subparser = _add_verb(parser.add_subparsers(), verb)
+    parser.format_help()
+    subparser.format_help()
 
 
 def exit_code(error: BaseException) -> int:

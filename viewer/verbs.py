@@ -41,7 +41,15 @@ class FurtherViewer:
 
 def load_viewers() -> tuple[FurtherViewer, ...]:
     """All that are installed, in the order of their entry points."""
-    return tuple(plugins.load_all(plugins.VIEWERS).values())
+    return tuple(plugins.load_all(plugins.VIEWERS, _try_viewer).values())
+
+
+def _try_viewer(viewer: FurtherViewer) -> None:
+    """Raises what a viewer of another package fails with when it is offered."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument(f"--{viewer.name}", help=viewer.summary)
+    viewer.add_arguments(parser)
+    parser.format_help()
 
 
 def find_chosen(args: argparse.Namespace) -> FurtherViewer | None:

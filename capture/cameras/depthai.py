@@ -1,4 +1,4 @@
-"""The colour stream of a Luxonis OAK camera, or the pairs of its stereo cameras, through DepthAI v3."""
+"""A Luxonis OAK camera through DepthAI v3: its colour stream, with depth images or not, or its stereo pairs."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import partial
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.depth_image import NOISES, DepthNoise, make_depth_image
 from splatnode.capture.frame import (
     Baseline,
     CameraUnavailable,
@@ -34,11 +35,15 @@ from splatnode.capture.frame import (
 )
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.text import sanitize_text
 
 log = logging.getLogger(__name__)
 
 LIVE = True
 _MIN_FOCAL = 0.1  # in longer image sides; a device without calibration gives the identity matrix
+_STEREO_SIZE = (640, 400)  # pixels, at which the device matches its stereo cameras' images
+_MATCH_PX = 0.25  # standard deviation of a disparity at that size, with subpixels
+_SATURATED = 65_535  # millimetres: of what is farther than 16 bits can say
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -58,6 +63,22 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Use the left stereo camera, not the colour camera, and send the right image with each frame: lengths are metres by
     # the device's baseline. Rectified on the device; grey where the sensors are
     stereo: bool = False
+    # Depth images of the device's stereo cameras, aligned with the colour images, with each frame: lengths are metres.
+    # available: where the device cannot measure depth, it says so, and sends colour images alone; required: it stops
+    depth: Literal["none", "available", "required"] = "none"
+
+    def __post_init__(self) -> None:
+        if self.depth != "none" and self.stereo:
+            raise ValueError("stereo and depth are two ways to metres; set one of them: stereo: true, or depth")
+        if self.depth != "none" and not self.undistort:
+            raise ValueError(
+                f"depth: {self.depth} needs undistort: true: the device aligns depth with undistorted images alone"
+            )
+
+    @property
+    def sync_s(self) -> float:
+        """How far apart images that count as taken together may be, seconds: half of the time between frames."""
+        return 0.5 / self.fps
 
 
 @dataclass(frozen=True)
@@ -80,7 +101,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     info = _select_device(dai, config.device)
     try:
         with dai.Device(info) as device, dai.Pipeline(device) as pipeline:
-            source = _pairs(dai, device, pipeline, config) if config.stereo else _colour(dai, pipeline, config)
+            source = _choose_source(dai, device, pipeline, config)
             controls = [camera.inputControl.createInputQueue() for camera in source.cameras]
             pipeline.start()
             if config.focus is not None:
@@ -97,7 +118,27 @@ def _send(controls: list[Any], command: Any) -> None:
         each.send(command)
 
 
-def _colour(dai: ModuleType, pipeline: Any, config: Config) -> Source:
+def _choose_source(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Source:
+    """Returns what the configuration asks for, or colour alone where depth may be missing. Raises CameraUnavailable."""
+    if config.stereo:
+        return _pairs(dai, device, pipeline, config)
+    if config.depth == "none":
+        return _colour(dai, pipeline, config)
+    try:
+        noise = _find_noise(dai, device)
+    except CameraUnavailable as error:
+        if config.depth == "required":
+            raise CameraUnavailable(
+                f"{error}, so it measures no depth. Set camera.depth to available for colour images alone"
+            ) from error
+        event(log, logging.WARNING, "no_depth", reason=sanitize_text(error), sent="colour images alone")
+        return _colour(dai, pipeline, config)
+    event(log, logging.INFO, "depth", sigma_at_2_m=f"{noise.a_m + 4 * noise.b_per_m:.3f}", within_s=config.sync_s)
+    return _colour_with_depth(dai, device, pipeline, config, noise)
+
+
+def _request_colour(dai: ModuleType, pipeline: Any, config: Config) -> tuple[Any, Any]:
+    """Returns the node of the colour camera, and its output."""
     camera = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A)
     output = camera.requestOutput(
         (config.width, config.height),
@@ -106,7 +147,62 @@ def _colour(dai: ModuleType, pipeline: Any, config: Config) -> Source:
         fps=config.fps,
         enableUndistortion=config.undistort,
     )
+    return camera, output
+
+
+def _colour(dai: ModuleType, pipeline: Any, config: Config) -> Source:
+    camera, output = _request_colour(dai, pipeline, config)
     return Source(output.createOutputQueue(maxSize=2, blocking=False), (camera,), convert_frame)
+
+
+def _colour_with_depth(dai: ModuleType, device: Any, pipeline: Any, config: Config, noise: DepthNoise) -> Source:
+    """Returns the colour and the depth image of one moment, which the device aligns: RVC2 as it matches, RVC4 behind.
+
+    The node's confidence map is not aligned, so it is not used.
+    """
+    camera, colour = _request_colour(dai, pipeline, config)
+    stereo, sync = pipeline.create(dai.node.StereoDepth), pipeline.create(dai.node.Sync)
+    stereo.setRectification(True)
+    stereo.setLeftRightCheck(True)
+    stereo.setSubpixel(True)
+    sides = ((dai.CameraBoardSocket.CAM_B, stereo.left), (dai.CameraBoardSocket.CAM_C, stereo.right))
+    for socket, side in sides:
+        beside = pipeline.create(dai.node.Camera).build(socket)
+        beside.requestOutput(_STEREO_SIZE, resizeMode=dai.ImgResizeMode.CROP, fps=config.fps).link(side)
+    if device.getPlatform() == dai.Platform.RVC4:
+        align = pipeline.create(dai.node.ImageAlign)
+        stereo.depth.link(align.input)
+        colour.link(align.inputAlignTo)
+        align.outputAligned.link(sync.inputs["depth"])
+    else:
+        colour.link(stereo.inputAlignTo)
+        stereo.depth.link(sync.inputs["depth"])
+    colour.link(sync.inputs["colour"])
+    sync.setSyncThreshold(timedelta(seconds=config.sync_s))
+    queue = sync.out.createOutputQueue(maxSize=2, blocking=False)
+    convert = DepthConverter(noise, config.sync_s)
+    return Source(queue, (camera,), convert, lambda group: group["colour"])
+
+
+def _find_noise(dai: ModuleType, device: Any) -> DepthNoise:
+    """Computes what an error of matching makes of depth, by the calibration of this very device.
+
+    Raises CameraUnavailable where it has no stereo cameras, or does not know them.
+    """
+    left, right = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
+    there = list(device.getConnectedCameras())
+    if left not in there or right not in there:
+        raise CameraUnavailable("the camera has no pair of stereo cameras (CAM_B and CAM_C)")
+    try:
+        calibration = device.readCalibration()
+        metres = abs(float(calibration.getBaselineDistance(right, left, False, dai.LengthUnit.METER)))
+        focal = float(calibration.getCameraIntrinsics(right, *_STEREO_SIZE)[0][0])
+        Baseline(metres)  # raises ValueError
+        if not focal >= _MIN_FOCAL * max(_STEREO_SIZE):
+            raise ValueError(f"its focal length is {focal:g} pixels")
+        return DepthNoise(NOISES["stereo"].a_m, _MATCH_PX / (focal * metres))
+    except (RuntimeError, ValueError, LookupError, TypeError) as error:
+        raise CameraUnavailable(f"the camera's stereo cameras are not calibrated ({sanitize_text(error)})") from error
 
 
 def _pairs(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Source:
@@ -121,7 +217,7 @@ def _pairs(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Sourc
         camera.requestOutput(size, resizeMode=dai.ImgResizeMode.CROP, fps=config.fps).link(side)
     stereo.rectifiedLeft.link(sync.inputs["left"])
     stereo.rectifiedRight.link(sync.inputs["right"])
-    sync.setSyncThreshold(timedelta(seconds=0.5 / config.fps))
+    sync.setSyncThreshold(timedelta(seconds=config.sync_s))
     queue = sync.out.createOutputQueue(maxSize=2, blocking=False)
     return Source(queue, cameras, partial(convert_stereo_pair, baseline), lambda group: group["left"])
 
@@ -156,7 +252,8 @@ def read(dai: ModuleType, source: Source, config: Config, hold: Callable[[], Non
         except dai.MessageQueue.QueueException as error:
             raise CameraUnavailable(f"the camera ended its stream: {error}") from error
         if message is None:
-            raise CameraUnavailable(f"no frame for {config.frame_timeout_s:g} s; is the camera still plugged in?")
+            hint = "" if config.depth == "none" else " If it is, it may measure no depth: try camera.depth: none"
+            raise CameraUnavailable(f"no frame for {config.frame_timeout_s:g} s; is the camera still plugged in?{hint}")
         if not held and time.monotonic() < settled:
             continue
         if not held:
@@ -201,6 +298,42 @@ def convert_stereo_pair(baseline: Baseline, group: Any, frame_id: int) -> Frame 
         return replace(left, right=RightImage(grey(seen), baseline))
     except ValueError as error:
         return DroppedFrame(left.name, f"its right image cannot be used: {error}")
+
+
+class DepthConverter:
+    """Makes a group of a colour and a depth ImgFrame the colour one's Frame, with its depth image.
+
+    A depth image that cannot be used is left out; the log tells the first of them, and why.
+    """
+
+    def __init__(self, noise: DepthNoise, within_s: float) -> None:
+        self._noise, self._within_s, self._is_told = noise, within_s, False
+
+    def __call__(self, group: Any, frame_id: int) -> Frame | DroppedFrame:
+        frame = convert_frame(group["colour"], frame_id)
+        if isinstance(frame, DroppedFrame):
+            return frame
+        try:
+            return self._attach_depth(frame, group)
+        except ValueError as error:
+            if not self._is_told:
+                event(log, logging.WARNING, "depth_left_out", name=frame.name, reason=sanitize_text(error))
+                self._is_told = True
+            return frame
+
+    def _attach_depth(self, frame: Frame, group: Any) -> Frame:
+        """Raises ValueError."""
+        apart_s = (group["depth"].getTimestamp() - group["colour"].getTimestamp()).total_seconds()
+        if abs(apart_s) > self._within_s:
+            raise ValueError(
+                f"it was taken {1000 * apart_s:.1f} ms from its image, at most {1000 * self._within_s:.1f} ms count"
+            )
+        values = np.asarray(group["depth"].getCvFrame())
+        if values.dtype != np.uint16:
+            raise ValueError(f"it must be of 16 bits, millimetres, got {values.dtype}")
+        return replace(
+            frame, depth=make_depth_image(np.where(values == _SATURATED, np.uint16(0), values), noise=self._noise)
+        )
 
 
 def _rgb(image: Any) -> npt.NDArray[np.uint8]:

@@ -44,6 +44,7 @@ from splatnode.capture.odometry import LARGEST_M, make_given_pose
 from splatnode.capture.odometry import SIGMA_DEG as POSE_SIGMA_DEG
 from splatnode.capture.odometry import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.rgbd_folder import RgbdFolder, find_photographs, find_rgbd_folder
@@ -129,6 +130,8 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         )
     rgbd = find_rgbd_folder(config.folder)
     if rgbd is not None:
+        if rgbd.told:
+            notify(log, rgbd.told)
         lens = config.intrinsics or rgbd.intrinsics
         config = msgspec.structs.replace(config, folder=rgbd.photographs, intrinsics=lens)
     paths = select_images(config.folder, config.names)  # at once, before the first frame, so that mistakes show at once
@@ -185,7 +188,7 @@ def _frames(
 ) -> Iterator[Frame | DroppedFrame]:
     frame_id, used = 0, find_common_range(paths, config.max_pixels)
     if used is not None:
-        log.warning("%s", describe_value_range(used))
+        notify(log, describe_value_range(used))
     for path in paths:
         if (unreadable := explain_unreadable_file(path)) is not None:
             yield unreadable

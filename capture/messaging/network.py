@@ -344,7 +344,7 @@ RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
 
 # Of a capture beside others: a part of the names of its sockets, its spool and its frames.
 CAMERA_ID = "[A-Za-z0-9_-]{1,32}"  # a regular expression
-CaptureId = Annotated[str, msgspec.Meta(pattern=f"^(?:{CAMERA_ID})?$", max_length=32)]
+CaptureId = Annotated[str, msgspec.Meta(pattern=rf"^(?:{CAMERA_ID})?\Z", max_length=32)]
 _CAPTURE = re.compile(rf"capture\.keyframes(?:@({CAMERA_ID}))?")
 
 

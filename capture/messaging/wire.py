@@ -36,7 +36,7 @@ LARGEST = 2**62  # of all integers
 MOST_ENTRIES = 4096  # of a sequence or a table
 DEEPEST = 12  # values within values
 
-SessionId = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$", max_length=32)]
+SessionId = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{32}\Z", max_length=32)]
 Sequential = Annotated[int, msgspec.Meta(ge=0, le=LARGEST)]
 Count = Annotated[int, msgspec.Meta(ge=-1, le=LARGEST)]  # or a number of something, -1 where there is none yet
 Finite = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]

@@ -19,6 +19,8 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
+from splatnode.capture.process.notices import gives_warnings, notify
+
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
@@ -91,12 +93,12 @@ def replace_former_name(key: str, place: KeyPlace, schema: Any) -> str:
     if present is None or present not in types:
         return key  # an unknown key, which is refused where the whole is read
     if present != key:
-        _warn_once(
+        _tell_of_key(
             f"{join_keys(place.where, key)} is called {present} now; write {join_keys(place.where, present)}: "
             "the former name is read in this release only"
         )
     if is_internal(types[present]) and not place.internal:
-        _warn_once(
+        _tell_of_key(
             f"{join_keys(place.where, present)} is internal: it will be a constant in the next release; leave it out"
         )
     return present
@@ -110,6 +112,14 @@ def has_fields(schema: Any) -> bool:
 def join_keys(where: str, key: str) -> str:
     """Returns the path of `key` under `where`, either of which may be empty."""
     return f"{where}.{key}" if where and key and not key.startswith("[") else where + key
+
+
+def _tell_of_key(text: str) -> None:
+    """On the log once a process; a program's filters tell how often it hears a Python warning."""
+    if gives_warnings():
+        notify(log, text, DeprecationWarning)
+    else:
+        _warn_once(text)
 
 
 @functools.cache

@@ -12,7 +12,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -33,12 +33,23 @@ PRIORS = "splatnode.priors"  # a module, as one of recon/priors
 EXPORT_FORMATS = "splatnode.export_formats"  # a module, as one of recon/result/export/formats
 VIEWERS = "splatnode.viewers"  # a FurtherViewer
 
+# What a plug-in must have. Those of cameras and priors are named where they are configured, `Plugin.needs`.
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    VERBS: ("name", "summary", "add_arguments", "run"),
+    RECORDINGS: ("is_recording", "configure_part", "explain_many"),
+    EXPORT_FORMATS: ("DEFAULT_NAME", "export"),
+    VIEWERS: ("name", "summary", "shows", "show", "add_arguments", "check", "is_server"),
+}
 _OWN = Path(__file__).parents[2] / "extras" / "entry_points.txt"
 _FILE = "entry_points.txt"  # in the folder that an installation leaves for a distribution
 _GROUP = re.compile(r"\[\s*([\w.-]+)\s*\]")
 # NAME = MODULE or MODULE:OBJECT; extras behind it, in brackets, are for installers.
 _LINE = re.compile(r"([^=\[\s][^=]*?)\s*=\s*([\w.]+)\s*(?::\s*([\w.]+))?\s*(?:\[.*\])?")
 _MAX_BYTES = 1_000_000
+
+
+def ignore(_: Any) -> None:
+    """Tries nothing of a plug-in."""
 
 
 class BrokenPlugin(ImportError):
@@ -65,7 +76,9 @@ class EntryPoint:
             )
         try:
             loaded = import_module(self.module)
-            return functools.reduce(getattr, self.attribute.split("."), loaded) if self.attribute else loaded
+            loaded = functools.reduce(getattr, self.attribute.split("."), loaded) if self.attribute else loaded
+            needs = NEEDS.get(self.group, ())
+            missing = [needed for needed in needs if not hasattr(loaded, needed)]
         except Exception as error:  # whatever a stranger's module does when it is imported
             missing = error.name if isinstance(error, ModuleNotFoundError) else None
             if missing and missing.split(".")[0] != self.module.split(".")[0]:
@@ -74,6 +87,13 @@ class EntryPoint:
                 f"the plug-in {self.name!r} of {self.group} must be {self.target}, as {self.file} says, and that "
                 f"cannot be imported: {error}. Install the package that has it again, or remove it"
             ) from error
+        if missing:
+            raise BrokenPlugin(
+                f"the plug-in {self.name!r} of {self.group} must have {', '.join(needs)}; {self.target} of "
+                f"{self.package} has no {' and no '.join(missing)}. Install a version of that package that has "
+                "them, or remove it"
+            )
+        return loaded
 
     @property
     def target(self) -> str:
@@ -98,15 +118,32 @@ def entry_points(group: str) -> Mapping[str, EntryPoint]:
     return _read_all(tuple(sys.path), os.getcwd()).get(group, MappingProxyType({}))
 
 
-def load_all(group: str) -> dict[str, Any]:
-    """Loads what the entry points of a group name, by their names. It logs and leaves out what cannot be imported."""
+def load_all(group: str, try_out: Callable[[Any], object] = ignore) -> dict[str, Any]:
+    """Loads what the entry points of a group name, by their names.
+
+    It logs and leaves out what cannot be imported, or what of another package `try_out` fails on.
+    """
     loaded = {}
     for name, entry in entry_points(group).items():
         try:
-            loaded[name] = entry.load()
+            found = entry.load()
+            if not entry.is_ours:
+                _try_out(entry, found, try_out)
         except ImportError as error:
             log.warning("%s", sanitize_text(f"left out: {error}"))
+        else:
+            loaded[name] = found
     return loaded
+
+
+def _try_out(entry: EntryPoint, found: Any, try_out: Callable[[Any], object]) -> None:
+    try:
+        try_out(found)
+    except Exception as error:  # whatever a stranger's function does
+        raise BrokenPlugin(
+            f"the plug-in {entry.name!r} of {entry.group}, {entry.target} of {entry.package}, cannot be offered: "
+            f"{type(error).__name__}: {error}. Install another version of that package, or remove it"
+        ) from error
 
 
 @functools.lru_cache(maxsize=4)

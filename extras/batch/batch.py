@@ -36,6 +36,7 @@ from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.extras.cameras import mcap
 from splatnode.extras.jobs.child import Child, End, Limits, run_processes
 from splatnode.extras.lerobot import data_set
+from splatnode.extras.logged.image_topics import image_topics
 from splatnode.recon.former_names import FLAGS
 from splatnode.recon.result.export.limits import read_json_file
 
@@ -143,7 +144,7 @@ def list_parts(path: Path) -> list[str]:
     Raises ValueError, OSError and ModuleNotFoundError where it cannot be read.
     """
     if path.suffix.lower() == mcap.SUFFIX and path.is_file():
-        return [topic.name for topic in mcap.image_topics(path)]
+        return [topic.name for topic in image_topics(path)]
     return data_set.list_parts(path) if data_set.is_data_set(path) else []
 
 

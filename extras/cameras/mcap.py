@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -15,19 +15,15 @@ from splatnode.capture.lens_file import same_aspect
 from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_name, sanitize_text
-from splatnode.capture.rig import Rig
+from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.extras.logged import static_rig
-from splatnode.extras.logged.mcap import Message, Topic, UnusableLog, messages, topics
+from splatnode.extras.logged.depth_topics import DepthReader, open_depth
+from splatnode.extras.logged.image_topics import COPIES, image_topics, read_topic_lens
+from splatnode.extras.logged.mcap import Message, Topic, UnusableLog, topics
 from splatnode.extras.logged.messages import (
-    CALIBRATIONS,
-    PICTURES,
     READ,
-    Calibration,
     MessageTime,
     UnusableMessage,
-    calibration_topic,
-    is_colour_image,
-    lens,
     read_in_order,
     read_picture,
     read_times,
@@ -37,9 +33,8 @@ from splatnode.extras.logged.messages import (
 log = logging.getLogger(__name__)
 
 SUFFIX = ".mcap"
+_DEPTH_MARK = ",depth="  # between the topic of the images and that of their depth images
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the message comes behind it
-_COPIES = ("/compressed", "/theora", "/ffmpeg")  # behind a topic's name: ROS sends its images once more, packed
-_NOT_PHOTOGRAPHS = "/compressedDepth"  # the end of a topic's name: depth that ROS packs into a PNG
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,6 +42,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     topic: str = ""  # with the images; "": the only one that has any
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     pace: Pace = "fastest"  # recorded: at the pace of the log; fastest: as fast as frames are taken
+    # With the depth images; "": the one that goes with the images, if one alone does; none: images go without
+    depth_topic: str = ""
+    # Between an image and the depth image that goes with it, at most
+    depth_tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=1)] = TOLERANCE_S
+    # The kind of the depth camera, which tells how unsure its depths are
+    depth_noise: Literal["stereo", "structured_light", "time_of_flight", "lidar"] = "stereo"
     intrinsics: Intrinsics | None = None  # the lens, of images of its aspect ratio, instead of what the file tells
 
 
@@ -67,7 +68,9 @@ def is_recording(path: Path) -> bool:
 
 
 def configure_part(path: Path, part: str) -> dict[str, Any]:
-    return {"file": path, "topic": part}
+    """Behind the topic of the images may stand that of their depth images: /front/image,depth=/front/depth."""
+    topic, _, depth = part.partition(_DEPTH_MARK)
+    return {"file": path, "topic": topic, **({"depth_topic": depth} if depth else {})}
 
 
 def explain_many(path: Path) -> None:
@@ -79,30 +82,13 @@ def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]] | None:
     if part or not path.is_file():
         return None
     names = [topic.name for topic in image_topics(path)]
-    names = [name for name in names if not any(name == f"{each}{copy}" for each in names for copy in _COPIES)]
+    names = [name for name in names if not any(name == f"{each}{copy}" for each in names for copy in COPIES)]
     return [([segment for segment in name.split("/") if segment], name) for name in names]
 
 
 def read_rig(path: Path, parts: Mapping[str, str]) -> Rig:
     """Returns where the cameras of these topics stand to each other. Raises as `static_rig.read_rig`."""
     return static_rig.read_rig(path, parts)
-
-
-def image_topics(file: Path) -> list[Topic]:
-    """Those whose messages are photographs, by name. Raises UnusableLog, OSError, ModuleNotFoundError without mcap."""
-    pictures = [topic for topic in topics(file) if topic.kind in PICTURES and not topic.name.endswith(_NOT_PHOTOGRAPHS)]
-    return [topic for topic in pictures if topic.schema.endswith("CompressedImage") or _has_colour_images(file, topic)]
-
-
-def _has_colour_images(file: Path, topic: Topic) -> bool:
-    """Whether the first image of a topic is a photograph, and not depth; one that cannot be read may be."""
-    first = next(messages(file, {topic.name}), None)
-    if first is None:
-        return False
-    try:
-        return is_colour_image(read_picture(first))
-    except UnusableMessage:
-        return True
 
 
 def _select_topic(config: Config) -> Topic:
@@ -128,11 +114,15 @@ def _select_topic(config: Config) -> Topic:
 
 
 def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
-    known = config.intrinsics or _lens(config.file, topic)
+    known = config.intrinsics or read_topic_lens(config.file, topic)
     index, told = 0, False
+    times = read_times(config.file, topic)
+    depth = _open_depth(config, topic, times)
     try:
-        for message, time in read_in_order(config.file, topic, read_times(config.file, topic)):
+        for message, time in read_in_order(config.file, topic, times):
             item = _frame(message, time, index, config, known)
+            if depth is not None and isinstance(item, Frame):
+                item = depth.attach_depth(item, index)
             if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
                 sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
                 event(log, logging.WARNING, "lens_of_another_size", topic=sanitize_text(topic.name), **sizes)
@@ -143,8 +133,20 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
         if index == 0:
             raise
         yield DroppedFrame(f"{_stem(topic)}_rest", str(error))
+    if depth is not None:
+        depth.close()
     if index == 0:
         raise ValueError(f"{str(config.file)!r} has no message of {sanitize_text(topic.name, LONGEST_NAME)}")
+
+
+def _open_depth(config: Config, topic: Topic, times: Sequence[MessageTime]) -> DepthReader | None:
+    """Opens the depth images; where a damaged file does not give them, logs that and returns None."""
+    wanted = config.depth_topic
+    try:
+        return open_depth(config.file, topic, times, wanted, config.depth_tolerance_s, config.depth_noise)
+    except UnusableLog as error:
+        event(log, logging.WARNING, "depth_left_out", reason=sanitize_text(error))
+        return None
 
 
 def _frame(
@@ -161,35 +163,6 @@ def _frame(
     fits = known is not None and same_aspect(known, width, height)
     own = known.resized(width, height) if known is not None and fits else None
     return make_frame(index, name, time.stream_ns, image, own, captured_at=time.captured_at)
-
-
-def _lens(file: Path, topic: Topic) -> Intrinsics | None:
-    """Reads the lens of the topic's camera; where it cannot be used, logs that and returns None."""
-    told = [each.name for each in topics(file) if each.kind in CALIBRATIONS]
-    known: dict[str, Calibration] = {}
-    sensor = _sensor(file, topic)
-    for name in told:
-        first = next(messages(file, {name}), None)
-        try:
-            with guard_untrusted(UnusableMessage):
-                if first is not None:
-                    known[name] = CALIBRATIONS[first.topic.kind](first.data)
-        except UnusableMessage as error:
-            event(log, logging.WARNING, "calibration_unreadable", topic=sanitize_text(name), error=sanitize_text(error))
-    chosen = calibration_topic(topic.name, sensor, known)
-    try:
-        return None if chosen is None else lens(topic.name, known[chosen])
-    except UnusableMessage as error:
-        event(log, logging.WARNING, "calibration_unusable", topic=sanitize_text(chosen), error=sanitize_text(error))
-        return None
-
-
-def _sensor(file: Path, topic: Topic) -> str:
-    first = next(messages(file, {topic.name}), None)
-    try:
-        return "" if first is None else read_picture(first).sensor
-    except UnusableMessage:
-        return ""
 
 
 def _stem(topic: Topic) -> str:

@@ -35,6 +35,7 @@ class Layout:
     height: int  # pixels
     encoding: str  # as Foxglove and ROS name it: rgb8, bgr8, mono8, ...
     step: int  # bytes from row to row
+    is_big_endian: bool = False  # of numbers of more than a byte
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class Picture:
     captured_ns: int  # of the clock of who sent it, mostly since 1970
     data: bytes  # a JPEG, PNG or WebP file, or raw rows
     layout: Layout | None  # None: `data` is a file
+    format: str = ""  # of a file, as its sender tells it: jpeg, png, 16UC1; compressedDepth png
 
 
 @dataclass(frozen=True)
@@ -270,6 +272,7 @@ class _Compressed(msgspec.Struct, frozen=True):
     data: bytes  # base64 in JSON
     timestamp: _Time = _Time()
     frame_id: str = ""
+    format: str = ""
 
 
 class _Raw(msgspec.Struct, frozen=True):
@@ -294,7 +297,7 @@ class _Calibration(msgspec.Struct, frozen=True):
 
 def parse_compressed_json(data: bytes) -> Picture:
     found = _parse_json(data, _Compressed)
-    return Picture(found.frame_id, found.timestamp.ns, found.data, None)
+    return Picture(found.frame_id, found.timestamp.ns, found.data, None, found.format)
 
 
 def parse_raw_json(data: bytes) -> Picture:
@@ -310,7 +313,7 @@ def parse_calibration_json(data: bytes) -> Calibration:
 
 def parse_compressed_protobuf(data: bytes) -> Picture:
     fields = Fields(data)
-    return Picture(fields.text(4), _time_ns(fields.message(1)), fields.bytes(2), None)
+    return Picture(fields.text(4), _time_ns(fields.message(1)), fields.bytes(2), None, fields.text(3))
 
 
 def parse_raw_protobuf(data: bytes) -> Picture:
@@ -359,10 +362,22 @@ _CODES = {  # bytes a pixel, and OpenCV's conversion to RGB; None: it is RGB
     "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
 }
 
+DEPTH_TYPES = {"16UC1": np.dtype(np.uint16), "32FC1": np.dtype(np.float32)}  # millimetres, metres (ROS' REP 118)
+
+
+def find_encoding(picture: Picture) -> str:
+    """Returns the encoding of its pixels; of a file what its format has before the semicolon, empty where nothing."""
+    return picture.layout.encoding if picture.layout else picture.format.partition(";")[0].strip()
+
+
+def is_depth_image(picture: Picture) -> bool:
+    """Whether its pixels are depths."""
+    return find_encoding(picture) in DEPTH_TYPES
+
 
 def is_colour_image(picture: Picture) -> bool:
-    """Whether its pixels are those of a photograph; depth, such as 16UC1 and 32FC1, are not."""
-    return picture.layout is None or picture.layout.encoding in _CODES
+    """Whether its pixels are those of a photograph; those of depth are not."""
+    return not is_depth_image(picture) if picture.layout is None else picture.layout.encoding in _CODES
 
 
 def rgb(picture: Picture, max_pixels: int) -> npt.NDArray[np.uint8]:
@@ -382,21 +397,27 @@ def _decode_rows(data: bytes, layout: Layout, max_pixels: int) -> npt.NDArray[np
             f"{sanitize_text(layout.encoding, 40) or 'none'}"
         )
     channels, code = _CODES[layout.encoding]
-    width, height, row = layout.width, layout.height, layout.width * channels
+    pixels = read_rows(data, layout, channels, max_pixels)
+    try:
+        image = pixels if code is None else cv2.cvtColor(pixels, code)
+    except cv2.error as error:  # such as a Bayer pattern of one row
+        size = f"{layout.width} x {layout.height}"
+        raise UnusableMessage(f"{size} of {layout.encoding} cannot be converted: {error.err}") from error
+    return image.astype(np.uint8, copy=False)
+
+
+def read_rows(data: bytes, layout: Layout, num_bytes: int, max_pixels: int) -> npt.NDArray[np.uint8]:
+    """(H, W, num_bytes) the bytes of each pixel of a raw image. Raises UnusableMessage where they are not there."""
+    width, height, row = layout.width, layout.height, layout.width * num_bytes
     if not 0 < width * height <= max_pixels:
         raise UnusableMessage(f"{width} x {height}: an image must have 1 to {max_pixels} pixels")
     if layout.step < row or len(data) < layout.step * (height - 1) + row:
         raise UnusableMessage(
-            f"{width} x {height} of {channels} bytes must have rows of {row} bytes or more, it has rows of "
+            f"{width} x {height} of {num_bytes} bytes must have rows of {row} bytes or more, it has rows of "
             f"{layout.step} and {len(data)} bytes in all"
         )
     rows = np.ndarray((height, row), np.uint8, data, strides=(layout.step, 1))  # no copy of what a step leaves out
-    pixels = np.ascontiguousarray(rows).reshape(height, width, channels)
-    try:
-        image = pixels if code is None else cv2.cvtColor(pixels, code)
-    except cv2.error as error:  # such as a Bayer pattern of one row
-        raise UnusableMessage(f"{width} x {height} of {layout.encoding} cannot be converted: {error.err}") from error
-    return image.astype(np.uint8, copy=False)
+    return np.ascontiguousarray(rows).reshape(height, width, num_bytes)
 
 
 # sensor_msgs/CompressedImage, Image and CameraInfo of ROS 2. Source: common_interfaces' message definitions.
@@ -404,17 +425,16 @@ def _decode_rows(data: bytes, layout: Layout, max_pixels: int) -> npt.NDArray[np
 
 def parse_compressed_image(data: bytes) -> Picture:
     values = Cdr(data)
-    captured_ns, sensor = values.time_ns(), values.text()
-    values.text()  # its format, which the data tells as well
-    return Picture(sensor, captured_ns, values.bytes(), None)
+    captured_ns, sensor, told = values.time_ns(), values.text(), values.text()
+    return Picture(sensor, captured_ns, values.bytes(), None, told)
 
 
 def parse_raw_image(data: bytes) -> Picture:
     values = Cdr(data)
     captured_ns, sensor = values.time_ns(), values.text()
     height, width = values.integer(), values.integer()
-    encoding, _big_endian, step = values.text(), values.byte(), values.integer()
-    return Picture(sensor, captured_ns, values.bytes(), Layout(width, height, encoding, step))
+    encoding, big_endian, step = values.text(), values.byte(), values.integer()
+    return Picture(sensor, captured_ns, values.bytes(), Layout(width, height, encoding, step, big_endian > 0))
 
 
 def parse_camera_info(data: bytes) -> Calibration:
@@ -464,6 +484,7 @@ class MessageTime:
     log_ns: int  # when it was written down
     stream_ns: int  # when its image comes in the stream; never before that of an earlier image
     captured_at: Stamp | None  # None: no clock can count so far
+    is_stamped: bool = True  # `stream_ns` is of the headers; False: of the log
 
 
 def read_picture(message: Message) -> Picture:
@@ -497,7 +518,7 @@ def read_times(file: Path, topic: Topic) -> tuple[MessageTime, ...]:
         stream_ns = log_ns if is_one_time else captured_ns
         if header is None and found and not is_one_time:
             stream_ns = found[-1].stream_ns  # it is left out, where it lies
-        found.append(MessageTime(place, log_ns, stream_ns, _stamp(captured_ns)))
+        found.append(MessageTime(place, log_ns, stream_ns, _stamp(captured_ns), is_told and not is_one_time))
     return tuple(sorted(found, key=lambda each: each.stream_ns))
 
 

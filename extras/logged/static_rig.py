@@ -172,7 +172,7 @@ def read_rig(file: Path, cameras: Mapping[str, str]) -> Rig:
                 f"{str(file)!r} does not tell where the camera {camera_id} stands: its images {said}, and "
                 f"{_STATIC} has {_list_frames(transforms)}. Give the rig in a file"
             )
-        placed[camera_id] = _climb(transforms, sensor)
+        placed[camera_id] = climb_tree(transforms, sensor)
     roots = {root for root, _ in placed.values()}
     if len(roots) > 1:
         raise ValueError(
@@ -191,8 +191,8 @@ def _find_sensor(file: Path, topic: str) -> str:
     return "" if first is None else read_picture(first).sensor
 
 
-def _climb(transforms: Mapping[str, Transform], frame: str) -> tuple[str, Array]:
-    """The root above a coordinate frame, and T_root_frame (4, 4). Raises ValueError where the links are a circle."""
+def climb_tree(transforms: Mapping[str, Transform], frame: str) -> tuple[str, Array]:
+    """Finds the root above a coordinate frame, and T_root_frame (4, 4). Raises ValueError where links are a circle."""
     T, seen = np.eye(4), [frame]
     while frame in transforms:
         T = transforms[frame].matrix @ T

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
+import math
 import signal
 import threading
 import time
@@ -25,9 +26,18 @@ from splatnode.capture.messaging.network import (
     RECON_MAP,
     RECON_SCENE,
     RECON_STATUS,
+    AlreadyRunning,
     files_for_strangers,
 )
-from splatnode.capture.messaging.pubsub import Answer, CommandServer, MarkProblemsSeen, Publisher, StateServer, ask
+from splatnode.capture.messaging.pubsub import (
+    Answer,
+    CommandServer,
+    MarkProblemsSeen,
+    NoAnswer,
+    Publisher,
+    StateServer,
+    ask,
+)
 from splatnode.capture.messaging.wire import Name, Numbering
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.files import shortage, state_directory
@@ -38,10 +48,11 @@ from splatnode.capture.process.system import (
     is_shortage,
     make_sure_of_room,
     raise_file_limit,
+    raise_shortage,
     resident_mb,
     wrap_late_errors,
 )
-from splatnode.capture.process.terminal import say
+from splatnode.capture.process.terminal import say, show_progress
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.process.unfailing import Unfailing
 from splatnode.recon.config import apply_changes
@@ -60,6 +71,7 @@ from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record, make_depth_header
 from splatnode.recon.result.report import estimate_result_bytes
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.submap_index import is_map_set
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +108,7 @@ class DiskSpace:
 
 # Commands to the running daemon, and the verb `retract` that sends one.
 
-EXIT_GOOD, EXIT_UNKNOWN_NAME = 0, 2
+EXIT_GOOD, EXIT_UNKNOWN_NAME, EXIT_UNFINISHED = 0, 2, 75
 
 
 class RemoveKeyframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):
@@ -105,7 +117,11 @@ class RemoveKeyframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, ta
     name: Name
 
 
-Command = RemoveKeyframe | MarkProblemsSeen
+class Finish(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="finish"):
+    """Finalize all scenes, merge those of each map, and end. The answer says what is left to be done."""
+
+
+Command = RemoveKeyframe | MarkProblemsSeen | Finish
 
 
 def remove_keyframe(args: argparse.Namespace) -> int:
@@ -120,6 +136,9 @@ SERVE_S = 0.05  # between looks at what the threads have produced
 _SOCKETS = 8  # that it binds: of states two
 _FILES, _THREADS = 128, 28  # of which the daemon has need: six endpoints, its own threads, those that compute
 END_S = 20.0  # for the threads to end; an export takes seconds
+QUIET_S = 2.0  # in which no keyframe comes before a node that finishes ends: capture sends what it still keeps
+RESTS = 2  # looks at which nothing was left to be done, likewise
+ASK_AGAIN_S = 1.0  # how far a running node is
 STUCK_S = (
     300.0  # without progress the worker counts as stuck; its longest step, verifying all views, takes tens of seconds
 )
@@ -138,14 +157,40 @@ def recon(args: argparse.Namespace) -> int:
         config = msgspec.structs.replace(config, reconstruction=recipe)
     stopping = threading.Event()
     handle_first_signal((signal.SIGTERM, signal.SIGINT), stopping.set)
-    with Daemon(config, stopping) as daemon:
-        daemon.run()
+    try:
+        with Daemon(config, stopping, args.finish) as daemon:
+            daemon.run()
+    except AlreadyRunning:
+        if not args.finish:
+            raise
+        return _wait_for_running_node(config, stopping)
+    if daemon.left:
+        say(f"not finished: {daemon.left}", error=True)
+        return EXIT_UNFINISHED
     return 0
 
 
+def _wait_for_running_node(config: DaemonConfig, stopping: threading.Event) -> int:
+    """Has the node that runs finish, and waits until it has ended. Raises NotAllowed, WireError."""
+    answer = ask(RECON_CONTROL, config.network, Finish(), Answer)
+    with show_progress() as tell:
+        while not stopping.wait(ASK_AGAIN_S):
+            tell(answer.message)
+            try:
+                answer = ask(RECON_CONTROL, config.network, Finish(), Answer)
+            except NoAnswer:  # it has ended
+                break
+    if answer.done and not stopping.is_set():
+        return 0
+    say(answer.message, error=True)
+    return EXIT_UNFINISHED
+
+
 class Daemon:
-    def __init__(self, config: DaemonConfig, stopping: threading.Event) -> None:
-        """Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
+    def __init__(self, config: DaemonConfig, stopping: threading.Event, finish: bool = False) -> None:
+        """If `finish`, the daemon ends by itself once every keyframe is in a final scene and the maps are merged.
+
+        Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
         with self._close_on_error():
@@ -181,6 +226,10 @@ class Daemon:
         self._started_s = time.monotonic()
         self._shown: PublishedSnapshot | None = None
         self._errors: list[BaseException] = []
+        self._finish = _Finish() if finish else None
+        self._merged: threading.Thread | None = None  # once all is final
+        self._merged_s = -math.inf  # monotonic: when it was last seen at work
+        self.left = ""  # what a node that finishes could not do
         self._heart, self._told = Unfailing("the heartbeat"), ReconState.LOADING.value  # the service manager's
 
     def __enter__(self) -> Daemon:
@@ -209,6 +258,7 @@ class Daemon:
                     self._maps.serve()
                 self._publish()
                 self._publish_map(self._worker.current_map)
+                self._end_if_finished()
                 if time.monotonic() >= next_status_s:
                     next_status_s = time.monotonic() + self._config.status_interval_s
                     self._heart.do(self._beat)
@@ -221,6 +271,41 @@ class Daemon:
         if self._errors:
             raise self._errors[0]
         event(log, logging.INFO, "stopped")
+
+    def _end_if_finished(self) -> None:
+        """Merges the final scenes of a node that finishes, then stops it."""
+        if self._finish is None:
+            return
+        if self._merged is not None:
+            if self._merged.is_alive():
+                self._merged_s = time.monotonic()
+            elif time.monotonic() - self._merged_s >= QUIET_S:  # whoever asked hears what came of it
+                self._stopping.set()
+            return
+        waiting = self._worker.count_waiting()
+        if self._finish.is_over(waiting, self._intake.newest, self._worker.rests):
+            self.left = self._describe_left()
+            self._merged, self._merged_s = self._start_thread(self._merge_maps), time.monotonic()
+
+    def _describe_left(self) -> str:
+        """Describes the work that is left; empty where all is final."""
+        waiting, places = self._worker.count_waiting(), self._worker.num_unfinished
+        left = [f"keyframes that no scene shows yet: {waiting}"] if waiting else []
+        left += [f"places that are not final yet: {places}"] if places else []
+        return sanitize_text("; ".join([*left, *filter(None, [self._worker.problem])]))
+
+    def _merge_maps(self) -> None:
+        """Merges the scenes of each map that has several. What cannot be merged is a problem, and no reason to fail."""
+        from splatnode.recon.merging.command import write_maps  # brings what merges
+
+        if not is_map_set(self._config.out):  # no scene was made
+            return
+        try:
+            reports = write_maps(self._config.out, self._config.out, lambda _: None, quiet=True, least=2)
+            event(log, logging.INFO, "merged", maps=", ".join(reports) or "none")
+        except (OSError, ValueError) as error:
+            raise_shortage(error)
+            self.left = sanitize_text(f"the maps are not merged: {error}. Run: splatnode merge {self._config.out}")
 
     def _beat(self) -> None:
         status = self._make_status()
@@ -272,6 +357,12 @@ class Daemon:
         if isinstance(command, MarkProblemsSeen):
             self._problems.mark_seen()
             return Answer(True, "the problems are not told again")
+        if isinstance(command, Finish):
+            self._finish = self._finish or _Finish()
+            if self.left:
+                return Answer(False, f"not finished: {self.left}")
+            doing = "merging" if self._merged is not None else self._describe_left() or "making the last scene final"
+            return Answer(True, f"finishing; {doing}")
         together = self._store.find_frame_set(command.name, self._config.frame_sets.tolerance_s)
         others = [name for name in together if name != command.name]
         answer = self._remove_keyframe(command.name)
@@ -352,6 +443,21 @@ class Daemon:
         except BaseException:
             self._resources.close()
             raise
+
+
+class _Finish:
+    """Tells when all that a node was given is worked in: no keyframe comes any more, and nothing is left to be done."""
+
+    def __init__(self) -> None:
+        self._newest: int | None = None  # keyframe
+        self._rests: int | None = None  # of the worker, when the newest one came
+        self._since_s = time.monotonic()
+
+    def is_over(self, waiting: int, newest: int, rests: int) -> bool:
+        if waiting or newest != self._newest or self._rests is None:
+            self._newest, self._rests, self._since_s = newest, rests, time.monotonic()
+            return False
+        return rests - self._rests >= RESTS and time.monotonic() - self._since_s >= QUIET_S
 
 
 def _make_live_camera_record(tracked: CameraEstimate | None) -> CameraRecord | None:

@@ -69,6 +69,10 @@ class Worker:
         """Places that the camera has left and whose scenes are not final yet."""
         return self._left.num_unfinished
 
+    def count_waiting(self) -> int:
+        """Keyframes that no scene shows yet."""
+        return self.loading + len(self._backlog) + len(self.place.under_way) + len(self._inbox)
+
     @property
     def map_counts(self) -> tuple[int, int, int]:
         """How many scenes are judged, how many maps they are, and how many loops count."""

@@ -37,15 +37,20 @@ def merge(args: argparse.Namespace) -> int:
     return EXIT_GOOD if reports else EXIT_REFUSED
 
 
-def write_maps(folder: Path, out: Path, most: Callable[[Sequence[Submap]], int | None], quiet: bool) -> Reports:
+def write_maps(
+    folder: Path, out: Path, most: Callable[[Sequence[Submap]], int | None], quiet: bool, least: int = 1
+) -> Reports:
     """Writes the merged result of each map of the scenes in `folder` into `out`; their reports by their folders.
 
-    `most` says how many Gaussians the map of these submaps may have. Raises FileNotFoundError, SceneFileError,
+    `most` says how many Gaussians the map of these submaps may have; maps of fewer than `least` scenes are left out.
+    Raises FileNotFoundError, SceneFileError,
     ResultWriteError.
     """
     whole = read_map_set(folder)
     reports = {}
     for each in whole.maps:
+        if len(each.placements) < least:
+            continue
         with show_waiting(f"reading the scenes of {each.name}"):
             found = load_submaps(whole, each)
         if not found.used:

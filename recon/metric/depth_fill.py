@@ -18,7 +18,7 @@ from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import project, unproject
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.metric.depth_fit import DepthView, find_depth_lens, fit_depth_images, group_by_name
+from splatnode.recon.metric.depth_fit import DepthFit, DepthView, find_depth_lens, fit_depth_images, group_by_name
 from splatnode.recon.priors.pointmap import LEAST_CONFIDENCE, Pointmap, compute_depth_normals
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 
@@ -48,7 +48,8 @@ def fill_measured_depth(
 ) -> tuple[Pointmap, ...]:
     """The point maps, with measured depth where it tells more than stereo; the same ones where none was measured.
 
-    Depth images that the points of the images contradict, or cannot judge, add nothing, which the log tells. `graph`
+    Depth images that the points of the images contradict, or cannot judge, add nothing, which the log tells: without
+    numbers, for those of the result are of all points that matches and cameras agree on in the end. `graph`
     and `registration` are those that the point maps were made of.
     """
     cameras = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
@@ -58,7 +59,7 @@ def fill_measured_depth(
     views = [make_depth_view(keyframes[name], registration, cameras[name]) for name in cameras if name in keyframes]
     fits = fit_depth_images(views)
     for fit in fits:
-        log.log(logging.INFO if fit.is_usable else logging.WARNING, "%s", fit.check.message)
+        log.log(logging.INFO if fit.is_usable else logging.WARNING, "%s", _describe_use(fit))
     usable, by_name = group_by_name(fits), {view.name: view for view in views}
     found = []
     for pointmap in pointmaps:
@@ -68,6 +69,13 @@ def fill_measured_depth(
             pointmap = fuse_depth(pointmap, MeasuredDepth(measured.z / unit, measured.sigma / unit))
         found.append(pointmap)
     return tuple(found)
+
+
+def _describe_use(fit: DepthFit) -> str:
+    who = f"depth images of {len(fit.names)} photographs" + (f" of {fit.camera_id}" if fit.camera_id else "")
+    if fit.is_usable:
+        return f"{who} fit the images and fill what these cannot tell"
+    return f"{who} fill nothing: {fit.check.code.value}; the result tells why (depth_checks, report.json's depth)"
 
 
 def make_depth_view(keyframe: Keyframe, registration: Registration, camera: RegisteredCamera) -> DepthView:

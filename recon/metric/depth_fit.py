@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.depth_image import DepthImage
+from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import project
 from splatnode.recon.metric.depth_smoothing import smooth_depth
@@ -145,7 +145,7 @@ def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
     ratio, sigma = samples.look((0.0, 0.0), scale)
     known = np.isfinite(ratio)
     if known.sum() < LEAST_POINTS:
-        return _explain_few(camera_id, names, int(known.sum()))
+        return _explain_few(views, int(known.sum()))
     mean, mean_sigma = _average(ratio[known], sigma[known])
     agreeing = float((np.abs(ratio[known] - mean) < _AGREEING_SIGMAS * sigma[known]).mean())
     shift, gain = _find_shift(samples, scale)
@@ -219,27 +219,37 @@ def _judge(
     size = float(np.hypot(*shift))
     made = DepthCheck(DepthCode.FITS, f"{who} fit {num_points} points of the images", camera_id, num_points)
     if gain > _LEAST_GAIN and size >= _LEAST_SHIFT_PX:
+        is_least = max(map(abs, shift)) >= _SEARCH_PX  # where the search ends
+        best = f"{shift[0]:+.0f} pixels across and {shift[1]:+.0f} down"
+        where = f"by at least {_SEARCH_PX} pixels, where the search ends ({best}" if is_least else f"{best} ("
+        also = ". Disparity in place of depth, or a wrong lens, looks the same: check these, too" if is_least else ""
         return replace(
             made,
             code=DepthCode.SHIFTED,
             shift_px=shift,
-            message=f"{who} are not aligned with the images: they fit best {shift[0]:+.0f} pixels across and "
-            f"{shift[1]:+.0f} down (of {REFERENCE_PX:.0f} across), so they were left out. Align depth to colour, or "
-            "give the depth camera's intrinsics and T_camera_depth",
+            shift_is_least=is_least,
+            message=f"{who} are not aligned with the images: they fit best {where}{', ' if is_least else ''}of "
+            f"{REFERENCE_PX:.0f} across), so they were left out. Align depth to colour, or give the depth camera's "
+            f"intrinsics and T_camera_depth{also}",
         )
     if agreeing < _LEAST_AGREEING:
         return replace(
             made,
             code=DepthCode.CONTRADICTS,
             message=f"{who} contradict the images at {100 * (1 - agreeing):.0f} % of {num_points} points, so they were "
-            "left out. Check that each goes with its photograph, its unit and its noise",
+            "left out. Check that each goes with its photograph, that it is depth and no disparity, its unit and its "
+            "noise",
         )
     return made
 
 
-def _explain_few(camera_id: str, names: tuple[str, ...], count: int) -> DepthFit:
+def _explain_few(views: Sequence[DepthView], count: int) -> DepthFit:
+    camera_id, names = views[0].camera_id, tuple(view.name for view in views)
+    doubts = (doubt for view in views if (doubt := describe_doubtful_unit(view.depth)))
     who = f"depth images of {len(names)} photographs" + (f" of {camera_id}" if camera_id else "")
     message = f"{who} have a depth at {count} points of the images; {LEAST_POINTS} are needed to use them"
+    if (doubt := next(doubts, None)) is not None:
+        message += f": {doubt}"
     return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
 
 

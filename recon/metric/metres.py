@@ -106,7 +106,7 @@ def _collect_measurements(
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
     if snapshot.rig is not None and snapshot.rig.metres_per_unit is not None:
-        known = f"the given rig of {len(snapshot.rig.mounts)} cameras"
+        known = f"the given rig of {snapshot.rig.num_given} cameras"
         said.append(Measurement(snapshot.rig.metres_per_unit, snapshot.rig.scale_sigma, known))
     said += estimate_scale_from_motions(make_metric_views(snapshot), evidence.motions, config.odometry_scale_sigma)
     for (baseline_m, sigma_m), pairs in _group_stereo_pairs(config, evidence).items():

@@ -78,6 +78,12 @@ class RigEstimate:
         """Whether all is known that is claimed of the mounts."""
         return all(np.isfinite(m.covariance).all() and np.isfinite(m.T_rig_camera).all() for m in self.mounts)
 
+    @property
+    def num_given(self) -> int:
+        """Returns of how many cameras the given poses count: the rig's own, and those whose mounts it holds."""
+        held = {mount.camera_id for mount in self.mounts if mount.given}
+        return 1 + len(held) if held else 0
+
     def rescale(self, unit: float) -> RigEstimate:
         """Returns it in a world whose unit is `unit` of this one's."""
         by = np.diag([1.0] * 3 + [1.0 / unit] * 3)

@@ -27,6 +27,7 @@ from splatnode.capture.frame import (
 from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
 from splatnode.capture.messaging.wire import Amount, Count, Finite, Header, Message, Name, Sequential, Text, WireError
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
+from splatnode.recon.result.depth_check import DepthCheckRecord, make_depth_check_record
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
     GaussianArrays,
@@ -40,6 +41,7 @@ THUMBNAIL_SIDE = 320  # pixels
 THUMBNAIL_QUALITY = 85  # of 100, as JPEG
 MAX_NAMES = 1000  # of frames that a verdict is about
 MAX_DROPPED = 200  # that are named with their reasons
+MAX_DEPTH_CAMERAS = 100  # whose depth images are judged
 MAX_PIXELS = 1 << 26  # of a camera's picture at modelled size, which a viewer may have to paint
 LARGEST_VALUE = 1e9  # of a Gaussian; one with a larger number is left out
 SH_BASES = (1, 4, 9, 16)  # of degrees 0 to 3
@@ -128,6 +130,9 @@ class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     seconds: Annotated[dict[Name, Amount], msgspec.Meta(max_length=64)]
     final: bool
     scale: ScaleRecord | UnsetType = UNSET  # left out of a relative scene of which nothing is to be said
+    depth_checks: Annotated[tuple[DepthCheckRecord, ...], msgspec.Meta(max_length=MAX_DEPTH_CAMERAS)] | UnsetType = (
+        UNSET  # left out where no depth images came
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +168,7 @@ def encode_snapshot(
         seconds=snapshot.seconds,
         final=snapshot.final,
         scale=UNSET if snapshot.scale == RELATIVE else make_scale_record(snapshot.scale),
+        depth_checks=tuple(map(make_depth_check_record, snapshot.depth_checks[:MAX_DEPTH_CAMERAS])) or UNSET,
     )
     thumbnails = [
         make_jpeg_array(make_thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras
@@ -203,6 +209,7 @@ def _decode_live_scene(message: Message[SceneHeader]) -> LiveScene:
         seconds=header.seconds,
         final=header.final,
         scale=RELATIVE if header.scale is UNSET else parse_scale(header.scale),
+        depth_checks=() if header.depth_checks is UNSET else tuple(each.restore() for each in header.depth_checks),
     )
     return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns)
 

@@ -167,6 +167,7 @@ class OnRig:
     mounts: tuple[tuple[str, Array64, float, float], ...]
     metres_per_unit: float | None  # by a given rig; None: none tells it
     scale_sigma: float  # standard deviation of its logarithm
+    num_given: int = 0  # cameras of the given rig that tell it, which have images and are believed
 
     def rescale(self, factor: float) -> OnRig:
         """Returns it in a world whose unit is `factor` times smaller."""

@@ -23,9 +23,11 @@ from splatnode.capture.image_file import (
     find_common_range,
     read_image_file,
 )
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast, raise_shortage
-from splatnode.capture.process.text import guard_untrusted, is_printable
+from splatnode.capture.process.text import guard_untrusted, is_printable, sanitize_text
+from splatnode.recon.result.depth_check import StoredDepthCheck
 from splatnode.recon.result.export.cameras import decode_cameras
 from splatnode.recon.result.export.limits import SceneFileError, read_json_file
 from splatnode.recon.result.export.stored import SOURCES, StoredResult, read_cameras, read_gaussians
@@ -71,6 +73,7 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
         final=not report.verdict.provisional,
         scale=StoredResult(scene).scale(),
         up=report.up,
+        depth_checks=tuple(each.restore() for each in report.depth),
         scenes=tuple(each.scene for each in report.scenes),
     )
     return snapshot, _list_folders(folder, report)
@@ -94,7 +97,7 @@ def _read_gaussians(scene: Path) -> GaussianArrays:
             return read_gaussians(scene, sources)
         except SceneFileError as error:
             raise_shortage(error)
-            log.warning("it is not known which photographs the Gaussians come from: %s", error)
+            notify(log, f"it is not known which photographs the Gaussians come from: {sanitize_text(error)}")
     return read_gaussians(scene)
 
 
@@ -114,6 +117,7 @@ class _Report(msgspec.Struct, frozen=True):
     photographs: str | None = None
     up: Up | None = None
     scenes: tuple[_Scene, ...] = ()
+    depth: Annotated[tuple[StoredDepthCheck, ...], msgspec.Meta(max_length=10_000)] = ()
 
     def collect_texts(self) -> list[str]:
         """All that it says, which is shown; where its photographs lie is not."""
@@ -127,6 +131,7 @@ class _Report(msgspec.Struct, frozen=True):
             *self.seconds,
             *(each.scene for each in self.scenes),
             self.up.source if self.up else "",
+            *(text for each in self.depth for text in (each.message, each.camera)),
         ]
 
 

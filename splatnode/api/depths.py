@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -13,7 +14,11 @@ from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.depth_files import find_depth_files
 from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import Frame
+from splatnode.capture.process.notices import notify
+from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.replay_source import Source, attach_depths
+
+log = logging.getLogger(__name__)
 
 Depths: TypeAlias = "str | PathLike[str] | Mapping[str, DepthOf] | Sequence[DepthOf]"
 
@@ -42,6 +47,9 @@ def _name_depths(depths: Any, images: Images, source: Source) -> dict[str, Any]:
         names = {frame.name for frame in source.frames}
         if not names & named.keys():
             raise ValueError(f"depths are of none of the photographs, such as {min(names, default='none')}")
+        if further := sorted(named.keys() - names):
+            some = sanitize_text(", ".join(further[:3]), 200)
+            notify(log, f"{len(further)} of {len(named)} depths are of no photograph that is used, such as {some}")
         return named
     names = names_of(images)
     if len(depths) != len(names):

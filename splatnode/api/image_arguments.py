@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -10,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_files import read_depth_file
-from splatnode.capture.depth_image import DepthImage, make_depth_image
+from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit, make_depth_image
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_file import UnusableImage
+from splatnode.capture.messaging.network import CAMERA_ID
 from splatnode.capture.odometry import (
     GRAVITY_SIGMA_DEG,
     MOTION_DRIFT,
@@ -25,6 +28,10 @@ from splatnode.capture.odometry import (
     Motion,
     make_given_pose,
 )
+from splatnode.capture.process.notices import notify
+from splatnode.capture.process.text import LONGEST_NAME, is_printable
+
+log = logging.getLogger(__name__)
 
 Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 DepthOf: TypeAlias = "DepthImage | npt.NDArray[Any] | str | PathLike[str] | None"
@@ -100,6 +107,24 @@ def make_gravity(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Grav
     return Gravity((x, y, z), GRAVITY_SIGMA_DEG if sigma_deg is None else float(sigma_deg))
 
 
+def check_capture_id(camera_id: Any) -> str:
+    """The id of a camera that sends to a node, as it is. Raises TypeError, ValueError."""
+    if not isinstance(camera_id, str):
+        raise TypeError(f"camera_id must be a text, got {type(camera_id).__name__}")
+    if camera_id and not re.fullmatch(CAMERA_ID, camera_id):
+        raise ValueError(f"camera_id must be up to 32 letters, digits, - and _, got {camera_id[:40]!a}")
+    return camera_id
+
+
+def check_camera_id(camera_id: Any, what: str) -> str:
+    """The id of one of several cameras of one reconstruction, as it is. Raises TypeError, ValueError."""
+    if not isinstance(camera_id, str):
+        raise TypeError(f"{what} must be a text, got {type(camera_id).__name__}")
+    if not is_printable(camera_id, LONGEST_NAME):
+        raise ValueError(f"{what} must be at most {LONGEST_NAME} printable letters, got {camera_id[:40]!a}")
+    return camera_id
+
+
 def parse_sigmas(sigmas: Any, what: str) -> Sigmas:
     """Returns two standard deviations, metres and degrees. Raises TypeError; `what` is the argument."""
     if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
@@ -127,3 +152,11 @@ def parse_depth(given: Any) -> DepthImage:
 def parse_optional_depth(given: DepthOf) -> DepthImage | None:
     """As `parse_depth`; None stays None."""
     return None if given is None else parse_depth(given)
+
+
+def parse_single_depth(given: DepthOf) -> DepthImage | None:
+    """As `parse_optional_depth`, of one image at a time: what speaks against its unit is notified."""
+    found = parse_optional_depth(given)
+    if found is not None and (doubt := describe_doubtful_unit(found)):
+        notify(log, f"the depth image: {doubt}")
+    return found

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
+from splatnode.api.entrance import enter_api
 from splatnode.api.live_map import LiveMap, NodeMap
 from splatnode.api.result import Camera, Result, camera_of, result_of
 from splatnode.capture.messaging.network import Network
@@ -63,6 +64,7 @@ class Node:
         while (update := self.wait()) is not None:
             yield update
 
+    @enter_api()
     def wait(self, timeout_s: float | None = None) -> NodeUpdate | None:
         """The next update; None where none comes in so many seconds, or when the connection is closed.
 
@@ -81,6 +83,7 @@ class Node:
         return None if tracked is None else camera_of(tracked)
 
     @property
+    @enter_api()
     def map(self) -> NodeMap:
         """Which space is free, occupied, or not seen, where the node's configuration has `occupancy.live`.
 
@@ -92,6 +95,7 @@ class Node:
             return NodeMap(heard.told.scene_id, None, OUTDATED)
         return heard.told
 
+    @enter_api()
     def wait_for_map(self, timeout_s: float | None = None) -> NodeMap:
         """As `map`, as soon as there is one; what is known after so many seconds, or when the connection is closed."""
         until = None if timeout_s is None else time.monotonic() + timeout_s
@@ -117,6 +121,7 @@ class Node:
         self.close()
 
 
+@enter_api()
 def connect(
     address: str | PathLike[str] | None = None,
     *,

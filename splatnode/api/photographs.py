@@ -11,7 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.api.image_arguments import Lens, make_intrinsics
+from splatnode.api.image_arguments import Lens, check_camera_id, make_intrinsics
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.image_file import (
@@ -55,6 +55,8 @@ class SeveralCameras:
                 count = "a text" if isinstance(told, str) else len(told)
                 raise ValueError(f"{what} must be one for each of the {len(names)} images, got {count}")
         ids, stamps = self.camera_ids or [None] * len(names), self.captured_at or [None] * len(names)
+        for camera in ids:
+            check_camera_id("" if camera is None else camera, "each of camera_ids")
         return {name: (camera or "", stamp) for name, camera, stamp in zip(names, ids, stamps, strict=True)}
 
     def apply(self, each: Frame | DroppedFrame, told: Mapping[str, tuple[str, Stamp | None]]) -> Frame | DroppedFrame:

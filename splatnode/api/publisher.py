@@ -14,15 +14,17 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.entrance import enter_api
 from splatnode.api.image_arguments import (
     DepthOf,
     Lens,
     Sigmas,
     append_motion,
+    check_capture_id,
     make_gravity,
     make_intrinsics,
     make_pose,
-    parse_optional_depth,
+    parse_single_depth,
 )
 from splatnode.capture.config import Camera, CaptureConfig, ProgramConfig
 from splatnode.capture.daemon import CaptureSession
@@ -103,6 +105,7 @@ class Publisher:
     or `splatnode capture`, sends what still waits.
     """
 
+    @enter_api()
     def __init__(
         self,
         config: str | PathLike[str] | None = None,
@@ -119,9 +122,10 @@ class Publisher:
           node. Up to 32 letters, digits, - and _.
         - `changes`: such as `{"network": {"directory": "run"}, "spool": {"max_frames": 50}}`.
 
-        Raises ValueError where the configuration cannot be used, and OSError where another process publishes already
-        (BlockingIOError) or a folder cannot be used.
+        Raises ValueError where the configuration or the id cannot be used, and OSError where another process publishes
+        already (BlockingIOError) or a folder cannot be used.
         """
+        check_capture_id(camera_id)
         settings = read_yaml(Path(config)) if config is not None else {}
         settings = merge_config(settings, _plain(changes or {}))
         if every_frame:
@@ -153,6 +157,7 @@ class Publisher:
             self._session = CaptureSession(self._config, self._server, resources)
             self._resources = resources.pop_all()
 
+    @enter_api()
     def publish(
         self,
         image: Picture,
@@ -174,7 +179,8 @@ class Publisher:
         """Gives the node an image: an array (H, W, 3) uint8 RGB or (H, W) grey, a PIL image, or bytes of a JPEG or PNG.
 
         - `captured_at`: when it was taken: seconds since 1970, UTC, or a Stamp. None: now, or as its EXIF tells.
-        - `camera_id`: which of several cameras took it. Each camera's keyframes are selected on their own.
+        - `camera_id`: which of several cameras took it, as for `Publisher`. Each camera's keyframes are selected on
+          their own.
         - `intrinsics`: its lens, or a matrix K (3, 3) of a pinhole, in pixels.
         - `mask`: (H, W), what is 0 or False is not used.
         - `pose`, `pose_sigma`: T_world_camera (4, 4) in metres, all in one world; metres and degrees (0.01, 2).
@@ -198,7 +204,7 @@ class Publisher:
             mask,
             (make_pose(pose, _pair(pose_sigma)), make_gravity(gravity, gravity_sigma)),
             (motion, _pair(motion_sigma)),
-            parse_optional_depth(depth),
+            parse_single_depth(depth),
         )
         deadline = time.monotonic() + wait_s
         while True:
@@ -296,7 +302,7 @@ class Publisher:
         depth: DepthImage | None,
     ) -> tuple[Frame, Motion | None]:
         """The frame, and the motions up to it. Raises TypeError, ValueError."""
-        by = self._config.camera_id if camera_id is None else _check_camera_id(camera_id)
+        by = self._config.camera_id if camera_id is None else check_capture_id(camera_id)
         taken_at = _make_stamp(captured_at)
         made = _read_picture(image)
         taken_at = taken_at or made.captured_at or wall_clock(time.monotonic_ns())
@@ -333,12 +339,6 @@ def _plain(changes: Mapping[str, Any]) -> dict[str, Any]:
 def _pair(sigmas: Sequence[float] | None) -> Sigmas | None:
     """Two numbers in any sequence, as a tuple."""
     return None if sigmas is None else tuple(sigmas)  # pyright: ignore[reportReturnType]  # checked where it is used
-
-
-def _check_camera_id(camera_id: str) -> str:
-    if sanitize_text(camera_id, LONGEST_NAME) != camera_id:
-        raise ValueError(f"camera_id must be at most {LONGEST_NAME} printable letters, got {camera_id[:40]!a}")
-    return camera_id
 
 
 def _make_stamp(captured_at: Stamp | float | None) -> Stamp | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike, fspath
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.api.depths import Depths, add_depths
+from splatnode.api.entrance import enter_api
 from splatnode.api.image_arguments import Sigmas, parse_sigmas
 from splatnode.api.photographs import (
     Images,
@@ -32,6 +34,7 @@ from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame, Stamp
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
+from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
@@ -40,6 +43,8 @@ from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_i
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
 from splatnode.recon.replay_source import Source, add_poses, apply_masks
 from splatnode.recon.rig_choice import apply_rig
+
+log = logging.getLogger(__name__)
 
 # Poses as a program has them: a file, or matrices, by the photographs' names or in their order.
 
@@ -242,6 +247,7 @@ def _name(photograph: object, of_pictures: bool) -> str:
 Changes = Mapping[str, Any] | str | PathLike[str]
 
 
+@enter_api()
 def reconstruct(
     images: Images,
     *,
@@ -251,7 +257,7 @@ def reconstruct(
     intrinsics: LensChoice | None = None,
     poses: Poses | None = None,
     poses_sigma: PosesSigma | None = None,
-    poses_only_check: bool = False,
+    check_poses: bool = False,
     rig: str | PathLike[str] | None = None,
     masks: Masks | None = None,
     depths: Depths | None = None,
@@ -261,10 +267,12 @@ def reconstruct(
     config: Changes | None = None,
     views: int | None = None,
     every_frame: bool = False,
-    only_seen: bool = False,
+    multi_view_only: bool = False,
     seed: int | None = None,
     threads: int | None = None,
     tell: Tell | None = None,
+    only_seen: bool | None = None,
+    poses_only_check: bool | None = None,
 ) -> Result:
     """Reconstructs images: the same cameras and Gaussians, to the bit, as `splatnode replay`.
 
@@ -283,7 +291,7 @@ def reconstruct(
     - `poses`: T_world_camera (4, 4) in metres by image name, in a list (None: unknown), or a file as for `--poses`.
       They give metres and the world's axes; one that does not fit is named and left out. `poses_sigma`: standard
       deviations, metres and degrees, of all poses or in a list or mapping. With sigmas (also from the file) and
-      `intrinsics` they are priors of the cameras, unless `poses_only_check`.
+      `intrinsics` they are priors of the cameras, unless `check_poses` (formerly `poses_only_check`).
     - `rig`: a file with where the cameras stand to each other, as for `--rig`. None: a log tells, else the images do.
     - `masks`: white (any value above 0) is used, black is ignored. A folder of masks with the images' names, one file
       for all, or a list of arrays (H, W), paths, or None. None: all is used.
@@ -294,21 +302,22 @@ def reconstruct(
     - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: a mapping or a YAML file of what differs from the preset (`docs/configuration.md`).
     - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
-    - `only_seen`: leaves out what no two images confirm, and the far background.
-    - `seed`: of random numbers. None: the configuration's, 0.
-    - `threads`: at most, of torch and of the compiled core. None: as many as there are processors.
-    - `tell`: the progress callback, in the calling thread: a step with `doing`, `done`, `of`, or a line of text. An
+    - `multi_view_only` (formerly `only_seen`): leaves out what no two images confirm, and the far background.
+    - `seed`: of random numbers (None: the configuration's). `threads`: at most (None: as many as processors).
+    - `tell`: the progress callback, in the calling thread: a step with `doing`, `done`, `of`, or a text line. An
       exception in it cancels the work.
 
-    Raises TypeError and ValueError for wrong arguments, and FileNotFoundError.
+    Raises TypeError, ValueError, FileNotFoundError. What of an input is left out is told as an `InputWarning`.
     """
     telling = tell or ignore_progress
+    check_poses = merge_former_argument("poses_only_check", poses_only_check, "check_poses", check_poses)
+    multi_view_only = merge_former_argument("only_seen", only_seen, "multi_view_only", multi_view_only)
     check_counts(views=views, threads=threads)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     loaded = load_frames(images, views, every_frame, telling, several)
     source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)
     own = own_sigmas_of(poses, poses_sigma, images, source.frames)
-    trusted = poses is not None and (poses_sigma is not None or bool(own)) and not poses_only_check
+    trusted = poses is not None and (poses_sigma is not None or bool(own)) and not check_poses
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma), "registration": hold_poses(trusted)}
     chosen = build_config(preset, config, flags, scale, of_pictures=source.photographs is None)
     source, chosen = apply_rig(source, chosen, rig, telling)
@@ -317,7 +326,7 @@ def reconstruct(
     if trusted and known is not None:
         source, known = _hold_cameras(source, known, poses_sigma, chosen, own), None  # they are the photographs' own
     given = Evidence((), known, pairs_given(scale, images, source.frames))
-    made = reconstruct_source(source, chosen, preset, only_seen, threads, given, tell=telling)
+    made = reconstruct_source(source, chosen, preset, multi_view_only, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
 
 
@@ -364,6 +373,20 @@ def tolerance_of(preset: str, changes: Changes | None) -> float:
 def hold_poses(trusted: bool) -> Mapping[str, bool] | None:
     """Returns what makes given poses hold the cameras; None: nothing."""
     return {"trust_poses": True} if trusted else None
+
+
+def merge_former_argument(former: str, told: bool | None, present: str, value: bool) -> bool:
+    """Returns the value of an argument that had a former name, which is notified where it is used.
+
+    Raises TypeError where both are given.
+    """
+    if told is None:
+        return value
+    if value:
+        raise TypeError(f"{present} is given twice, once as {former}, its former name; give it once")
+    text = f"the argument {former} is called {present} now; the former name is read in this release only"
+    notify(log, text, DeprecationWarning)
+    return told
 
 
 def check_counts(**values: int | None) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.api.entrance import enter_api
 from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
 from splatnode.recon import core
 from splatnode.recon.result.export.prepare import sanitize_gaussians
@@ -224,6 +225,11 @@ class Result:
         return self._snapshot.scale.interval_95
 
     @property
+    def scale_source(self) -> str | None:
+        """The scale source, or why there is none although one was asked for. None: nothing was asked for."""
+        return self._snapshot.scale.source
+
+    @property
     def depth_checks(self) -> tuple[DepthCheck, ...]:
         """The judgement of the images on each camera's depth images; empty where none came."""
         return self._snapshot.depth_checks
@@ -233,6 +239,7 @@ class Result:
         """Whether all photographs were judged with all evidence, and the scene is refined."""
         return self._snapshot.final
 
+    @enter_api()
     def render(
         self, T_world_camera: npt.ArrayLike, K: npt.ArrayLike, size: tuple[int, int], *, threads: int | None = None
     ) -> View:
@@ -245,6 +252,7 @@ class Result:
             raise ValueError(f"there is no scene to render: {self.verdict.code.value}. Ask verdict.publishable first")
         return view(self._snapshot.gaussians, T_world_camera, K, size, threads)
 
+    @enter_api()
     def localise(
         self,
         image: str | PathLike[str] | Picture,
@@ -271,6 +279,7 @@ class Result:
             raise ValueError(f"no scene to look for a photograph in: {why}")
         return localize_query(landmarks, image, intrinsics, near)
 
+    @enter_api()
     def map(self, *, voxel: float | None = None, up: npt.ArrayLike | None = None) -> OccupancyMap:
         """Which space is free, occupied, or not seen, by depths that two photographs confirm and by nothing else.
 
@@ -282,6 +291,7 @@ class Result:
 
         return occupancy_map(self._snapshot, voxel, None if up is None else np.asarray(up, np.float64))
 
+    @enter_api()
     def save(self, folder: str | PathLike[str]) -> Path:
         """Writes the files that `splatnode replay --out FOLDER` writes, and returns the folder.
 
@@ -294,6 +304,7 @@ class Result:
             self._files.write(out)
         return out
 
+    @enter_api()
     def show(
         self,
         viewer: Viewer = "open3d",
@@ -340,6 +351,7 @@ class StoredFiles:
         copy_result(self.folder, out)
 
 
+@enter_api()
 def load(folder: str | PathLike[str]) -> Result:
     """The result in a folder that `Result.save`, `splatnode replay` or a node wrote; a refusal, too.
 

@@ -8,13 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
+from splatnode.api.entrance import enter_api
 from splatnode.api.image_arguments import (
     DepthOf,
     append_motion,
+    check_camera_id,
     make_gravity,
     make_intrinsics,
     make_pose,
-    parse_optional_depth,
+    parse_single_depth,
 )
 from splatnode.api.photographs import Lens, Picture, lenses, make_frame
 from splatnode.api.reconstruct import (
@@ -23,6 +25,7 @@ from splatnode.api.reconstruct import (
     build_config,
     check_counts,
     is_stereo,
+    merge_former_argument,
     parse_matrix,
     sigmas_of,
 )
@@ -33,7 +36,6 @@ from splatnode.capture.keyframe_selection import Selector
 from splatnode.capture.lens_file import assign_lens, check_fits
 from splatnode.capture.odometry import Motion
 from splatnode.capture.process.terminal import Tell, ignore_progress
-from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.quality import Limits
 from splatnode.recon import threads as limits
 from splatnode.recon.config import apply_changes
@@ -64,12 +66,13 @@ class Session:
     Most frames of a camera's loop add too little and are not taken. Thread-safe. As a context manager it closes itself.
     """
 
+    @enter_api()
     def __init__(
         self,
         *,
         intrinsics: Lens | None = None,
         poses_sigma: tuple[float, float] | None = None,
-        poses_only_check: bool = False,
+        check_poses: bool = False,
         scale: Scale | None = None,
         preset: str = "balanced",
         config: Changes | None = None,
@@ -77,18 +80,20 @@ class Session:
         seed: int | None = None,
         threads: int | None = None,
         tell: Tell | None = None,
+        poses_only_check: bool | None = None,
     ) -> None:
         """The arguments are those of `reconstruct`, without `budget_s`.
 
         `poses_sigma` is of poses that `add` gets without their own. Poses with sigmas are priors of cameras with a
-        known lens, unless `poses_only_check`. Images without a name are called 0000.png, 0001.png, ...
+        known lens, unless `check_poses`. Images without a name are called 0000.png, 0001.png, ...
         """
         check_counts(threads=threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
         flags = {"seed": seed, "metric": sigmas_of(poses_sigma)}
         self._config = build_config(preset, config, flags, scale, of_pictures=True)
-        self._only_checks = poses_only_check
+        former = "poses_only_check", poses_only_check
+        self._only_checks = merge_former_argument(*former, "check_poses", check_poses)
         if self._config.budget_s is not None:
             raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or ignore_progress
@@ -104,6 +109,7 @@ class Session:
         self._snapshot: Snapshot | None = None
         self._lock = threading.RLock()
 
+    @enter_api()
     def add(
         self,
         image: Picture,
@@ -152,7 +158,7 @@ class Session:
             usual = metric.odometry_drift, metric.odometry_sigma_deg
             moved = append_motion(self._motion, frame.name, motion, motion_sigma, *usual)
             came = {"given_pose": given, "motion": moved, "gravity": make_gravity(gravity, gravity_sigma)}
-            beside = {"right": _make_right_image(right, baseline_m), "depth": parse_optional_depth(depth)}
+            beside = {"right": _make_right_image(right, baseline_m), "depth": parse_single_depth(depth)}
             frame = replace(frame, **came, **beside)
             self._motion = moved
             self._given.add(frame.name)
@@ -171,6 +177,7 @@ class Session:
             left_out = {each.name: each.reason for each in work.dropped}
             return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)
 
+    @enter_api()
     def finish(self) -> Result:
         """Judges all photographs with all evidence, and makes their scene anew; the session is closed then.
 
@@ -223,7 +230,7 @@ class Session:
         self, image: Picture, number: int, name: str, captured_at: Stamp | None, lens: Lens | None, camera: str | None
     ) -> Frame:
         made = make_frame(image, number, name, time.monotonic_ns(), captured_at)
-        made = made if camera is None else replace(made, camera_id=sanitize_text(camera, LONGEST_NAME))
+        made = made if camera is None else replace(made, camera_id=check_camera_id(camera, "camera"))
         if lens is not None:
             known = make_intrinsics(lens, made.width, made.height)
             check_fits(known, [(made.width, made.height)])

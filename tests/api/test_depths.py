@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import re
 
 import cv2
 import msgspec
@@ -41,15 +43,21 @@ def metres_ratio(result: splatnode.Result) -> float:
     return float(np.linalg.norm(result.cameras[-1].centre - result.cameras[0].centre) / true)
 
 
-def test_a_scene_in_metres_with_more_depth_and_the_same_cameras(arrays, depths, result):
-    made = splatnode.reconstruct(arrays, depths=depths, config=QUICK)
+def test_a_scene_in_metres_with_more_depth_and_the_same_cameras(arrays, depths, result, tmp_path, caplog):
+    with caplog.at_level(logging.INFO):
+        made = splatnode.reconstruct(arrays, depths=depths, config=QUICK)
     assert made.verdict.publishable and made.metric and len(made.cameras) == 4
     assert metres_ratio(made) == pytest.approx(1.0, abs=0.01)
     assert (
         made.scale_interval is not None and made.scale_interval[0] <= 1 / metres_ratio(made) <= made.scale_interval[1]
     )
+    assert made.scale_source is not None and "depth images of 4 photographs" in made.scale_source
+    assert result.scale_source is None
     (check,) = made.depth_checks
     assert check.code is DepthCode.FITS and result.depth_checks == ()
+    assert splatnode.load(made.save(tmp_path / "out")).depth_checks == made.depth_checks
+    assert "depth images of 4 photographs fit the images" in caplog.text
+    assert set(re.findall(r"(\d+) points of the images", caplog.text)) <= {str(check.num_points)}, "one number"
     assert made.consistent_depth is not None and result.consistent_depth is not None
     assert made.consistent_depth > result.consistent_depth
     unit = np.linalg.norm(made.cameras[-1].centre) / np.linalg.norm(result.cameras[-1].centre)
@@ -102,6 +110,8 @@ def test_depths_are_a_list_a_mapping_a_folder_or_files(folder, arrays, depths, t
         ([None], ValueError, "one for each of the 4 photographs, got 1"),
         ([np.zeros((240, 320, 3), np.uint8)] * 4, ValueError, "depth image of 0000.png.*uint16 of millimetres"),
         ([np.zeros((9, 320), np.uint16)] * 4, ValueError, "depth image of 0000.png.*shape of its image, 320 x 240"),
+        ([np.full((240, 320), 2, np.uint16)] * 4, ValueError, "depth image of 0000.png.*median is 2: probably metres"),
+        ([np.full((240, 320), 2500.0)] * 4, ValueError, "floats hold metres; the median is 2500: probably millimetres"),
         ([7, 7, 7, 7], TypeError, "must be a DepthImage"),
         ({"other.png": np.zeros((240, 320), np.uint16)}, ValueError, "none of the photographs, such as 0000.png"),
         ("/not/there", FileNotFoundError, "give a folder of depth images"),

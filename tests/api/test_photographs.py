@@ -111,6 +111,10 @@ def test_listed_pictures_of_several_cameras_are_frame_sets():
     assert [frame.name for frame in few] == ["0000.png", "0003.png"]
     with pytest.raises(ValueError, match="camera_ids must be one for each of the 4 images, got 1"):
         load_frames(pictures, None, False, ignore_progress, SeveralCameras(camera_ids=["left"]))
+    with pytest.raises(TypeError, match="each of camera_ids must be a text, got int"):
+        load_frames(pictures, None, False, ignore_progress, SeveralCameras(camera_ids=["a", "b", "c", 3]))  # pyright: ignore
+    with pytest.raises(ValueError, match=r"camera_ids must be at most 255 printable letters, got 'a\\n'"):
+        load_frames(pictures, None, False, ignore_progress, SeveralCameras(camera_ids=["a\n", "b", "c", None]))
     with pytest.raises(TypeError, match="give one of"):
         load_frames(pictures, None, False, ignore_progress, SeveralCameras("all", camera_ids=["a"] * 4))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 
@@ -161,7 +162,11 @@ def test_one_program_or_camera_publishes_at_a_time(tmp_path):
         ({"image": "a.jpg"}, TypeError, "bytes of a JPEG or PNG file; got str"),
         ({"image": b"no image"}, ValueError, "bytes of a JPEG or PNG file that can be read"),
         ({"captured_at": -1.0}, ValueError, "seconds since 1970"),
-        ({"camera_id": "a\n"}, ValueError, "printable"),
+        ({"camera_id": "a\n"}, ValueError, r"camera_id must be up to 32 letters, digits, - and _, got 'a\\n'"),
+        ({"camera_id": "x y"}, ValueError, "camera_id must be up to 32 letters, digits, - and _, got 'x y'"),
+        ({"camera_id": "../x"}, ValueError, "camera_id must be up to 32 letters, digits, - and _, got '../x'"),
+        ({"camera_id": 33 * "a"}, ValueError, "camera_id must be up to 32 letters"),
+        ({"camera_id": 3}, TypeError, "camera_id must be a text, got int"),
         ({"pose": np.zeros((4, 4))}, ValueError, "a rigid motion"),
         ({"pose": np.eye(3)}, ValueError, r"\(4, 4\), got \(3, 3\)"),
         ({"pose_sigma": (1, 2)}, ValueError, "give pose, too"),
@@ -180,6 +185,16 @@ def test_what_cannot_be_used_is_refused_and_costs_nothing(tmp_path, arguments, e
         with pytest.raises(error, match=told):
             node.publish(**{"image": picture(), **arguments})
         assert node.num_waiting == 0 and node.publish(picture()).taken
+
+
+@pytest.mark.parametrize("camera_id", ["x y", "../x", "a\n", 33 * "a", 3])
+def test_an_id_is_checked_alike_for_a_publisher_and_for_an_image(tmp_path, camera_id):
+    with pytest.raises((TypeError, ValueError)) as of_all:
+        splatnode.Publisher(camera_id=camera_id, changes=changes(tmp_path))
+    with publisher(tmp_path) as node, pytest.raises(of_all.type, match=re.escape(str(of_all.value))):
+        node.publish(picture(), camera_id=camera_id)
+    with pytest.raises(ValueError, match="camera_id"):
+        splatnode.Publisher(changes=changes(tmp_path) | {"camera_id": camera_id})
 
 
 def test_a_configuration_that_cannot_be_used_is_refused(tmp_path):

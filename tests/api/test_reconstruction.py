@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import pickle
 import signal
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -151,11 +152,17 @@ def test_lenses_that_are_of_no_photograph_are_refused(arrays, lenses, kind, said
         splatnode.reconstruct(arrays, config=QUICK, intrinsics=lenses)
 
 
-def test_what_is_left_out_is_named(arrays, tmp_path):
+@pytest.mark.parametrize("only", ["multi_view_only", "only_seen"])
+def test_what_is_left_out_is_named(arrays, tmp_path, only):
     for index, image in enumerate(arrays[:2]):
         (tmp_path / f"{index}.png").write_bytes(encode_png(image))
     (tmp_path / "broken.png").write_bytes(b"no image")
-    made = splatnode.reconstruct(tmp_path, config=QUICK, only_seen=True)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        made = splatnode.reconstruct(tmp_path, config=QUICK, **{only: True})
+    told = [(str(each.message), each.category, each.filename) for each in heard]
+    former = "the argument only_seen is called multi_view_only now; the former name is read in this release only"
+    assert told == ([(former, DeprecationWarning, __file__)] if only == "only_seen" else [])
     assert [each.name for each in made.dropped] == ["broken.png"] and made.dropped[0].reason
     assert made.gaussians["seen"].all() and len(made.gaussians["seen"])
 

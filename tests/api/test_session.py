@@ -133,7 +133,7 @@ def test_poses_give_a_session_metres_and_their_axes(arrays):
 @pytest.mark.parametrize("only_checked", [False, True])
 def test_poses_with_sigmas_hold_the_cameras_of_a_session(arrays, only_checked):
     true = synthetic.scene_cameras(SMALL)
-    chosen = {"intrinsics": true[0][1], "poses_only_check": only_checked, "seed": 0}
+    chosen = {"intrinsics": true[0][1], "check_poses": only_checked, "seed": 0}
     with splatnode.Session(config=QUICK, **chosen) as session:
         for image, (T, _) in zip(arrays[:2], true, strict=False):
             result = session.add(image, pose=T, pose_sigma=(0.002, 0.1)).result
@@ -141,6 +141,16 @@ def test_poses_with_sigmas_hold_the_cameras_of_a_session(arrays, only_checked):
     if not only_checked:
         for camera, (T, _) in zip(result.cameras, true, strict=False):
             assert np.linalg.norm(camera.centre - T[:3, 3]) < 0.006
+
+
+def test_former_names_of_arguments_are_read_and_told():
+    with pytest.warns(DeprecationWarning, match="poses_only_check is called check_poses now") as heard:
+        session = splatnode.Session(poses_only_check=True)
+    assert session._only_checks and heard[0].filename == __file__
+    with pytest.raises(TypeError, match="check_poses is given twice, once as poses_only_check"):
+        splatnode.Session(poses_only_check=False, check_poses=True)
+    with pytest.raises(TypeError, match="multi_view_only is given twice, once as only_seen"):
+        splatnode.reconstruct([], only_seen=True, multi_view_only=True)
 
 
 def test_what_is_no_pose_is_said_and_the_photograph_can_come_again(arrays):
@@ -265,5 +275,7 @@ def test_a_photograph_may_have_its_own_lens_and_camera(arrays):
         session.add(arrays[1], name="b.png", intrinsics=wide, camera="gripper")
         with pytest.raises(ValueError, match="got those of 100 x 100 for 320 x 240"):
             session.add(arrays[2], intrinsics=splatnode.Intrinsics(100, 100, 90, 90, 50, 50, "given"))
+        with pytest.raises(ValueError, match="camera must be at most 255 printable letters"):
+            session.add(arrays[2], camera="a\n")
         frames = [session._frames[name] for name in ("a.png", "b.png")]
     assert [(each.intrinsics.fx, each.camera_id) for each in frames] == [(300, ""), (200, "gripper")]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import folder
-from splatnode.capture.depth_files import decode_exr, read_depth_file
+from splatnode.capture.depth_files import decode_exr, find_depth_files, read_depth_file
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.rgbd_folder import RgbdFolderError, find_rgbd_folder
@@ -191,6 +191,18 @@ def test_a_damaged_depth_image_costs_its_depth_alone(tmp_path, caplog):
     assert "1.png: its depth image is left out" in caplog.text
 
 
+@pytest.mark.parametrize("layout", ["TUM RGB-D", "ScanNet"])
+def test_depth_of_another_unit_than_the_layouts_is_left_out_with_its_median(tmp_path, caplog, layout):
+    LAYOUTS[layout](tmp_path)
+    metres = np.random.default_rng(0).integers(1, 4, (48, 64)).astype(np.uint16)
+    for path in tmp_path.glob("depth/*.png"):
+        write_png(path, metres)
+    frames = [each for each in folder.stream(folder.Config(folder=tmp_path)) if isinstance(each, Frame)]
+    assert not any(each.depth for each in frames)
+    holds = "steps of 0.2 mm" if layout == "TUM RGB-D" else "whole millimetres"
+    assert f"left out: depth images of 16 bits hold {holds}; the median is 2: probably metres" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [("x rgb/a.png\n", "a time and a file"), ("1.0 ../a.png\n", "a file in this folder"), ("#\n", "lists no files")],
@@ -204,6 +216,37 @@ def test_a_list_that_is_none_is_named(tmp_path, text, why):
     (tmp_path / "s/intrinsic/intrinsic_depth.txt").write_text("1 2\n3\n")
     with pytest.raises(RgbdFolderError, match="matrix of 3 or 4 rows"):
         find_rgbd_folder(tmp_path / "s")
+
+
+@pytest.mark.parametrize(("off_s", "told"), [(0.01, ""), (0.05, "the nearest is +50 ms away"), (-3e4, "-3e+04 s away")])
+def test_depth_whose_times_are_off_is_told_with_the_offset(tmp_path, caplog, off_s, told):
+    for index in range(4):
+        write_png(tmp_path / f"rgb/{index}.png", photograph(index))
+        write_png(tmp_path / f"depth/{index}.png", 5 * STEPS)
+    for name, off in (("rgb", 0.0), ("depth", off_s)):
+        lines = [f"{1e9 + 0.2 * index + off:.6f} {name}/{index}.png\n" for index in range(4)]
+        (tmp_path / f"{name}.txt").write_text("".join(lines))
+    frames = [each for each in folder.stream(folder.Config(folder=tmp_path)) if isinstance(each, Frame)]
+    assert all((each.depth is None) == bool(told) for each in frames)
+    assert ("0 of 4 photographs have a depth image within 20 ms" in caplog.text) == bool(told)
+    assert told in caplog.text
+
+
+@pytest.mark.parametrize("layout", ["ScanNet", "Record3D"])
+def test_a_layout_whose_depth_has_other_names_is_told(tmp_path, caplog, layout):
+    LAYOUTS[layout](tmp_path)
+    list(folder.stream(folder.Config(folder=tmp_path)))
+    assert "photographs have a depth image" not in caplog.text
+    for path in list(tmp_path.glob("depth/[12].*")):
+        path.rename(path.with_stem(f"frame-{path.stem}"))
+    list(folder.stream(folder.Config(folder=tmp_path)))
+    assert "1 of 3 photographs have a depth image: those of other names count for none" in caplog.text
+
+
+def test_a_folder_with_depth_of_few_photographs_is_told(tmp_path, caplog):
+    write_png(tmp_path / "a.png", STEPS)
+    assert set(find_depth_files(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])) == {"a.jpg"}
+    assert "1 of 3 photographs have a depth image" in caplog.text
 
 
 def write_lists(folder: Path, rgb: str, depth: str) -> Path:

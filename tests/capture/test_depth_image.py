@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import msgspec
@@ -15,6 +16,7 @@ from splatnode.capture.depth_image import (
     DepthNoise,
     depth_arrays,
     describe_depth,
+    describe_doubtful_unit,
     make_depth_image,
     read_depth,
 )
@@ -163,3 +165,42 @@ def test_what_is_no_number_is_unknown_whoever_sends_it():
     sent = DepthImage(values, 1.0)
     for found in (make_depth_image(values), read_depth(describe_depth(sent), depth_arrays(sent))):
         assert found.values.tolist() == [[0.0, 0.0, 0.0, 2.0]] and found.values.dtype == np.float32
+
+
+# Units that are probably others: what is far too near or too far for a depth camera.
+
+ROOM = 1.0 + 3.0 * np.random.default_rng(2).random((40, 60))  # metres
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        (np.rint(ROOM).astype(np.uint16), "hold whole millimetres; the median is [0-9.]+: probably metres; give float"),
+        (np.rint(10 * ROOM).astype(np.uint16), "the median is 2[0-9.]*: probably another unit; .*tell unit_m"),
+        ((1000 * ROOM).astype(np.float32), r"floats hold metres; the median is 2[0-9.]*: probably millimetres; divide"),
+        (1000 * ROOM, "probably millimetres"),
+    ],
+)
+def test_values_of_another_unit_are_refused_with_their_median_unless_the_unit_is_told(values, why):
+    with pytest.raises(ValueError, match=why):
+        make_depth_image(values)
+    assert make_depth_image(values, unit_m=0.001).unit_m == 0.001
+    few = np.zeros_like(values)
+    few[:5] = values[:5]
+    assert make_depth_image(few) is not None, "of a few pixels nothing is judged"
+
+
+@pytest.mark.parametrize(
+    ("depth", "doubt"),
+    [
+        (make_depth_image(np.rint(1000 * ROOM).astype(np.uint16)), ""),
+        (make_depth_image(ROOM), ""),
+        (make_depth_image(np.full((40, 60), 0, np.uint16)), ""),
+        (make_depth_image((1000 * np.rint(ROOM)).astype(np.uint16)), "2400 pixels have 4 different depths alone"),
+        (make_depth_image(200 * ROOM), "the median depth is 4[0-9.]+ m: where floats are no metres"),
+        (DepthImage(np.rint(ROOM).astype(np.uint16)), "probably metres"),
+    ],
+)
+def test_what_may_be_right_is_doubted_alone(depth, doubt):
+    said = describe_doubtful_unit(depth)
+    assert re.search(doubt, said) if doubt else said == "", said

@@ -62,3 +62,57 @@ def test_what_is_no_rig_is_refused(tmp_path: Path, text: str) -> None:
     file.write_text(text)
     with pytest.raises(ValueError, match="rig.yaml"):
         read_rig(file)
+
+
+GOOD = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+FRONT = '{"image_prefix": "front", "ref_sensor": true}'
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (f"cameras: {{a: {{T_rig_camera: {GOOD}}}, left: {{T_rig_camera: 3}}}}", "camera 'left': Expected array"),
+        (f"cameras: {{a: {{T_rig_camera: {GOOD}}}, left: {{T_rig: {GOOD}}}}}", "camera 'left': .*unknown field T_rig"),
+        (f"cameras: {{a: {{T_rig_camera: {GOOD}}}, left: {{T_rig_camera: [[1]]}}}}", "camera 'left': the pose of left"),
+        (
+            f"cameras: {{a: {{T_rig_camera: {GOOD}}}, left: {{sigma_m: -1}}}}",
+            "camera 'left': the sigmas of left on its",
+        ),
+        (f"cameras: {{a: {{T_rig_camera: {GOOD}}}, left: [1]}}", "camera 'left': Expected object"),
+        ("cameras: [a, b]", "cameras must be a mapping of camera ids"),
+        (f'[{{"cameras": [{FRONT}, {{"image_prefix": "left", "cam_from_rig_rotation": [1]}}]}}]', "camera 'left': not"),
+        (f'[{{"cameras": [{FRONT}, {{"cam_from_rig_rotation": [1]}}]}}]', "camera '1': it has no 'image_prefix'. Each"),
+        (f'[{{"cameras": [{FRONT}, {{"image_prefix": "b", "cam_from_rig_rotation": [0, 0, 0, 0]}}]}}]', "camera 'b': "),
+        ('[{"cameras": 3}]', "one rig with `cameras`, a list"),
+    ],
+)
+def test_an_error_in_a_rig_names_the_camera(tmp_path: Path, text: str, told: str) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text(text)
+    with pytest.raises(UnusableRig, match=told) as raised:
+        read_rig(file)
+    assert str(raised.value).count("rig.yaml") == 1 and "`$" not in str(raised.value)
+
+
+def test_an_error_in_a_camchain_names_the_camera(tmp_path: Path) -> None:
+    file = tmp_path / "camchain.yaml"
+    for second, told in (
+        ({**LENS}, "camera 'cam1': it has no 'T_cn_cnm1'"),
+        ({**LENS, "T_cn_cnm1": [[1]]}, "'cam1': "),
+    ):
+        file.write_text(json.dumps({"cam0": LENS, "cam1": second}))
+        with pytest.raises(UnusableRig, match=told):
+            read_rig(file)
+    file.write_text(json.dumps({"cam0": {**LENS, "resolution": 3}, "cam1": LENS}))
+    with pytest.raises(UnusableRig) as raised:
+        read_rig(file)
+    assert str(raised.value).count("camchain.yaml") == 1 and "UnusableLens" not in str(raised.value)
+
+
+def test_a_rig_that_is_no_yaml_is_named_once_on_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text("cameras: {a: [\nb: }")
+    with pytest.raises(UnusableRig, match="rig.yaml is not YAML: .*it must give a rig") as raised:
+        read_rig(file)
+    said = str(raised.value)
+    assert said.count(str(file)) == 1 and "ConfigError" not in said and "\n" not in said and "\\n" not in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -16,6 +17,8 @@ from splatnode import command_line
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.multi_camera import select_cameras
+from splatnode.capture.process.notices import InputWarning, give_warnings
+from splatnode.capture.process.terminal import ignore_progress
 from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import format_rig, read_rig
 from splatnode.recon.clock import Clock
@@ -23,7 +26,15 @@ from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 from splatnode.recon.replay_source import Source
-from splatnode.recon.rig_choice import DRAWN_SIGMA_DEG, DRAWN_SIGMA_M, add_rig_lenses, choose_rig, hold_rig
+from splatnode.recon.rig_choice import (
+    DRAWN_SIGMA_DEG,
+    DRAWN_SIGMA_M,
+    add_rig_lenses,
+    apply_rig,
+    choose_rig,
+    describe_rig_use,
+    hold_rig,
+)
 from tests.support import mcap_files
 from tests.support.rig_walk import RigWalk, make_rig_walk, true_mounts
 
@@ -194,6 +205,53 @@ def test_a_rig_of_other_cameras_is_told(walk: RigWalk) -> None:
     rig = Rig((RigCamera("cam0"), RigCamera("cam1")))
     with pytest.raises(ValueError, match="it has cam0, cam1, and the images are of front, left.*--cameras"):
         add_rig_lenses(Source(walk.frames, None, None), rig)
+
+
+def place(camera_id: str, x_m: float) -> RigCamera:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return RigCamera(camera_id, tuple(T.ravel().tolist()))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "ids", "expected"),
+    [
+        ([place("a", 0), place("b", 0.2)], ["a", "b", "a"], []),
+        ([place("a", 0), place("b", 0.2), place("rear", 1)], ["a", "b"], ["no image is of rear .* counts for a, b al"]),
+        ([place("a", 0), place("b", 0.2)], ["a", "b", "c"], ["rig does not have c, whose .* The rig has a, b; name"]),
+        ([place("a", 0), place("b", 0.2)], ["a", "b", ""], ["1 of 3 images are of no camera that is named"]),
+        ([place("a", 0), place("b", 220)], ["a", "b"], ["a and b 220 m apart: its poses are metres.*divide"]),
+        ([place("a", 1), place("b", 1)], ["a", "b"], ["a, b in one place, within their sigma_m: it gives no metres"]),
+        ([place("a", 0), place("rear", 220), place("b", 0.2)], ["a", "b"], ["no image is of rear"]),
+        (
+            [place("a", 0), RigCamera("b")],
+            ["a", "b"],
+            ["not tell where b stands .*images alone.*gives no metres: give"],
+        ),
+        (
+            [place("a", 0), place("b", 0.2), RigCamera("c")],
+            ["a", "b", "c"],
+            ["where c stands .*The others give the metres"],
+        ),
+    ],
+)
+def test_what_of_a_rig_does_not_count_is_told(cameras: list[RigCamera], ids: list[str], expected: list[str]) -> None:
+    told = list(describe_rig_use(Rig(tuple(cameras)), ids))
+    assert len(told) == len(expected), told
+    for text, pattern in zip(told, expected, strict=True):
+        assert re.search(pattern, text), text
+
+
+def test_the_log_or_a_program_hears_what_of_a_rig_does_not_count(walk: RigWalk, tmp_path: Path, caplog) -> None:
+    file = tmp_path / "rig.yaml"
+    mounts = [(camera, true_mounts()[camera], 0.001, 0.1) for camera in (*IDS, "right")]
+    file.write_text(format_rig(mounts, metric=True))
+    given, config = Source(walk.frames, None, None), ReconstructionConfig()
+    apply_rig(given, config, file, ignore_progress)
+    assert "no image is of right of the rig" in caplog.text
+    with give_warnings(), pytest.warns(InputWarning, match="no image is of right of the rig") as heard:
+        apply_rig(given, config, file, ignore_progress)
+    assert heard[0].filename == __file__
 
 
 def test_a_rig_stays_where_further_settings_change() -> None:

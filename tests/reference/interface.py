@@ -51,6 +51,7 @@ _CLASSES = (
     "Stereo",
     "DepthImage",
     "DepthNoise",
+    "InputWarning",
 )
 _WIDE = 110  # characters
 _FURTHER = (
@@ -81,7 +82,7 @@ def told() -> set[str]:
 def _class(documented: type, title: str, methods: bool = True) -> str:
     is_record = dataclasses.is_dataclass(documented)
     parts = [f"## {title}\n"]
-    if not is_record and documented.__init__.__doc__:
+    if not is_record and "__init__" in vars(documented) and documented.__init__.__doc__:
         parts += [_head(documented.__name__, documented.__init__), *_paragraphs(documented.__init__)]
     parts += _paragraphs(documented)
     own = list(_own(documented))

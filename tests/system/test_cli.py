@@ -382,7 +382,7 @@ def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):
         raise RuntimeError("the compiled core is missing. Run: python recon/core/compile.py")
 
     monkeypatch.setattr(core, "library", missing)
-    assert doctor.doctor(argparse.Namespace(json=False)) == 2
+    assert doctor.doctor(argparse.Namespace(json=False, rates=None)) == 2
     assert "Run: python recon/core/compile.py" in capsys.readouterr().out
 
 

@@ -13,7 +13,7 @@ from splatnode.capture.frame import ExposureSettings, Intrinsics
 from splatnode.capture.messaging import messages, network, pubsub, wire
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.status import CaptureStatus
-from splatnode.recon.daemon.node import RemoveKeyframe
+from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.occupancy.message import MapHeader, MapRecord
 from splatnode.recon.result.export.format import list_format_names
@@ -90,6 +90,7 @@ SECTIONS = {
     "Fields that all headers have": wire.Header,
 }
 ROWS = (
+    Finish,
     RemoveKeyframe,
     pubsub.MarkProblemsSeen,
     pubsub.Answer,

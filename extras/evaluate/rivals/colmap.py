@@ -1,6 +1,7 @@
 """Stock COLMAP and GLOMAP through pycolmap (pip install 'splatnode[bench]'): photographs in, a sparse model out.
 
-Everything is at its defaults, except that frames of one size share a camera, as they do in splatnode.
+Everything is at its defaults, except that frames of one size share a camera, as they do in splatnode. `..._few_views`
+are the same mappers with options for few views: their defaults are made for hundreds.
 """
 
 from __future__ import annotations
@@ -76,6 +77,48 @@ def map_globally(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstructio
     options.random_seed = seed
     pycolmap.calibrate_view_graph(folder / "database.db")
     return pycolmap.global_mapping(folder / "database.db", folder / "images", folder / "models", options)
+
+
+def map_few_views_incrementally(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
+    """COLMAP's incremental mapper with what it needs where images are few, and far apart or close together.
+
+    A first pair may have 1 degree between its rays, 50 inliers and forward motion; points need .5 degrees, a further
+    image 15 inliers; no distortion is estimated, for images have none.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    options.mapper.init_min_tri_angle = 1.0
+    options.mapper.init_max_forward_motion = 1.0
+    options.mapper.init_min_num_inliers = 50
+    options.mapper.abs_pose_min_num_inliers = 15
+    options.mapper.filter_min_tri_angle = 0.5
+    options.mapper.abs_pose_refine_extra_params = False
+    options.triangulation.min_angle = 0.5
+    options.ba_refine_extra_params = False
+    return pycolmap.incremental_mapping(folder / "database.db", folder / "images", folder / "models", options)
+
+
+def map_few_views_globally(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
+    """GLOMAP with points that two views see, which need .5 degrees, and without distortion."""
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = seed
+    options.mapper.track_min_num_views_per_track = 2
+    options.mapper.global_positioning.min_num_view_per_track = 2
+    options.mapper.bundle_adjustment.min_track_length = 2
+    options.mapper.bundle_adjustment.refine_extra_params = False
+    options.mapper.min_tri_angle_deg = 0.5
+    options.mapper.retriangulation.min_angle = 0.5
+    options.mapper.retriangulation.ignore_two_view_tracks = False
+    pycolmap.calibrate_view_graph(folder / "database.db")
+    return pycolmap.global_mapping(folder / "database.db", folder / "images", folder / "models", options)
+
+
+MAPPERS: Mapping[str, Mapper] = {
+    "colmap": map_incrementally,
+    "colmap-few-views": map_few_views_incrementally,
+    "glomap": map_globally,
+    "glomap-few-views": map_few_views_globally,
+}
 
 
 def reconstruct_sparse_model(

@@ -29,10 +29,9 @@ from splatnode.extras.evaluate.protocol import (
 )
 from splatnode.extras.evaluate.report import Timing, measure_timing
 from splatnode.extras.evaluate.rivals.colmap import (
+    MAPPERS,
     Mapper,
     RegisteredFrame,
-    map_globally,
-    map_incrementally,
     reconstruct_sparse_model,
 )
 from splatnode.extras.evaluate.rivals.outcome import make_verdict
@@ -371,7 +370,7 @@ def classify_outcome(demand: Demand, published: bool, published_right: bool, cod
 
 Method = Callable[[Iterable[Frame | DroppedFrame], ReconstructionConfig], Snapshot]
 
-NAMES = ("splatnode", "colmap", "glomap")
+NAMES = ("splatnode", *MAPPERS)
 
 
 def splatnode(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
@@ -389,17 +388,13 @@ def splatnode_stream(frames: Iterable[Frame | DroppedFrame], config: Reconstruct
 def find_method(name: str, stream: bool = False) -> Method:
     """The method; `stream`: for frames that come one at a time, if it can.
 
-    Raises ValueError for a method that there is not, or that needs a package that is not installed.
+    Raises ValueError for a method that there is not.
     """
     if name == "splatnode":
         return splatnode_stream if stream else splatnode
     if name not in NAMES:
         raise ValueError(f"no method {name!r}; there are: {', '.join(NAMES)}")
-    try:
-        pass
-    except ImportError as error:
-        raise ValueError(f"method {name!r} needs pycolmap. Run: pip install 'splatnode[bench]'") from error
-    return colmap if name == "colmap" else glomap
+    return partial(_reconstruct, mapping=MAPPERS[name])
 
 
 # What splatnode registered, published or not: whether a refusal was of right cameras.
@@ -550,20 +545,8 @@ def run_trial(case: TrialCase, method: str) -> TrialResult:
     )
 
 
-# The cameras of stock COLMAP and GLOMAP (extras/evaluate/rivals/colmap.py) as a snapshot without Gaussians.
-
-
-def colmap(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
-    """Incremental mapping."""
-    return _reconstruct(frames, config, map_incrementally)
-
-
-def glomap(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig) -> Snapshot:
-    """Global mapping."""
-    return _reconstruct(frames, config, map_globally)
-
-
 def _reconstruct(frames: Iterable[Frame | DroppedFrame], config: ReconstructionConfig, mapping: Mapper) -> Snapshot:
+    """The cameras of stock COLMAP and GLOMAP (extras/evaluate/rivals/colmap.py), without Gaussians."""
     usable = [frame for frame in frames if isinstance(frame, Frame)]
     model = reconstruct_sparse_model(usable, config.seed, mapping)
     registered = () if model is None else model.registered

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import subprocess
 import sys
 import time
@@ -16,7 +17,17 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import depthai as oak
-from splatnode.capture.cameras.depthai import Config, Source, convert_frame, convert_stereo_pair, find, read, stream
+from splatnode.capture.cameras.depthai import (
+    Config,
+    DepthConverter,
+    Source,
+    convert_frame,
+    convert_stereo_pair,
+    find,
+    read,
+    stream,
+)
+from splatnode.capture.depth_image import DepthNoise
 from splatnode.capture.frame import (
     Baseline,
     CameraUnavailable,
@@ -358,6 +369,191 @@ def test_depthai_has_what_pairs_need():
     assert stereo.setRectification and stereo.rectifiedLeft and stereo.rectifiedRight and stereo.left and stereo.right
     assert dai.CalibrationHandler().getBaselineDistance and dai.LengthUnit.METER
     assert dai.CameraBoardSocket.CAM_B and dai.CameraBoardSocket.CAM_C
+
+
+class FakeDepth(FakeStereo):
+    """A device whose stereo node measures depth beside the colour camera."""
+
+    def __init__(self, messages, platform="RVC2", there=("A", "B", "C"), baseline=0.075, focal=450.0):
+        super().__init__(messages, baseline)
+        supply = iter(messages)
+        self.queue = SimpleNamespace(get=lambda timeout: self._next(supply))
+        nodes = {
+            "Camera": self._colour_or_side,
+            "StereoDepth": self._depth_node,
+            "Sync": lambda: self._sync(self.queue),
+            "ImageAlign": self._align,
+        }
+        pipeline = SimpleNamespace(create=lambda node: nodes[node](), start=lambda: self.told.append("start"))
+        calibration = SimpleNamespace(
+            getBaselineDistance=lambda *asked: self._baseline(asked, baseline),
+            getCameraIntrinsics=lambda *asked: self._focal(asked, focal),
+        )
+        found = self.Device.getAllAvailableDevices
+        device = SimpleNamespace(
+            getConnectedCameras=lambda: list(there),
+            getPlatform=lambda: platform,
+            readCalibration=lambda: calibration,
+        )
+        self.Device = _Opened(lambda info: None, device)
+        self.Device.getAllAvailableDevices = found
+        self.Pipeline = _Opened(lambda device: None, pipeline)
+        self.node = SimpleNamespace(**{name: name for name in nodes})
+        self.CameraBoardSocket = SimpleNamespace(CAM_A="A", CAM_B="B", CAM_C="C")
+        self.Platform = SimpleNamespace(RVC4="RVC4")
+
+    @staticmethod
+    def _focal(asked, focal):
+        assert asked == ("C", 640, 400)
+        return [[focal, 0.0, 320.0], [0.0, focal, 200.0], [0.0, 0.0, 1.0]]
+
+    def _colour_or_side(self):
+        camera = self._camera()
+        request = camera.requestOutput
+
+        def request_output(size, *rest, **how):
+            output = request(size, **how)
+            output.createOutputQueue = lambda **options: self.queue
+            return output
+
+        camera.requestOutput = request_output
+        return camera
+
+    def _depth_node(self):
+        return SimpleNamespace(
+            left="left",
+            right="right",
+            inputAlignTo="stereo's colour",
+            setRectification=lambda on: self.told.append(("rectified", on)),
+            setLeftRightCheck=lambda on: self.told.append(("checked", on)),
+            setSubpixel=lambda on: self.told.append(("subpixels", on)),
+            depth=self._linked("depth"),
+        )
+
+    def _align(self):
+        return SimpleNamespace(input="align", inputAlignTo="align's colour", outputAligned=self._linked("aligned"))
+
+    def _sync(self, queue):
+        node = super()._sync(queue)
+        node.inputs = {"colour": "sync colour", "depth": "sync depth"}
+        return node
+
+
+def shot(index=0, late_ms=0.0, values=None):
+    """A group of a colour message and of the depth beside it: 1 and 2 m, a hole, and what 16 bits cannot say."""
+    depth = np.tile(np.array([1000, 2000, 0, 65_535], np.uint16), (720, 320)) if values is None else values
+    measured = SimpleNamespace(
+        getTimestamp=lambda: timedelta(seconds=100_000, microseconds=index, milliseconds=late_ms),
+        getCvFrame=lambda: depth,
+    )
+    return {"colour": message(index), "depth": measured}
+
+
+SIDES = ["camera B -> left", "camera C -> right"]
+ALIGNED_BY = {
+    "RVC2": [*SIDES, "camera A -> stereo's colour", "depth -> sync depth", "camera A -> sync colour"],
+    "RVC4": [
+        *SIDES,
+        "depth -> align",
+        "camera A -> align's colour",
+        "aligned -> sync depth",
+        "camera A -> sync colour",
+    ],
+}
+
+
+@pytest.mark.parametrize("platform", ["RVC2", "RVC4"])
+@pytest.mark.parametrize("depth", ["available", "required"])
+def test_depth_goes_with_the_colour_frames(monkeypatch, platform, depth):
+    fake = use(monkeypatch, FakeDepth([shot(index) for index in range(4)], platform))
+    first, second = itertools.islice(stream(Config(depth=depth, warmup_s=0)), 2)
+    assert isinstance(first, Frame) and (first.frame_id, second.name) == (0, "100000.000002")
+    assert first.image.shape == (720, 1280, 3) and first.right is None and first.depth is not None
+    assert first.depth.is_aligned and first.depth.metres[5, :4].tolist() == [1.0, 2.0, 0.0, 0.0]
+    assert first.depth.confidence is None
+    near, far = first.depth.noise.compute_sigma(np.array([1.0, 4.0]))
+    assert near == pytest.approx(0.002 + 0.25 / (450 * 0.075)) and far - 0.002 == pytest.approx(16 * (near - 0.002))
+    assert fake.links == ALIGNED_BY[platform]
+    for told in (
+        ("rectified", True),
+        ("checked", True),
+        ("subpixels", True),
+        ((640, 400), {"resizeMode": "crop", "fps": 10}),
+    ):
+        assert told in fake.told
+    assert ("together within", timedelta(seconds=0.05)) in fake.told
+    assert [each.calls[0][0] for each in fake.told if isinstance(each, _Control)] == ["setAutoExposureLock"]  # colour's
+
+
+def test_a_device_that_gives_no_pair_says_what_to_try(monkeypatch):
+    use(monkeypatch, FakeDepth([shot(), None]))
+    frames = stream(Config(depth="required", lock_exposure=False))
+    next(frames)
+    with pytest.raises(CameraUnavailable, match="still plugged in. If it is, it may measure no depth: try"):
+        next(frames)
+
+
+LACKING = [
+    ({"there": ("A",)}, "has no pair of stereo cameras"),
+    ({"baseline": None}, "are not calibrated .no calibration data"),
+    ({"baseline": 0.0}, "are not calibrated"),
+    ({"focal": 1.0}, "are not calibrated .its focal length is 1 pixels"),
+    ({"focal": float("nan")}, "are not calibrated"),
+]
+
+
+@pytest.mark.parametrize(("lacking", "reason"), LACKING)
+def test_a_device_that_cannot_measure_depth_says_so_or_sends_colour_alone(monkeypatch, caplog, lacking, reason):
+    use(monkeypatch, FakeDepth(map(message, range(4)), **lacking))
+    with pytest.raises(CameraUnavailable, match=f"{reason}.*so it measures no depth. Set camera.depth to available"):
+        next(stream(Config(depth="required")))
+    fake = use(monkeypatch, FakeDepth(map(message, range(4)), **lacking))
+    frame = next(stream(Config(depth="available", lock_exposure=False)))
+    assert isinstance(frame, Frame) and frame.depth is None and fake.links == []
+    assert re.search(f"no_depth.*{reason}", caplog.text) and "colour images alone" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"late_ms": 51.0}, "taken 51.0 ms from its image, at most 50.0 ms count"),
+        ({"values": np.full((720, 1280), 90, np.uint8)}, "must be of 16 bits, millimetres, got uint8"),
+        (
+            {"values": np.full((400, 400), 900, np.uint16)},
+            "must have the shape of its image, 1280 x 720; got 400 x 400",
+        ),
+    ],
+)
+def test_a_depth_image_that_cannot_be_used_is_left_out_and_told_once(caplog, changed, reason):
+    convert = DepthConverter(DepthNoise(0.002, 0.008), 0.05)
+    for index in range(3):
+        frame = convert(shot(index, **changed), index)
+        assert isinstance(frame, Frame) and frame.depth is None
+    assert caplog.text.count("depth_left_out") == 1 and reason in caplog.text
+    good = convert(shot(4, late_ms=-49.0), 3)
+    assert isinstance(good, Frame) and good.depth is not None
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [({"stereo": True}, "set one of them"), ({"undistort": False}, "needs undistort: true")],
+)
+def test_depth_that_goes_with_no_colour_image_is_refused(changed, reason):
+    with pytest.raises(ValueError, match=reason):
+        Config(depth="available", **changed)
+
+
+def test_depthai_has_what_depth_needs():
+    """The names are DepthAI's own, and so is the message; only a device could run the nodes."""
+    dai = pytest.importorskip("depthai", reason="needs the extra oak")
+    stereo, align = dai.node.StereoDepth, dai.node.ImageAlign
+    assert stereo.depth and stereo.inputAlignTo and stereo.setLeftRightCheck and stereo.setSubpixel
+    assert align.input and align.inputAlignTo and align.outputAligned
+    assert dai.Device.getConnectedCameras and dai.Device.getPlatform and dai.Platform.RVC4
+    assert "resizeWidth: int" in dai.CalibrationHandler.getCameraIntrinsics.__doc__
+    measured = dai.ImgFrame()
+    measured.setCvFrame(np.full((4, 6), 1234, np.uint16), dai.ImgFrame.Type.RAW16)
+    assert measured.getCvFrame().dtype == np.uint16 and (measured.getCvFrame() == 1234).all()
 
 
 def test_depthai_s_messages_tell_time_and_sensitivity_or_zeros():

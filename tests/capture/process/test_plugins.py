@@ -131,6 +131,53 @@ def test_a_verb_of_another_package_is_offered_and_one_that_is_broken_is_left_out
     assert "reconstruct a folder" in splatnode("--help", path=f"{installed}{os.pathsep}{ROOT}").stdout
 
 
+BROKEN = """
+from types import SimpleNamespace
+from splatnode.capture.process.arguments import Verb
+from splatnode.viewer.further import FurtherViewer
+
+def fail(parser):
+    raise KeyError("nothing")
+
+LACKS = SimpleNamespace(name="lacks", summary="has no function")
+FAILS = Verb("fails", "fails when its options are asked for", fail, lambda args: 0)
+HELP = Verb("percent", "100% of it", lambda parser: parser.add_argument("--all", help="50%"), lambda args: 0)
+VIEWER = FurtherViewer("fails", "fails when its options are asked for", "shows", lambda source, args: None, fail)
+EMPTY = SimpleNamespace(name="empty")
+"""
+BROKEN_LINES = """
+[splatnode.verbs]
+lacks = broken_plugins:LACKS
+fails = broken_plugins:FAILS
+percent = broken_plugins:HELP
+
+[splatnode.viewers]
+fails = broken_plugins:VIEWER
+empty = broken_plugins:EMPTY
+
+[splatnode.export_formats]
+empty = broken_plugins:EMPTY
+"""
+
+
+def test_a_plug_in_without_its_functions_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
+    (tmp_path / "broken_plugins.py").write_text(BROKEN)
+    (tmp_path / "broken-1.0.dist-info").mkdir()
+    (tmp_path / "broken-1.0.dist-info" / "entry_points.txt").write_text(BROKEN_LINES)
+    path = f"{tmp_path}{os.pathsep}{ROOT}"
+    of_view = ["fails", "empty"]
+    for words, names in ((["--help"], ["lacks", "fails", "percent", *of_view]), (["view", "--help"], of_view)):
+        done = splatnode(*words, path=path)
+        assert done.returncode == 0 and "usage: splatnode" in done.stdout and "Traceback" not in done.stderr
+        assert [line.split("'")[1] for line in done.stderr.splitlines()] == names, done.stderr
+    assert "has no add_arguments and no run" in splatnode("--help", path=path).stderr
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(
+        plugins.BrokenPlugin, match="must have DEFAULT_NAME, export; broken_plugins:EMPTY of broken has"
+    ):
+        plugins.entry_points(plugins.EXPORT_FORMATS)["empty"].load()
+
+
 def test_without_the_room_the_core_runs_and_offers_what_it_has(tmp_path):
     """As where `extras` is not installed: its verbs, cameras and formats are not offered, and the rest works."""
     copy = tmp_path / "copy"

@@ -25,7 +25,6 @@ from splatnode.capture.process.logs import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import ingest
-from splatnode.recon.daemon import ingest as captures
 from splatnode.recon.daemon.checkpoint.records import read_frame
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
@@ -129,7 +128,7 @@ def plain(monkeypatch):
 
 
 def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain, monkeypatch):
-    monkeypatch.setattr(captures, "CONNECT_S", 30.0)  # a busy machine connects them one by one
+    monkeypatch.setattr(ingest, "CONNECT_S", 30.0)  # a busy machine connects them one by one
     patient = FrameSetConfig(wait_s=30.0)
     network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
     with ExitStack() as resources:

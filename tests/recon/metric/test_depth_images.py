@@ -15,6 +15,7 @@ from splatnode.recon.metric.depth_fill import MeasuredDepth, fuse_depth, warp_de
 from splatnode.recon.metric.depth_fit import DepthFit, DepthView, fit_depth_images
 from splatnode.recon.metric.depth_scale import estimate_scale_from_depth
 from splatnode.recon.metric.depth_smoothing import smooth_depth
+from splatnode.recon.metric.depth_units import describe_doubtful_units
 from splatnode.recon.metric.evidence import CameraDepth, Evidence, gather_evidence
 from splatnode.recon.metric.measurement import Measurement, MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale
@@ -69,6 +70,42 @@ def test_a_shift_of_four_pixels_is_named_and_its_depth_left_out(shift):
     assert found.check.code is DepthCode.SHIFTED and not found.is_usable and found.check.shift_px is not None
     assert np.hypot(*(np.array(found.check.shift_px) - shift)) <= 2.0
     assert "not aligned" in found.check.message and "Align depth to colour" in found.check.message
+
+
+def test_a_shift_at_the_end_of_the_search_is_called_the_least():
+    found = fit(DepthCamera(shift_px=(14.0, 0.0))).check
+    assert found.code is DepthCode.SHIFTED and found.shift_is_least and found.record()["shift_is_least"] is True
+    assert "by at least 10 pixels, where the search ends" in found.message
+    assert "Disparity in place of depth, or a wrong lens, looks the same" in found.message
+    within = fit(DepthCamera(shift_px=(4.0, 0.0))).check
+    assert not within.shift_is_least and "at least" not in within.message and "Disparity" not in within.message
+
+
+def test_disparity_in_place_of_depth_is_not_told_as_a_shift_of_so_many_pixels():
+    swapped = [
+        replace(each, depth=DepthImage(np.where(z > 0, 4.0 / np.maximum(z, 0.1), 0).astype(np.float32), 1.0))
+        for each in views()
+        for z in [each.depth.metres]
+    ]
+    (found,) = fit_depth_images(swapped)
+    assert not found.is_usable and "isparity" in found.check.message, found.check
+    assert found.check.shift_px is None or found.check.shift_is_least
+
+
+def test_depths_beyond_any_camera_are_told_with_their_unit():
+    far = [replace(each, depth=DepthImage(1000 * each.depth.metres, 1.0)) for each in views()]
+    (found,) = fit_depth_images(far)
+    assert found.check.code is DepthCode.UNTESTED
+    assert "floats hold metres; the median is" in found.check.message and "probably milli" in found.check.message
+
+
+def test_doubts_about_units_are_told_once_for_all_images():
+    frames = [replace(each, depth=DepthImage(np.full((240, 320), 2, np.uint16))) for each in support.photographs(PLACE)]
+    good = [replace(each, depth=depths()[each.name].depth) for each in frames[:1]]
+    assert describe_doubtful_units(good) == ""
+    said = describe_doubtful_units([*good, *frames[1:]])
+    assert frames[1].name in said and "median is 2: probably metres" in said
+    assert f"({len(frames) - 1} of {len(frames)} depth images)" in said
 
 
 @pytest.mark.parametrize("seed", range(4))

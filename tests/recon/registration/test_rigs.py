@@ -260,6 +260,19 @@ def test_a_known_rig_tells_metres_within_their_interval() -> None:
         assert off < 1.96 * rig.scale_sigma < 0.05
 
 
+def test_only_cameras_that_have_images_and_are_given_count_for_the_rig() -> None:
+    found, keyframes, _ = make_drive()
+    cameras = {each.camera_id: each for each in make_rig().cameras}
+    rig = find_rig(found, keyframes, make_rig())[1]
+    assert rig.num_given == 3
+    rear = replace(cameras["right"], camera_id="rear")  # took no image
+    rig = find_rig(found, keyframes, Rig((cameras["front"], cameras["left"], rear)))[1]
+    assert rig.metres_per_unit is not None and len(rig.mounts) == 3
+    assert rig.num_given == 2
+    assert find_rig(found, keyframes, make_rig(left=3.0))[1].num_given == 2, "a camera that is not believed"
+    assert find_rig(found, keyframes)[1].num_given == 0
+
+
 def test_a_camera_that_is_given_wrongly_is_named_and_not_believed() -> None:
     found, keyframes, worlds = make_drive()
     adjusted, rig = find_rig(found, keyframes, make_rig(left=3.0))

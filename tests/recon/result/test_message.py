@@ -11,6 +11,7 @@ import pytest
 from splatnode.capture.frame import Clock, DroppedFrame, Intrinsics, Stamp
 from splatnode.capture.messaging.messages import make_jpeg_array
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
+from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.result.message import (
     CameraRecord,
     SceneHeader,
@@ -113,6 +114,20 @@ def test_a_camera_tells_the_lens_that_was_taken_out_of_its_photograph():
 )
 def test_metres_and_the_reason_why_there_are_none_come_out_as_they_went_in(scale):
     assert decode_snapshot(sent(replace(snapshot(), scale=scale))).snapshot.scale == scale
+
+
+CHECKS = (
+    DepthCheck(DepthCode.FITS, "depth images of 4 photographs fit 900 points of the images", "wrist", 900),
+    DepthCheck(DepthCode.SHIFTED, "they lie beside", "", 40, (10.0, -2.0), shift_is_least=True),
+    DepthCheck(DepthCode.SCALE, "3 % too large", "head", 50, scale_error=0.03),
+)
+
+
+def test_what_the_images_say_of_depth_images_comes_out_as_it_went_in():
+    assert decode_snapshot(sent(replace(snapshot(), depth_checks=CHECKS))).snapshot.depth_checks == CHECKS
+    header, arrays = encode_snapshot(snapshot(), "scene-0002", NUMBERED)
+    assert "depth_checks" not in msgspec.msgpack.decode(encode(header, arrays)[1])[0], "none came"
+    assert decode_snapshot(sent(snapshot())).snapshot.depth_checks == ()
 
 
 def test_a_relative_scene_is_the_message_of_a_splatnode_that_knows_no_live_metres():

@@ -7,8 +7,21 @@ from typing import Any
 
 from tests.reference.measured.raw import part, percent, raw, require, span, table, thousands
 
+STEPS = ("add", "update", "localize", "finalize", "map")
 Row = tuple[str, str, str]  # what ran, what came of it, its raw file
 HEADER = ("run", "result", "raw file")
+
+
+def rates() -> str:
+    """The seconds of each step of a scene that grows, by number of views."""
+    found = raw("rates")
+    require(found["command"] == "splatnode doctor --rates 3 6 12 24 --json", "measured by the command of the page")
+    seconds = [[each[f"{step}_s"] for step in STEPS] for each in found["rates"]]
+    rows = [
+        (str(each["views"]), *("–" if took is None else f"{took:.2f} s" for took in times))
+        for each, times in zip(found["rates"], seconds, strict=True)
+    ]
+    return table(("views", *STEPS), rows)
 
 
 def live_scenes() -> str:
@@ -444,4 +457,4 @@ def _viewer() -> Iterable[Row]:
     )
 
 
-BLOCKS = (live_scenes, walks, endurance, batches, viewer)
+BLOCKS = (rates, live_scenes, walks, endurance, batches, viewer)

@@ -203,9 +203,7 @@ _PREVIEWS = Reader((WireError,), ("splatnode.capture.config", f"{_MESSAGING}.jpe
 _SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
 _IMAGES = Reader(
     (UnusableImage,),
-    tuple(
-        f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exif", "exif_time", "exposure_settings")
-    ),
+    tuple(f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exposure_settings")),
 )
 _CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
 _RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.recon.result.stored_snapshot",))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture import image_header
-from splatnode.capture import image_header as exif
+from splatnode.capture.depth_image import make_depth_image
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.image_file import ORIENTATION, check_whole, measure_values, upright_size
 from splatnode.capture.image_header import UnusableImage, exif_time
@@ -20,7 +20,16 @@ from splatnode.capture.pose_files import PosesFileError, read_poses
 from splatnode.capture.process.text import guard_untrusted
 from splatnode.extras.cameras import mcap
 from splatnode.extras.lerobot import data_set
-from splatnode.extras.logged.messages import CALIBRATIONS, PICTURES, Calibration, UnusableMessage, lens, rgb
+from splatnode.extras.logged.depth_messages import decode_depth
+from splatnode.extras.logged.messages import (
+    CALIBRATIONS,
+    PICTURES,
+    Calibration,
+    UnusableMessage,
+    is_depth_image,
+    lens,
+    rgb,
+)
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.npz_files import decode_depths, decode_landmarks
 from tests.support.adversary import archives, images, lenses, logs, poses, stored
@@ -43,6 +52,7 @@ _KINDS = {
     "compressed protobuf": PICTURES["foxglove.CompressedImage", "protobuf"],
     "raw protobuf": PICTURES["foxglove.RawImage", "protobuf"],
     "calibration protobuf": CALIBRATIONS["foxglove.CameraCalibration", "protobuf"],
+    "depth cdr": PICTURES["sensor_msgs/msg/CompressedImage", "cdr"],
 }
 
 
@@ -64,9 +74,9 @@ def _read_poses(files: stored.Files, folder: Path) -> object:
 
 
 def _read_exif(tiff: bytes, folder: Path) -> object:
-    tags = exif.read_tags(tiff)
-    told = exif.exif_intrinsics(tags, 4000, 3000), exif.exif_exposure(tags), exif_time(tiff)
-    return told, exif.first(tags, ORIENTATION), exif.camera_identity(tiff)
+    tags = image_header.read_tags(tiff)
+    told = image_header.exif_intrinsics(tags, 4000, 3000), image_header.exif_exposure(tags), exif_time(tiff)
+    return told, image_header.first(tags, ORIENTATION), image_header.camera_identity(tiff)
 
 
 def _read_header(data: bytes, folder: Path) -> object:
@@ -101,6 +111,8 @@ def _read_logged(case: tuple[bytes, bytes], folder: Path) -> object:
         found = _KINDS[kind.decode() if kind.decode("ascii", "replace") in _KINDS else "raw cdr"](data)
         if isinstance(found, Calibration):
             return lens("/front/image_rect", found), lens("/front/image_raw", found)
+        if is_depth_image(found):
+            return make_depth_image(decode_depth(found)).metres
         return rgb(found, _MAX_PIXELS)
 
 
@@ -141,10 +153,15 @@ def _modules(*names: str) -> tuple[str, ...]:
 
 _LENSES = Reader((UnusableLens,), _modules("lens_file"))
 _POSES = Reader((PosesFileError,), _modules("poses_file", "colmap_images"))
-_EXIF = Reader((), _modules("exif", "exif_time"))
+_EXIF = Reader((), _modules("image_header"))
 _HEADERS = Reader((UnusableImage,), _modules("image_header", "jpeg2000", "heif_file"))
-_LOGGED = Reader((UnusableMessage,), ("splatnode.extras.logged.messages",))
-_MCAP = Reader((ValueError,), ("splatnode.extras.cameras.mcap", "splatnode.extras.logged.mcap"))
+_LOGGED = Reader(
+    (UnusableMessage,), tuple(f"splatnode.extras.logged.{name}" for name in ("messages", "depth_messages"))
+)
+_MCAP = Reader(
+    (ValueError,),
+    ("splatnode.extras.cameras.mcap", *(f"splatnode.extras.logged.{name}" for name in ("mcap", "depth_topics"))),
+)
 _DATA_SETS = Reader((data_set.UnusableDataSet,), ("splatnode.extras.lerobot.data_set",))
 _MASKS = Reader((UnusableMask,), _modules("masks"))
 _LANDMARKS = Reader((SceneFileError,), (f"{_RESULT}.landmarks_file", f"{_RESULT}.npz_file"))

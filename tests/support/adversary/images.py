@@ -28,6 +28,12 @@ def sound(suffix: str) -> bytes:
     return cv2.imencode(suffix, pixels)[1].tobytes()
 
 
+@functools.lru_cache(maxsize=1)
+def deep_png() -> bytes:
+    """A whole file of 16 x 12 pixels of 16 bits, as depth has them."""
+    return cv2.imencode(".png", np.arange(192, dtype=np.uint16).reshape(12, 16) * 300)[1].tobytes()
+
+
 @functools.lru_cache(maxsize=8)
 def _zeros(size: int) -> bytes:
     return zlib.compress(bytes(size))

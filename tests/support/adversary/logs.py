@@ -7,6 +7,8 @@ import random
 import struct
 import zlib
 
+import numpy as np
+
 from tests.support.adversary import documents, edges, images
 
 _ENCODINGS = (
@@ -35,7 +37,9 @@ MESSAGES = (
     "compressed protobuf",
     "raw protobuf",
     "calibration protobuf",
+    "depth cdr",
 )
+_DEPTH_FORMATS = ("16UC1; compressedDepth png", "32FC1; compressedDepth png", "16UC1; png compressed ")
 
 
 def logged(rng: random.Random) -> tuple[bytes, bytes]:
@@ -98,6 +102,10 @@ def _cdr(rng: random.Random, what: str) -> bytes:
         to.text("jpeg")
         to.bytes(images.sound(".jpg") if rng.random() < 0.7 else images.image(rng))
         return to.whole()
+    if what == "depth":
+        to.text(rng.choice((*_DEPTH_FORMATS, *_DEPTH_FORMATS, "16UC1; compressedDepth rvl", edges.text(rng))))
+        to.bytes(_packed_depth(rng))
+        return to.whole()
     width, height = _size(rng)
     to.value("I", height)
     to.value("I", width)
@@ -118,6 +126,19 @@ def _cdr(rng: random.Random, what: str) -> bytes:
     for _ in range(6):
         to.value("I", 0 if rng.random() < 0.8 else edges.unsigned(rng, 32))
     return to.whole()
+
+
+def _packed_depth(rng: random.Random) -> bytes:
+    """What ROS' compressedDepth has: a head, and a PNG of 16 bits."""
+    numbers = (100.0, 1.0) if rng.random() < 0.7 else (edges.number(rng), edges.number(rng))
+    head = struct.pack("<i", rng.choice((0, 1, -1))) + b"".join(_single(each) for each in numbers)
+    png = images.deep_png() if rng.random() < 0.7 else images.png(rng)
+    return head[: rng.choice((12, 12, 12, 12, 5))] + png
+
+
+def _single(number: float) -> bytes:
+    """Four bytes; a number that they do not hold becomes infinite."""
+    return np.float32(min(max(number, -3e38), 3e38)).tobytes()
 
 
 def _doubles(rng: random.Random, usual: object) -> list[float]:
@@ -196,18 +217,25 @@ def mcap(rng: random.Random) -> bytes:
 
     kind = rng.choice(MESSAGES)
     what, encoding = kind.split()
-    schema = {"compressed": "CompressedImage", "raw": "RawImage", "calibration": "CameraCalibration"}[what]
+    schema = {"raw": "RawImage", "calibration": "CameraCalibration"}.get(what, "CompressedImage")
     if encoding == "cdr":
         schema = "sensor_msgs/msg/" + {"raw": "Image", "calibration": "CameraInfo"}.get(what, "CompressedImage")
     else:
         schema = f"foxglove.{schema}"
     told = record(3, number(1, "H") + text(schema) + text("ros2msg") + number(0, "I"))
     told += record(4, number(1, "H") + number(1, "H") + text("/front") + text(encoding) + number(0, "I"))
+    has_depth = rng.random() < 0.4
+    if has_depth:
+        packed = text("sensor_msgs/msg/CompressedImage")
+        told += record(3, number(2, "H") + packed + text("ros2msg") + number(0, "I"))
+        told += record(4, number(2, "H") + number(2, "H") + text("/depth") + text("cdr") + number(0, "I"))
     body, places = told, []
     for index in range(rng.choice((0, 1, 2, 3))):
         places.append(len(body))
         times = number(1_700_000_000 * 10**9 + index, "Q") * 2
         body += record(5, number(1, "H") + number(index, "I") + times + message(rng, kind))
+        if has_depth:
+            body += record(5, number(2, "H") + number(index, "I") + times + message(rng, "depth cdr"))
     head = _MAGIC + record(1, text("") + text("adversary"))
     if rng.random() < 0.4:
         return head + body + record(15, number(0, "I")) + _footer(number, 0)
@@ -218,7 +246,8 @@ def mcap(rng: random.Random) -> bytes:
     start, data = len(head), head + record(6, chunk) + record(7, index_record)
     data += record(15, number(0, "I"))
     summary = len(data)
-    offsets = number(10, "I") + number(1, "H") + number(start + 9 + len(chunk), "Q")
+    behind = number(start + 9 + len(chunk), "Q")
+    offsets = number(20, "I") + number(1, "H") + behind + number(2, "H") + behind
     entry = (
         number(0, "Q") * 2 + number(start, "Q") + number(9 + len(chunk), "Q") + offsets + number(len(index_record), "Q")
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import io
 import itertools
 import logging
@@ -441,8 +440,7 @@ def _write(path: Path, plan: Plan, rows: dict[RowKey, WindowRow], asked: Sequenc
 
 # COLMAP's and GLOMAP's answers to windows: a photograph's features and a pair's matches are found once in a scene.
 
-MAPPERS: Mapping[str, colmap.Mapper] = {"colmap": colmap.map_incrementally, "glomap": colmap.map_globally}
-_KIND = "colmap"  # of pieces: those of both mappers
+_KIND = "colmap"  # of pieces: those of all mappers
 
 
 def run_rival_on_window(
@@ -452,7 +450,7 @@ def run_rival_on_window(
 
     `fresh`: measures the seconds from photographs on, too.
     """
-    frames, mapper = load_window_frames(place, window), MAPPERS[method]
+    frames, mapper = load_window_frames(place, window), colmap.MAPPERS[method]
     with TemporaryDirectory(prefix="splatnode-window-") as name:
         folder = Path(name)
         named = colmap.name_images(frames)
@@ -501,7 +499,12 @@ _FOUND = {  # from the bottom of a bar to its top
     WindowOutcome.FAILED: ("#7F7F7F", "no answer"),
 }
 _COUNT_COLOURS = ("#CC79A7", "#0072B2", "#009E73", "#E69F00")
-_NAMES = {"colmap": "COLMAP", "glomap": "GLOMAP"}
+_NAMES = {
+    "colmap": "COLMAP",
+    "colmap-few-views": "COLMAP, options for few views",
+    "glomap": "GLOMAP",
+    "glomap-few-views": "GLOMAP, options for few views",
+}
 _CLAIMS = {"rotation": "rotation, degrees", "centre": "centre, % of the distance to the scene"}
 _LEAST = 1e-3  # degrees or percent: what is smaller is drawn here
 _WRONG_BELOW = (
@@ -637,7 +640,7 @@ if __name__ == "__main__":
 
 def run_windows_verb(args: argparse.Namespace) -> int:
     """Runs the windows, writes windows.json and its charts, and prints the tables."""
-    methods = args.methods or list_default_methods()
+    methods = args.methods or NAMES
     for method in methods:
         find_method(method)
     plan = Plan(
@@ -671,11 +674,6 @@ def print_report(rows: Sequence[WindowRow]) -> None:
         say(why)
 
 
-def list_default_methods() -> tuple[str, ...]:
-    """All methods that can run here."""
-    return NAMES if importlib.util.find_spec("pycolmap") else (OURS,)
-
-
 def format_report(rows: Sequence[WindowRow]) -> list[str]:
     """For people: the windows of each method by angle and by count, then the shares within the 95 % bounds."""
     head = f"{'':>26} {'sets':>5} {'right':>6} {'part':>5} {'between':>8} {'wrong':>6} {'refused':>8} {'no answer':>10}"
@@ -703,9 +701,4 @@ def format_report(rows: Sequence[WindowRow]) -> list[str]:
 
 def _draw_charts(out: Path, rows: Sequence[WindowRow]) -> list[str]:
     """The names of the charts that were drawn to `out`."""
-    try:
-        pass
-    except ImportError:
-        logger.warning("no charts: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
-        return []
     return draw(rows, out)

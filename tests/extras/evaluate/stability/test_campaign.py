@@ -168,5 +168,5 @@ def test_command_line():
     assert (args.scenes, args.rows, args.seeds) == ([Path("a"), Path("b")], (1, 7), 2)
     assert args.methods == ("splatnode", "colmap") and args.cores is None and args.ray is None
     assert isinstance(args, argparse.Namespace)
-    with pytest.raises(ValueError, match="no method 'magic'; there are: splatnode, colmap, glomap"):
+    with pytest.raises(ValueError, match="no method 'magic'; there are: splatnode, colmap, colmap-few-views, glomap"):
         find_method("magic")
