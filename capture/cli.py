@@ -21,7 +21,7 @@ from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_li
 from splatnode.capture.daemon import last_run
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
-from splatnode.capture.messaging import keys as key_files
+from splatnode.capture.messaging import network as key_files
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_changes, parse_config, parse_layers, read_yaml
 from splatnode.capture.process.config_text import ConfigError

@@ -19,10 +19,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import exif, heif_file, image_header
-from splatnode.capture.exif import exif_time
+from splatnode.capture import heif_file, image_header
 from splatnode.capture.frame import ExposureSettings, Intrinsics, Stamp
-from splatnode.capture.image_header import ImageHeader, UnusableImage, read_header
+from splatnode.capture.image_header import ImageHeader, UnusableImage, exif_time, read_header
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.library_lines import catch_library_lines
 from splatnode.capture.process.system import outlast
@@ -178,7 +177,7 @@ def upright_size(data: bytes) -> tuple[int, int] | None:
     if heif_file.is_heif(data) or image_header.is_jpeg2000(data):
         return None
     header = read_header(data)
-    turned = (exif.first(exif.read_tags(header.exif), ORIENTATION) or 1) in ON_ITS_SIDE
+    turned = (image_header.first(image_header.read_tags(header.exif), ORIENTATION) or 1) in ON_ITS_SIDE
     return (header.height, header.width) if turned else (header.width, header.height)
 
 
@@ -250,10 +249,10 @@ def _measure_file(path: Path, max_pixels: int) -> Extent | None:
 
 def _attach_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
     """The image (H, W, 3) RGB with what its EXIF tells, whose bytes begin with a TIFF header."""
-    tags = exif.read_tags(tiff)
-    intrinsics = exif.exif_intrinsics(tags, image.shape[1], image.shape[0])
-    known = exif_time(tiff), exif.exif_exposure(tags)
-    return DecodedImage(image, intrinsics, *known, camera=exif.camera_identity(tiff))
+    tags = image_header.read_tags(tiff)
+    intrinsics = image_header.exif_intrinsics(tags, image.shape[1], image.shape[0])
+    known = exif_time(tiff), image_header.exif_exposure(tags)
+    return DecodedImage(image, intrinsics, *known, camera=image_header.camera_identity(tiff))
 
 
 def _decode(header: ImageHeader, used: ValueRange | None) -> npt.NDArray[np.uint8]:
@@ -276,7 +275,9 @@ def _decode_alpha(header: ImageHeader) -> npt.NDArray[np.bool_] | None:
     mask = alpha == np.iinfo(alpha.dtype).max if header.is_premultiplied else alpha > 0
     if mask.all() or not mask.any():
         return None
-    orientation = 1 if header.turns_itself else int(exif.first(exif.read_tags(header.exif), ORIENTATION) or 1)
+    orientation = (
+        1 if header.turns_itself else int(image_header.first(image_header.read_tags(header.exif), ORIENTATION) or 1)
+    )
     return np.ascontiguousarray(upright(mask, orientation))
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import exif
+from splatnode.capture import image_header
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import (
     ORIENTATION,
@@ -192,5 +192,5 @@ def _orientation(frame: Frame) -> int:
     if frame.encoded is None:
         return 1
     with guard_untrusted(UnusableMask, frame.name):
-        tags = exif.read_tags(read_header(frame.encoded).exif)
-    return int(exif.first(tags, ORIENTATION) or 1)
+        tags = image_header.read_tags(read_header(frame.encoded).exif)
+    return int(image_header.first(tags, ORIENTATION) or 1)

@@ -16,10 +16,9 @@ from typing import TypeAlias
 
 from splatnode.capture import film, recording
 from splatnode.capture.cameras import folder
-from splatnode.capture.exif import exif_time, name_time
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.image_file import UnusableImage, read_image_file
-from splatnode.capture.image_header import read_header
+from splatnode.capture.image_header import exif_time, name_time, read_header
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import LONGEST_NAME, digest_name, guard_untrusted, sanitize_name, sanitize_text
 from splatnode.capture.rig import TOLERANCE_S, FrameSet, Rig, form_frame_sets

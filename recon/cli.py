@@ -1,21 +1,27 @@
-"""The verbs of the command line that reconstruct."""
+"""The verbs of the command line that reconstruct.
+
+What a reconstruction will take is told before it begins, roughly: by what the built-in capture took, with as many
+views.
+"""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from splatnode.capture.keyframe_selection import THINNED
 from splatnode.capture.lens_file import Lenses, read_lenses
 from splatnode.capture.pose_files import Trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
-from splatnode.recon import cost
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
-from splatnode.recon.mapping.command import replay_map
+from splatnode.recon.mapping import replay_map
 from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
@@ -23,11 +29,45 @@ from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruc
 from splatnode.recon.replay_source import Request, Source, add_depth_folder, add_poses, load_source, parse_sources
 from splatnode.recon.result.export.result import LIVE_PICTURE
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.report import bound_result_bytes
+from splatnode.recon.result.report import bound_result_bytes, print_summary
 from splatnode.recon.result.submap_index import FILE, is_map_set
-from splatnode.recon.result.summary import print_summary
 from splatnode.recon.rig_choice import apply_rig
 from splatnode.recon.viewer_process import Show, viewer
+
+FEW = 12  # photographs: of so many, the end is near before an estimate is read
+# Views, seconds and 10^6 bytes of the largest memory; two cores, preset balanced (tests/bench/results/growth.json).
+MEASURED = ((3, 17.5, 481), (6, 23.2, 543), (12, 33.0, 629), (24, 55.9, 775), (48, 103.0, 1212))
+_BYTES_A_PIXEL = 3  # of each photograph, which stays in memory as it was read
+_SECONDS_RANGE = 0.5, 3.0  # times as long: more cores and a preset that does less, or a slow machine with other work
+_MEMORY_RANGE = 0.9, 1.6
+
+
+def format_cost(sizes: Sequence[tuple[int, int]]) -> str | None:
+    """One line about the photographs with these widths and heights; None for so few that nobody needs to know."""
+    if len(sizes) <= FEW:
+        return None
+    views, seconds, megabytes = np.array(MEASURED).T
+    count, pixels = len(sizes), sum(width * height for width, height in sizes)
+    took_s, took_mb = (
+        _interpolate(count, views, seconds),
+        _interpolate(count, views, megabytes) + _BYTES_A_PIXEL * pixels / 1e6,
+    )
+    shortest, longest = (took_s * times for times in _SECONDS_RANGE)
+    least, most = (took_mb * times / 1000 for times in _MEMORY_RANGE)
+    time = (
+        f"{shortest:.0f} to {longest:.0f} s" if longest < 120 else f"{shortest / 60:.1f} to {longest / 60:.0f} minutes"
+    )
+    memory = f"{least:.1f} to {most:.1f} GB of memory"
+    return f"{count} photographs, {pixels / 1e6:.0f} megapixels in all: about {time}, {memory}"
+
+
+def _interpolate(count: int, views: np.ndarray, measured: np.ndarray) -> float:
+    """Between the measured counts; beyond the last one it goes on as between the last two."""
+    if count <= views[-1]:
+        return float(np.interp(count, views, measured))
+    slope = (measured[-1] - measured[-2]) / (views[-1] - views[-2])
+    return float(measured[-1] + slope * (count - views[-1]))
+
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
@@ -58,7 +98,7 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
         tell(str(given.choice))
         if given.choice.left_out.get(THINNED):
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
-    if not args.json and (taken := cost.format_cost(given.sizes)) is not None:
+    if not args.json and (taken := format_cost(given.sizes)) is not None:
         say(taken, error=True)
     given, config = apply_rig(given, config, args.rig, tell)
     given = given if args.depths is None else add_depth_folder(given, args.depths)

@@ -19,8 +19,7 @@ from splatnode.recon.estimation import Reconstruction, ReconstructionSummary
 from splatnode.recon.frames import screening
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.optimize import training
-from splatnode.recon.optimize.monitor import examine, start_watch
-from splatnode.recon.optimize.training import single_torch_thread
+from splatnode.recon.optimize.training import examine, single_torch_thread, start_watch
 from splatnode.recon.priors.pointmap import Pointmap, compute_consistent_depths
 from splatnode.recon.rasterize.dispatch import choose_device
 from splatnode.recon.registration.undistortion import undistort_keyframes

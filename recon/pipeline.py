@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.lenses.undistort import is_resampled
+from splatnode.capture.lenses import is_resampled
 from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_text
@@ -26,7 +26,7 @@ from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, ReconstructionSummary, estimate_cameras, estimate_depth
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects

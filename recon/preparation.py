@@ -9,7 +9,7 @@ from dataclasses import replace
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, resize_image

@@ -1,4 +1,4 @@
-"""`splatnode replay` on the command line: its arguments, and what runs it.
+"""`splatnode replay` on the command line: its arguments, which other verbs of reconstruction share, and what runs it.
 
 A flag that is not given is None, so that the configuration file, then the preset, decides.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 from splatnode.capture.process.arguments import (
     Verb,
     add_json,
+    angle,
     import_lazily,
     megabytes,
     names,
@@ -20,7 +21,34 @@ from splatnode.capture.process.arguments import (
     seconds,
 )
 from splatnode.recon.metric.arguments import add_baseline, add_frame, add_marker, add_poses, add_stereo
-from splatnode.recon.shared_arguments import add_device, add_multi_view_only
+
+
+def add_device(parser: argparse.ArgumentParser) -> argparse.Action:
+    return parser.add_argument(
+        "--device",
+        choices=("cpu", "cuda", "auto"),
+        help="where Gaussians are refined (default: cpu; auto: a GPU where one can be used)",
+    )
+
+
+def add_multi_view_only(parser: argparse.ArgumentParser) -> argparse.Action:
+    return parser.add_argument(
+        "--multi-view-only",
+        action="store_true",
+        help="leave out what no two photographs confirm, and the far background: holes in place of guesses",
+    )
+
+
+def add_lens(parser: argparse.ArgumentParser) -> None:
+    """Adds the lens of the images that are looked at, as a file or as an angle."""
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="their lens: YAML with width, height, fx, ..., COLMAP's cameras.txt, or Kalibr's camchain",
+    )
+    lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

@@ -21,8 +21,7 @@ from splatnode.capture.process.arguments import (
     positive,
 )
 from splatnode.recon.metric.arguments import add_frame, add_marker
-from splatnode.recon.replay_verb import REPLAY
-from splatnode.recon.shared_arguments import add_lens, add_multi_view_only
+from splatnode.recon.replay_verb import REPLAY, add_lens, add_multi_view_only
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
 
@@ -171,7 +170,7 @@ VERBS = (
         "weights",
         "get and check the weights of optional networks",
         _weights_arguments,
-        import_lazily("splatnode.recon.networks.weights_command", "command"),
+        import_lazily("splatnode.recon.networks.weights", "command"),
     ),
     Verb(
         "doctor",

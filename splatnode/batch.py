@@ -52,8 +52,8 @@ def reconstruct_dataset(
     from splatnode.extras.batch import remote
     from splatnode.extras.batch.command import replay
     from splatnode.extras.batch.remote import Job
+    from splatnode.extras.jobs.calls import own_version
     from splatnode.extras.jobs.child import Limits
-    from splatnode.extras.jobs.version import own_version
 
     where = str(results) if "://" in str(results) else str(Path(results).resolve())
     job = Job(partial(replay, tuple(options)), where, Limits(max_memory_mb, timeout_s), own_version())

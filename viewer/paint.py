@@ -1,10 +1,12 @@
 """The picture of a moment, drawn on the processor: Gaussians by the project's own rasteriser, the rest over them.
 
 It needs neither a display nor a graphics driver, and it is what the viewer shows where those are missing.
+While the person drags, a picture is as fine as keeps up with the hand.
 """
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
@@ -281,3 +283,24 @@ def add_caption(image: Image, lines: Sequence[str]) -> Image:
         origin = (8, step * (row + 1) - 2)
         cv2.putText(band, line, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (225, 225, 225), 1, cv2.LINE_AA)
     return np.vstack([image, band])
+
+
+# How coarse a picture is painted while the person drags.
+
+SLOWEST_S = (
+    0.05  # a picture while dragging may take: twice that, with what else a window does, are 10 pictures a second
+)
+_COARSEST = 4
+
+
+def choose_first_divisor(seconds: float) -> int:
+    """Returns the divisor of width and height with which a picture of `seconds` in full takes SLOWEST_S at most."""
+    return min(max(math.ceil(math.sqrt(seconds / SLOWEST_S) - 0.1), 1), _COARSEST)
+
+
+def choose_next_divisor(part: int, seconds: float) -> int:
+    """The divisor after a picture with this one took `seconds`: coarser where it was late, finer where time is left."""
+    if seconds > SLOWEST_S:
+        return min(part + 1, _COARSEST)
+    finer = max(part - 1, 1)
+    return finer if seconds * (part / finer) ** 2 < 0.8 * SLOWEST_S else part

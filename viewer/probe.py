@@ -1,4 +1,4 @@
-"""Whether a window can be opened here, found out in a child process.
+"""Whether a window can be opened here, found out in a child process, which opens a small one and says so.
 
 Open3D ends the whole process, without an exception, where it finds no Vulkan driver, and opens a window that nobody can
 see where it finds no display. So a child tries first, and what becomes of it is the answer.
@@ -7,6 +7,7 @@ see where it finds no display. So a child tries first, and what becomes of it is
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import subprocess
 from collections.abc import Sequence
@@ -31,8 +32,8 @@ class Probe:
 
 
 def probe_window(command: Sequence[str] | None = None, timeout_s: float = TIMEOUT_S) -> Probe:
-    """Tries to open a window in a child process: `command`; None: `window_trial`. It never raises for what it finds."""
-    trial = command or python.command("splatnode.viewer.window_trial")
+    """Tries to open a window in a child process: `command`, or else this module. It never raises for what it finds."""
+    trial = command or python.command("splatnode.viewer.probe")
     try:
         child = subprocess.run(trial, capture_output=True, text=True, errors="replace", timeout=timeout_s)
     except subprocess.TimeoutExpired:
@@ -69,3 +70,23 @@ def _reason(output: str, code: int) -> str:
 def _last_line(output: str) -> str:
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     return lines[-1][:200] if lines else "it said nothing"
+
+
+def open_trial_window() -> None:
+    """Ends this process."""
+    from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
+
+    app = gui.Application.instance
+    app.initialize()
+    window = app.create_window("splatnode", 64, 64)
+    widget = gui.SceneWidget()
+    widget.scene = rendering.Open3DScene(window.renderer)
+    window.add_child(widget)
+    for _ in range(3):
+        app.run_one_tick()
+    print("splatnode-window-opened", flush=True)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    open_trial_window()

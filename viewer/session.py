@@ -9,8 +9,7 @@ import numpy as np
 
 from splatnode.recon.result.export.prepare import Selection
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.viewer.analysis import Analysis, Analyst
-from splatnode.viewer.colours import Support, colour_gaussians
+from splatnode.viewer.analysis import Analysis, Analyst, Support, colour_gaussians
 from splatnode.viewer.editing import (
     EditError,
     Edits,

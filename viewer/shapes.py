@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Scale
-from splatnode.viewer.analysis import Advice
-from splatnode.viewer.colours import camera_colours
+from splatnode.viewer.analysis import Advice, camera_colours
 from splatnode.viewer.state import Graph, Moment, ViewerState, edge_lines, node_marks
 from splatnode.viewer.viewpoint import Canvas, Viewpoint, look_at, scene_depth, scene_pivot, scene_spread, scene_up
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from splatnode.capture import heif_file, recording
-from splatnode.capture.exif import name_time
 from splatnode.capture.frame import (
     LONGEST_M,
     SIGMA_M,
@@ -38,7 +37,7 @@ from splatnode.capture.image_file import (
     find_common_range,
     read_image_file,
 )
-from splatnode.capture.image_header import image_kind
+from splatnode.capture.image_header import image_kind, name_time
 from splatnode.capture.lens_file import same_aspect
 from splatnode.capture.masks import Mask, apply_mask
 from splatnode.capture.odometry import LARGEST_M, make_given_pose

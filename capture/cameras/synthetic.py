@@ -16,9 +16,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.render import Camera, Matrix, Solid, cast, cast_through, look_at
+from splatnode.capture.diorama.scene import Camera, Matrix, Solid, cast, cast_through, look_at, odometry, place
 from splatnode.capture.diorama.scene import Config as Odometry
-from splatnode.capture.diorama.scene import odometry, place
 from splatnode.capture.frame import Baseline, Clock, Frame, Intrinsics, RightImage, Stamp, grey
 from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.pace import FramesPerSecond

@@ -11,7 +11,6 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.cameras.folder import apply_alpha_mask, explain_unreadable_file, frame_name, image_paths
-from splatnode.capture.exif import name_time
 from splatnode.capture.frame import (
     CameraUnavailable,
     Clock,
@@ -36,6 +35,7 @@ from splatnode.capture.image_file import (
     measure_values,
     read_image_file,
 )
+from splatnode.capture.image_header import name_time
 from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
 from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers
 from splatnode.capture.process.config_keys import Internal

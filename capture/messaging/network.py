@@ -3,10 +3,22 @@
 ZeroMQ behaves as follows (measured), hence this file. A second bind on an ipc path succeeds and takes it over: a lock
 prevents it. A send without a receiver blocks for ever: no send waits. A pending message keeps a process from ending:
 LINGER is 0. The answer to a heartbeat cannot overtake a part that is on its way: what takes longer than their time-out
-would never arrive, so that there are none, and the kernel notices a dead link. A plain tcp socket gives the application
-raw bytes from anybody: there is no tcp without CURVE. It accepts connections without end: a gate bounds those that
-have no key. The number of parts of a message is not bounded: a peer that is
-let in could fill the memory, which the services' MemoryMax limits.
+would never arrive, so that there are none, and the kernel notices a dead link. A plain tcp socket gives the
+application raw bytes from anybody: there is no tcp without CURVE. It accepts connections without end: a gate bounds
+those that have no key. The number of parts of a message is not bounded: a peer that is let in could fill the memory,
+which the services' MemoryMax limits.
+
+Keys lie in a folder: `secret.key` (0600) and `public.key` of this machine, `allowed/NAME.key` with the public keys of
+other machines that may connect here, and, where this machine connects to another one, that one's public key as
+`server.key`. Processes on one machine share the folder; its own key is always let in. A key is 40 characters of Z85
+text.
+
+The gate: libzmq tells of each connection that it accepts, and closes it five seconds later where its handshake has not
+come to its end. Meanwhile a stranger can open any number, each with one of our descriptors. So many may be in their
+handshake here; for each further one the oldest is shut, of the address that has the most. Who has a key is let in
+within a few round trips, is no more among those, and shares the places with nobody of another address. Which of them
+are let in, libzmq does not tell; the kernel does, by the bytes that it has sent over a connection: READY, which a
+server says to a key that it knows, is beyond what it says to anybody (ZeroMQ RFC 23 and 26).
 """
 
 from __future__ import annotations
@@ -17,29 +29,281 @@ import logging
 import math
 import os
 import re
+import socket
+import struct
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from splatnode.capture.messaging import wire
-from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
-from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
+from splatnode.capture.process.crowd import network_of, next_to_go
 from splatnode.capture.process.files import (
     LockHeld,
     NotOwnerOnly,
+    StrayFile,
+    check_owner_only,
     default_runtime_directory,
     exclusive,
     make_owner_only_folder,
+    read_own,
+    remove_leftovers,
+    write_atomically,
 )
 from splatnode.capture.process.logs import is_logged
-from splatnode.capture.process.system import make_sure_of_room, raise_file_limit
-from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.process.system import make_sure_of_room, outlast, raise_file_limit
+from splatnode.capture.process.text import guard_untrusted, sanitize_text
+
+log = logging.getLogger(__name__)
+
+PLACES = 32  # of a socket, for connections in their handshake
+OVERSHOOT = 128  # of a process: connections that libzmq may accept before the gate has seen the first of them
+_EVENTS = zmq.EVENT_ACCEPTED | zmq.EVENT_ACCEPT_FAILED | zmq.EVENT_DISCONNECTED | zmq.EVENT_MONITOR_STOPPED
+_SAID_TO_ANYBODY = 64 + 170 + 14  # bytes: greeting, WELCOME, ERROR 400
+_INFO_BYTES, _ACKED = 256, struct.Struct("120xQ")  # tcp_info of linux/tcp.h, with tcpi_bytes_acked, since Linux 4.1
+_CLOSE_S = 5.0
+
+
+class _Peer(NamedTuple):
+    network: str
+    port: int
+
+
+class Gate:
+    """Watches a bound TCP socket in a thread of its own, which needs no descriptor and no memory to speak of."""
+
+    def __init__(self, bound: zmq.Socket, places: int = PLACES) -> None:
+        self.shut = 0  # connections
+        self._socket, self._places = bound, places
+        self._monitor = bound.get_monitor_socket(_EVENTS)
+        self._young: dict[int, _Peer] = {}  # by descriptor, the oldest first; some of them are let in already
+        self._thread = threading.Thread(target=self._watch, name="gate", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """To be called while the socket is open."""
+        self._socket.disable_monitor()
+        self._thread.join(_CLOSE_S)
+
+    def _watch(self) -> None:
+        with self._monitor:
+            while (event := recv_monitor_message(self._monitor))["event"] != zmq.EVENT_MONITOR_STOPPED:
+                self._note(event["event"], event["value"])
+
+    def _note(self, event: int, descriptor: int) -> None:
+        if event == zmq.EVENT_ACCEPT_FAILED:  # no descriptor is free
+            self._keep(self._places // 2)
+            return
+        self._young.pop(descriptor, None)
+        if event == zmq.EVENT_ACCEPTED:
+            peer = _peer(descriptor)
+            if peer is not None:
+                self._young[descriptor] = peer
+            self._keep(self._places)
+
+    def _keep(self, most: int) -> None:
+        """Lets at most so many be in their handshake."""
+        if len(self._young) <= most:
+            return
+        for descriptor in [each for each in self._young if _is_let_in(each)]:
+            del self._young[descriptor]
+        while len(self._young) > most:
+            self._shut(next_to_go({each: peer.network for each, peer in self._young.items()}))
+
+    def _shut(self, descriptor: int) -> None:
+        """Leaves alone what is no connection of this peer any more; libzmq closes the others."""
+        peer = self._young.pop(descriptor)
+        if _peer(descriptor) != peer:
+            return
+        with _lent(descriptor) as connection, contextlib.suppress(OSError):
+            connection.shutdown(socket.SHUT_RDWR)
+        self.shut += 1
+        if is_logged(self.shut):
+            log.warning("too many connections without a key: shut one of %s (%d so far)", peer.network, self.shut)
+
+
+@contextlib.contextmanager
+def _lent(descriptor: int) -> Iterator[socket.socket]:
+    """A socket of libzmq's, as one of Python's that does not close it."""
+    connection = socket.socket(socket.AF_INET, socket.SOCK_STREAM, 0, descriptor)
+    try:
+        yield connection
+    finally:
+        connection.detach()
+
+
+def _peer(descriptor: int) -> _Peer | None:
+    """Who is connected; None where the connection has ended meanwhile."""
+    try:
+        with _lent(descriptor) as connection:
+            host, port = connection.getpeername()[:2]
+            return _Peer(network_of(host), port)
+    except (OSError, ValueError):
+        return None
+
+
+def _is_let_in(descriptor: int) -> bool:
+    try:
+        with _lent(descriptor) as connection:
+            told = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+    except OSError:
+        return False
+    return len(told) >= _ACKED.size and _ACKED.unpack_from(told)[0] > _SAID_TO_ANYBODY
+
+
+SECRET, PUBLIC, SERVER, ALLOWED = "secret.key", "public.key", "server.key", "allowed"
+_KEY_BYTES = 40
+_LARGEST = 1000  # bytes of a key's file
+_READ_S = 1.0  # that a handshake waits where a key's file cannot be opened
+_MOST_SAID = 100  # refused keys and connections
+_Z85 = re.compile(rb"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
+
+
+class KeyFileError(PermissionError):
+    """The keys cannot be used; the text names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Keys:
+    public: bytes
+    secret: bytes
+    server: bytes  # of the machine whose services are connected to
+
+
+def create_keys(folder: Path) -> bytes:
+    """A new pair in `folder`, whose public key is returned; a secret key that was cut short is replaced, and said.
+
+    Raises KeyFileError where there is a secret key already, NotPrivate where others could change what is there.
+    """
+    _make(folder)
+    if _is_cut(folder / SECRET):
+        log.warning("the secret key in %s was cut short: this is a new pair, whose public key others need", folder)
+    elif os.path.lexists(folder / SECRET):
+        raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys")
+    public, secret = _key_pair()
+    _write_key(folder / PUBLIC, public)
+    _write_key(folder / SECRET, secret)  # last: where it is, the pair is
+    return public
+
+
+def allow(folder: Path, name: str, public: bytes) -> None:
+    """Lets the machine `name` connect, at once: the list is read at each handshake. Raises ValueError, NotPrivate."""
+    if not re.fullmatch(r"[\w.-]{1,64}", name) or name.startswith("."):
+        raise ValueError(f"a machine's name has letters, digits, - and _, got {name!r}")
+    _make(folder)
+    _write_key(folder / ALLOWED / f"{name}.key", check_key(public, name))
+
+
+def expect_server(folder: Path, public: bytes) -> None:
+    """Connects to services of the machine with this key, and to no other."""
+    check_owner_only(folder)
+    _write_key(folder / SERVER, check_key(public, SERVER))
+
+
+def read_keys(folder: Path) -> Keys:
+    """Raises KeyFileError where a key is missing, damaged, or others could read the secret or change any of them."""
+    try:
+        secret = _read_key(folder / SECRET)
+        check_owner_only(folder)
+        if (folder / SECRET).lstat().st_mode & 0o077:
+            raise KeyFileError(f"{folder / SECRET} can be read by other users. Run: chmod 600 {folder / SECRET}")
+        with guard_untrusted(KeyFileError, folder / SECRET):
+            public = zmq.curve_public(secret)
+        server = _read_key(folder / SERVER) if os.path.lexists(folder / SERVER) else public
+    except NotOwnerOnly as error:
+        raise KeyFileError(str(error)) from error
+    return Keys(public, secret, server)
+
+
+def check_key(text: bytes, where: object) -> bytes:
+    """The key in `text`. Raises KeyFileError, which names `where` it came from."""
+    key = text.strip()
+    if not _Z85.fullmatch(key):
+        raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keygen")
+    return key
+
+
+def _key_pair() -> tuple[bytes, bytes]:
+    """Public and secret. A command line takes a word with a leading `-` for an option: no public key has one."""
+    while True:
+        public, secret = zmq.curve_keypair()
+        if not public.startswith(b"-"):
+            return public, secret
+
+
+def _make(folder: Path) -> None:
+    """The folder, and that of the allowed keys. Raises NotPrivate, OSError."""
+    for each in (folder, folder / ALLOWED):
+        each.mkdir(mode=0o700, parents=True, exist_ok=True)
+        check_owner_only(each)
+
+
+def _is_cut(path: Path) -> bool:
+    """True if the file has less than a key, as a full disk or a power cut may have left it."""
+    try:
+        return len(read_own(path, _LARGEST).strip()) < _KEY_BYTES
+    except (FileNotFoundError, StrayFile):
+        return False
+
+
+def _write_key(path: Path, key: bytes) -> None:
+    remove_leftovers(path.parent)
+    write_atomically(path, [key + b"\n"])
+
+
+def _read_key(path: Path) -> bytes:
+    """Raises KeyFileError, and NotPrivate where others could change it."""
+    try:
+        return check_key(read_own(path, _LARGEST, only_ours=True), path)
+    except FileNotFoundError as error:
+        raise KeyFileError(f"no key {path}. Run: splatnode keygen {path.parent}") from error
+    except StrayFile as error:
+        raise KeyFileError(str(error)) from error
+
+
+class AllowList:
+    """Tells at each handshake whether a key may connect; the interface is that of pyzmq's credentials provider."""
+
+    def __init__(self, folder: Path, own: bytes) -> None:
+        self.folder = folder
+        self.own = own
+        self._said: set[str] = set()
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        try:
+            allowed = key == self.own or key in outlast(self._list_keys, "whom to let in", _READ_S)
+        except OSError as error:
+            self._say(logging.ERROR, f"cannot read whom to let in, so nobody is: {error}")
+            return False
+        if not allowed:
+            self._say(logging.WARNING, f"refused a connection: key {key.decode('ascii', 'replace')} is not allowed")
+        return allowed
+
+    def _list_keys(self) -> set[bytes]:
+        """The keys that only this user can have put there; the others are said. Raises NotPrivate, OSError."""
+        for each in (self.folder.parent, self.folder):
+            check_owner_only(each)
+        found = set()
+        for path in sorted(self.folder / name for name in os.listdir(self.folder) if name.endswith(".key")):
+            try:
+                found.add(_read_key(path))
+            except (KeyFileError, NotOwnerOnly) as error:
+                self._say(logging.ERROR, f"a key is not accepted: {error}")
+        return found
+
+    def _say(self, level: int, text: str) -> None:
+        """Once: a stranger who tries again and again does not fill the journal."""
+        if text not in self._said and len(self._said) < _MOST_SAID:
+            self._said.add(text)
+            more = "; nothing further is said of connections" if len(self._said) == _MOST_SAID else ""
+            log.log(level, "%s%s (allowed are those in %s)", text, more, self.folder)
+
 
 # The table of services: every message between the processes belongs to one of them.
 
@@ -83,7 +347,6 @@ CAMERA_ID = "[A-Za-z0-9_-]{1,32}"  # a regular expression
 CaptureId = Annotated[str, msgspec.Meta(pattern=rf"^(?:{CAMERA_ID})?\Z", max_length=32)]
 _CAPTURE = re.compile(rf"capture\.keyframes(?:@({CAMERA_ID}))?")
 
-log = logging.getLogger(__name__)
 
 REQUEST_BYTES = 64 << 10  # no request, acknowledgement or subscription is larger
 REQUEST_LIMITS = wire.Limits(header_bytes=REQUEST_BYTES, arrays=0, total_bytes=2 * REQUEST_BYTES)

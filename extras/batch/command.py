@@ -39,12 +39,10 @@ from splatnode.extras.batch.batch import (
     run_all,
 )
 from splatnode.extras.batch.remote import Job
-from splatnode.extras.batch.report import CSV, PAGE, PARQUET, write_csv, write_page, write_parquet
-from splatnode.extras.batch.verb import replay_options
-from splatnode.extras.batch.write_back import write_back
+from splatnode.extras.batch.report import CSV, PAGE, PARQUET, write_back, write_csv, write_page, write_parquet
+from splatnode.extras.jobs.calls import chosen_cores, own_version
 from splatnode.extras.jobs.child import Limits
-from splatnode.extras.jobs.cores import chosen_cores
-from splatnode.extras.jobs.version import own_version
+from splatnode.extras.verbs import replay_options
 from splatnode.recon.result.folder import hold_result_folder
 
 Run = Callable[[Sequence[BatchRecording]], Iterator[Outcome]]  # the outcomes as they come

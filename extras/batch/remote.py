@@ -28,9 +28,8 @@ from splatnode.extras.batch.batch import (
     partial_folder,
     partial_log,
 )
+from splatnode.extras.jobs.calls import free_core, other_version
 from splatnode.extras.jobs.child import NOT_RUN, Child, Limits, wait_for_end
-from splatnode.extras.jobs.cores import free_core
-from splatnode.extras.jobs.version import other_version
 
 _OF_STORE = "://"  # in the address of an object store
 

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.diorama import textures
-from splatnode.capture.diorama.render import Light, Solid, apply_irradiance, gather_irradiance, grid
 from splatnode.capture.diorama.scene import (
     CREAM,
     INK,
@@ -24,9 +23,14 @@ from splatnode.capture.diorama.scene import (
     PLUS_Y,
     PLUS_Z,
     Builder,
+    Light,
     Palette,
+    Solid,
     Vector,
+    apply_irradiance,
     cartons,
+    gather_irradiance,
+    grid,
     only,
     plant,
     scale_colour,

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.render import Camera, Matrix, Solid, colour_pixels, look_at, trace
+from splatnode.capture.diorama.scene import Camera, Matrix, Solid, colour_pixels, look_at, trace
 from splatnode.extras.building.building import (
     CHAIR_ROOM,
     CORRIDOR,

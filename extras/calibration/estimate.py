@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture import lenses
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses import lens as lenses
 from splatnode.extras.calibration.board import LEAST_CORNERS, Board, BoardView
 
 # Pixels of points, and how they change with the point and with the numbers of the lens.

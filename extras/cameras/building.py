@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.render import Camera
+from splatnode.capture.diorama.scene import Camera
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
 from splatnode.capture.process.config_keys import Internal

@@ -16,8 +16,13 @@ from torch import Tensor
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.extras.evaluate import methods
-from splatnode.extras.evaluate.dataset import Split, load_scene
-from splatnode.extras.evaluate.demo import compute_max_capture_bytes, write_held_out_images, write_training_images
+from splatnode.extras.evaluate.dataset import (
+    Split,
+    compute_max_capture_bytes,
+    load_scene,
+    write_held_out_images,
+    write_training_images,
+)
 from splatnode.extras.evaluate.protocol import (
     INTERPOLATED_START,
     PerceptualNetworks,
@@ -35,9 +40,8 @@ from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
 from splatnode.recon.result.folder import hold_result_folder
-from splatnode.recon.result.report import bound_result_bytes, write_result_folder
+from splatnode.recon.result.report import bound_result_bytes, print_summary, write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.summary import print_summary
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 # Of the search for a held-out view's pose, half of them at half the resolution: 33.0 dB in the mean, as 100 at full.

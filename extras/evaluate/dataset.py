@@ -1,28 +1,142 @@
-"""Scenes with known cameras, as they lie on disk. What is read here must never reach a reconstruction."""
+"""Scenes with known cameras, as they lie on disk. What is read here must never reach a reconstruction.
+
+COLMAP's sparse model, text or binary, gives the cameras of its photographs; points are not read. It is read here and
+not by pycolmap, which takes memory for every count that a file states. The built-in capture is written in the same
+layout.
+"""
 
 from __future__ import annotations
 
 import os
+import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.cameras import synthetic
 from splatnode.capture.cameras.folder import frame_name, image_paths
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_any_image, read_image_file, upright_size
+from splatnode.capture.image_file import (
+    SUFFIXES,
+    UnusableImage,
+    decode_any_image,
+    encode_png,
+    read_image_file,
+    upright_size,
+)
 from splatnode.capture.masks import mask_frames, open_masks
+from splatnode.capture.pose_files import binary_images, content_lines, text_images
+from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import LONGEST_TEXT, guard_untrusted, sanitize_text
-from splatnode.extras.evaluate.colmap_model import EvaluationFileError, read_json, read_model
 from splatnode.recon.result.export import read_cameras
-from splatnode.recon.result.export.cameras import Number, Row3, Row4
+from splatnode.recon.result.export.cameras import Number, Row3, Row4, encode_cameras
 from splatnode.recon.result.export.quaternions import matrices_from_quats
-from splatnode.recon.result.snapshot import find_camera_problem
+from splatnode.recon.result.export.staged import write_files
+from splatnode.recon.result.snapshot import CameraEstimate, find_camera_problem
+from splatnode.recon.threads import map_parallel
+
+# JSON files of evaluations: true cameras, splits, raw results.
+
+T = TypeVar("T")
+
+MAX_BYTES = 500_000_000
+
+
+class EvaluationFileError(ValueError):
+    """A file of an evaluation that is not what it should be; the message names it."""
+
+
+def read_json(path: Path, kind: type[T], expected: str) -> T:
+    """The content of `path`, which must be `expected`, as a `kind`; numbers are finite.
+
+    Raises EvaluationFileError, OSError.
+    """
+    with guard_untrusted(EvaluationFileError, str(path)):
+        try:
+            return record_in(read_bounded(path, MAX_BYTES, EvaluationFileError, str(path)), kind)
+        except msgspec.MsgspecError as error:
+            raise EvaluationFileError(f"{path} must be {expected}: {error}") from error
+
+
+_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # parameters of each
+_NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE"}
+
+
+@dataclass(frozen=True)
+class ColmapCamera:
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    name: str
+    quat: tuple[float, float, float, float]  # wxyz, of T_camera_world
+    translation: tuple[float, float, float]
+    camera: ColmapCamera
+
+
+def read_model(folder: Path) -> list[ColmapImage]:
+    """The photographs of the model in `folder`.
+
+    Raises EvaluationFileError where it is none, or is of distorted photographs; OSError.
+    """
+    suffix = "bin" if (folder / "cameras.bin").exists() else "txt"
+    cameras_file, images_file = _read_content(folder / f"cameras.{suffix}"), _read_content(folder / f"images.{suffix}")
+    with guard_untrusted(EvaluationFileError, str(folder)):
+        try:
+            cameras = dict(
+                _parse_binary_cameras(cameras_file) if suffix == "bin" else _parse_text_cameras(cameras_file.decode())
+            )
+            images = binary_images(images_file) if suffix == "bin" else text_images(images_file.decode())
+            return [
+                ColmapImage(name, (w, x, y, z), (tx, ty, tz), cameras[camera_id])
+                for name, (w, x, y, z, tx, ty, tz), camera_id in images
+            ]
+        except KeyError as error:
+            raise EvaluationFileError(f"{folder}: a photograph has the camera {error}, which is not there") from error
+        except (ValueError, struct.error) as error:
+            raise EvaluationFileError(f"{folder} must be a COLMAP model of undistorted photographs: {error}") from error
+
+
+def _read_content(path: Path) -> bytes:
+    return read_bounded(path, MAX_BYTES, EvaluationFileError, str(path))
+
+
+def _make_camera(model: str, width: int, height: int, lens: tuple[float, ...]) -> ColmapCamera:
+    if model not in _PINHOLES or len(lens) != _PINHOLES[model]:
+        raise ValueError(f"a camera is {sanitize_text(model, 100)} with {len(lens)} parameters, not PINHOLE with 4")
+    fx, fy, cx, cy = lens if len(lens) == 4 else (lens[0], *lens)
+    return ColmapCamera(width, height, fx, fy, cx, cy)
+
+
+def _parse_text_cameras(text: str) -> Iterator[tuple[int, ColmapCamera]]:
+    for line in content_lines(text):
+        if line.strip():
+            number, model, width, height, *lens = line.split()
+            yield int(number), _make_camera(model, int(width), int(height), tuple(map(float, lens)))
+
+
+def _parse_binary_cameras(data: bytes) -> Iterator[tuple[int, ColmapCamera]]:
+    (count,), position = struct.unpack_from("<Q", data), 8
+    for _ in range(count):  # ends at the latest where the bytes do
+        number, model, width, height = struct.unpack_from("<IiQQ", data, position)
+        size = _PINHOLES.get(_NUMBERS.get(model, ""), 0)
+        lens = struct.unpack_from(f"<{size}d", data, position + 24)
+        yield number, _make_camera(_NUMBERS.get(model, f"of model {model}"), width, height, lens)
+        position += 24 + 8 * size
+
 
 # True cameras from the files in which data sets have them: cameras.json, transforms.json, COLMAP's models.
 
@@ -367,3 +481,55 @@ def make_paper_split(names: Sequence[str], views: int) -> Split:
 
 def _space_evenly(first: int, last: int, count: int) -> list[int]:
     return np.linspace(first, last, count).astype(int).tolist()
+
+
+def write_capture(folder: Path, place: synthetic.Config) -> Split:
+    """Writes the photographs, those held out for testing, and the true cameras of both; returns their names.
+
+    The cameras are for evaluation: reconstruction reads the photographs in `folder`/images and nothing else.
+    """
+    split = write_training_images(folder, place)
+    write_held_out_images(folder, place)
+    return split
+
+
+def write_training_images(folder: Path, place: synthetic.Config) -> Split:
+    """Writes the photographs that are reconstructed; returns the names of all."""
+    training = _list_training_cameras(place)
+    _write_images(folder, place, training, first=0)
+    return Split(tuple(training), tuple(_list_test_cameras(place)))
+
+
+def write_held_out_images(folder: Path, place: synthetic.Config) -> None:
+    """Writes the photographs held out for testing, and the true cameras of all."""
+    training, testing = _list_training_cameras(place), _list_test_cameras(place)
+    _write_images(folder, place, testing, first=len(training))
+    cameras = [
+        CameraEstimate(name, number, T_world_camera, K, place.width, place.height)
+        for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items())
+    ]
+    write_files(folder, {"cameras.json": encode_cameras(cameras)})
+
+
+def _list_training_cameras(place: synthetic.Config) -> dict[str, synthetic.Camera]:
+    return {synthetic.frame_name(i): camera for i, camera in enumerate(synthetic.scene_cameras(place))}
+
+
+def _list_test_cameras(place: synthetic.Config) -> dict[str, synthetic.Camera]:
+    return {f"test_{i:03d}.png": camera for i, camera in enumerate(synthetic.evaluation_cameras(place))}
+
+
+def _write_images(folder: Path, place: synthetic.Config, cameras: Mapping[str, synthetic.Camera], first: int) -> None:
+    """Photographs by name, rendered side by side; `first` is the number of the first one's noise."""
+
+    def render_png(camera: synthetic.Camera, number: int) -> bytes:
+        return encode_png(synthetic.render_image(place, camera, noise_seed=number))
+
+    synthetic.solids(place)  # or each thread would make it
+    files = map_parallel(render_png, cameras.values(), range(first, first + len(cameras)))
+    write_files(folder, {f"images/{name}": file for name, file in zip(cameras, files, strict=True)})
+
+
+def compute_max_capture_bytes(place: synthetic.Config) -> int:
+    """Bytes that `write_capture` stays below: those of its photographs without compression."""
+    return (2 * place.views - 1) * place.width * place.height * 3

@@ -1,4 +1,7 @@
-"""The protocol: what a reconstruction scores on the views that it has not seen."""
+"""The protocol: what a reconstruction scores on the views that it has not seen.
+
+Estimated cameras are compared with true ones, whose worlds differ by a similarity.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistort_frame
-from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.capture.lenses import undistort_frame
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split
 from splatnode.extras.evaluate.regions import (
     UNKNOWN,
@@ -32,11 +34,100 @@ from splatnode.extras.evaluate.regions import (
 )
 from splatnode.recon.frames import screening
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
-from splatnode.recon.geometry import align_cameras, exp_se3, twist_gradient
+from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, exp_se3, twist_gradient, umeyama
 from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.scene.exposure import SATURATED, relative_illumination
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Errors of C estimated cameras. None where C, or the true motion, is too small to tell.
+
+    `rotation_deg` is the largest angle of any camera once both sets share the best common rotation;
+    `rotation_pair_deg` the largest error of any relative rotation, which needs no alignment. `centre_pct` is the RMS
+    distance of the centres after Umeyama's similarity, in percent of the true centres' RMS distance from their mean.
+    With C = 3 that similarity has 7 degrees of freedom against 9 numbers: read it with the rotations. `focal_pct` is
+    the mean absolute relative error of the focal length.
+    """
+
+    rotation_deg: float | None
+    rotation_pair_deg: float | None
+    centre_pct: float | None
+    focal_pct: float | None
+    ate_instantsplat: float | None
+
+
+def compare_cameras(Ts_estimated: Array, Ts_true: Array, Ks_estimated: Array, Ks_true: Array) -> CameraErrors:
+    """Compares (C, 4, 4) T_world_camera and (C, 3, 3) K, in the same order and for the same image sizes."""
+    if Ts_estimated.shape != Ts_true.shape or Ks_estimated.shape != Ks_true.shape:
+        raise ValueError(
+            f"cameras must come in pairs, got {Ts_estimated.shape} and {Ts_true.shape}, "
+            f"{Ks_estimated.shape} and {Ks_true.shape}"
+        )
+    if len(Ts_true) == 0:
+        return CameraErrors(None, None, None, None, None)
+    focal = 100.0 * float(np.abs(_compute_focal(Ks_estimated) / _compute_focal(Ks_true) - 1.0).mean())
+    if len(Ts_true) < 2:
+        return CameraErrors(None, None, None, focal, None)
+    rotations_estimated, rotations_true = Ts_estimated[:, :3, :3], Ts_true[:, :3, :3]
+    common = align_cameras(Ts_estimated, Ts_true).rotation
+    first, second = np.triu_indices(len(Ts_true), 1)
+    return CameraErrors(
+        rotation_deg=float(angles_deg(common @ rotations_estimated, rotations_true).max()),
+        rotation_pair_deg=float(
+            angles_deg(
+                rotations_estimated[first].transpose(0, 2, 1) @ rotations_estimated[second],
+                rotations_true[first].transpose(0, 2, 1) @ rotations_true[second],
+            ).max()
+        ),
+        centre_pct=compute_centre_error_pct(Ts_estimated[:, :3, 3], Ts_true[:, :3, 3]),
+        focal_pct=focal,
+        ate_instantsplat=compute_ate_instantsplat(Ts_estimated, Ts_true),
+    )
+
+
+def compute_centre_error_pct(estimated: Array, true: Array) -> float | None:
+    """RMS distance of centres (C, 3) after Umeyama's similarity, in percent of the true ones' RMS spread.
+
+    None where the true camera does not move.
+    """
+    apart = compute_rms_radius(true)
+    if apart <= 1e-9 * (1.0 + float(np.abs(true).max())):
+        return None
+    return 100.0 * _compute_rms_after_umeyama(estimated, true) / apart
+
+
+def compute_ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:
+    """The "ATE" of InstantSplat's released evaluation, only for comparison with published figures.
+
+    It aligns the translation columns t = -R C of the world-to-camera matrices, each set centred and divided by its
+    Frobenius norm. They do not transform by a similarity when the world moves, so a perfect reconstruction does not
+    score 0 (0.008 to 0.02 on typical arcs), and the norm makes the figure shrink with the number of cameras. None where
+    either set does not move.
+    """
+    columns = []
+    for Ts in (Ts_estimated, Ts_true):
+        t = np.linalg.inv(Ts)[:, :3, 3]
+        centred = t - t.mean(0)
+        norm = float(np.linalg.norm(centred))
+        if norm <= 1e-9 * (1.0 + float(np.abs(t).max())):
+            return None
+        columns.append(centred / norm)
+    return _compute_rms_after_umeyama(*columns)
+
+
+def _compute_rms_after_umeyama(source: Array, target: Array) -> float:
+    moved = umeyama(source, target)(source)
+    return math.sqrt(float(((moved - target) ** 2).sum(1).mean()))
+
+
+def _compute_focal(Ks: Array) -> Array:
+    return np.sqrt(Ks[:, 0, 0] * Ks[:, 1, 1])
+
 
 # Held-out photographs as a scene shows them: without the distortion that was taken out of its own photographs.
 
@@ -185,8 +276,6 @@ def create_empty_networks() -> PerceptualNetworks:
 
 
 # Where the search for a held-out view's pose starts if its true pose may not be used, as publications do it.
-
-Array = npt.NDArray[np.float64]
 
 
 def interpolate_pose(name: str, order: Sequence[str], cameras: Mapping[str, Array]) -> Array:

@@ -50,11 +50,9 @@ from splatnode.extras.evaluate.report import (
     read_bench,
 )
 from splatnode.extras.evaluate.shown import Renders, compute_surfaces, count_visibility_by_name
-from splatnode.extras.jobs.call import Answer, Work, pack_call
-from splatnode.extras.jobs.calls import Engine, Task, make_serial_engine, work_folder
+from splatnode.extras.jobs.calls import Answer, Engine, Task, Work, make_serial_engine, now, pack_call, work_folder
+from splatnode.extras.jobs.calls import Moment as Since
 from splatnode.extras.jobs.child import Limits
-from splatnode.extras.jobs.cores import Moment as Since
-from splatnode.extras.jobs.cores import now
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.folder import hold_result_folder

@@ -24,7 +24,7 @@ from splatnode.extras.evaluate.regions import UNKNOWN, Counts
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.geometry import project, transform_to_camera
 from splatnode.recon.priors import stereo
-from splatnode.recon.priors.multi_view_consistency import DepthMap
+from splatnode.recon.priors.stereo import DepthMap
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]

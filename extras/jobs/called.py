@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from splatnode.capture.process.files import check_owner_only
-from splatnode.extras.jobs.call import ANSWER, CALL, ERROR
+from splatnode.extras.jobs.calls import ANSWER, CALL, ERROR
 
 RAISED = 1  # the exit code where the function raised
 

@@ -1,28 +1,219 @@
 """Calls, some at a time: in processes on cores of this machine, or on a Ray cluster.
 
-On this machine they are made in copies of a process that has imported what they need: see `template`."""
+The call of a function of values lies in a folder, `called` is its process, and the answer lies in the same folder, or
+the reason why there is none. On this machine calls are made in copies of a process that has imported what they need:
+see `template`. Each has cores of its own, free of other work of this user. Work that another machine does, or that goes
+on later, needs the same splatnode: its version, and a digest of its sources, which a version in development does not
+tell.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import hashlib
+import io
 import itertools
 import json
+import os
+import pickle
+import platform
+import resource
 import select
 import shutil
 import signal
 import subprocess
+import tempfile
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from importlib import metadata
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 from splatnode.capture.process import python
 from splatnode.capture.process.files import NotOwnerOnly, check_owner_only, make_owner_only_folder, temporary_folder
-from splatnode.extras.jobs.call import LOG, Answer, answer_of, start_call, write_call
-from splatnode.extras.jobs.child import NOT_RUN, Child, Limits, make_launch_command, run_processes, wait_for_end
-from splatnode.extras.jobs.cores import chosen_cores, free_core, usable_cores
-from splatnode.extras.jobs.version import other_version, own_version
+from splatnode.extras.jobs.child import NOT_RUN, Child, End, Limits, make_launch_command, run_processes, wait_for_end
+
+CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder
+
+Work = Callable[[], Any]  # that can be pickled: a functools.partial of a module's function
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a call."""
+
+    pickled: bytes | None  # what the function returned; None: nothing
+    reason: str  # why it returned nothing: a sentence, or what it raised with its traceback; else empty
+    end: End  # of its process
+
+    def value(self) -> Any:
+        """Returns the function's result. Raises RuntimeError with the reason where there is none."""
+        if self.pickled is None:
+            raise RuntimeError(self.reason)
+        return pickle.loads(self.pickled)
+
+
+def pack_call(work: Work) -> bytes:
+    """A call for any machine with this splatnode: where the modules of the call are found, the function's, the call."""
+    packed = io.BytesIO()
+    pickler = _Pickler(packed)
+    pickler.dump(work)
+    places = sorted(filter(None, {python.place_of(module) for module in pickler.modules}))
+    module = getattr(work, "func", work).__module__
+    return pickle.dumps(places) + pickle.dumps(module) + packed.getvalue()
+
+
+class _Pickler(pickle.Pickler):
+    """Notes the modules of all functions and classes that it writes."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file)
+        self.modules: set[str] = set()
+
+    def persistent_id(self, obj: object) -> None:
+        if isinstance(obj, (FunctionType, type)):
+            self.modules.add(obj.__module__)
+
+
+def write_call(call: bytes, folder: Path) -> Path:
+    """Makes the folder of a `pack_call` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
+    make_owner_only_folder(folder, "--out or $TMPDIR", ours=True)
+    (folder / CALL).write_bytes(call)
+    return folder
+
+
+def start_call(folder: Path, cores: Sequence[int]) -> Child:
+    """A fresh process that makes the call of a folder on `cores`. Raises OSError."""
+    return Child.start(python.command("splatnode.extras.jobs.called", str(folder)), folder / LOG, cores)
+
+
+def answer_of(folder: Path, end: End) -> Answer:
+    """The answer of a call whose process has ended; nobody else can put one into the folder of `write_call`."""
+    if end.exit_code == 0 and (folder / ANSWER).exists():
+        return Answer((folder / ANSWER).read_bytes(), "", end)
+    if (folder / ERROR).exists():
+        return Answer(None, (folder / ERROR).read_text(), end)
+    return Answer(None, end.reason or f"ended with exit code {end.exit_code} and said nothing", end)
+
+
+def usable_cores() -> tuple[int, ...]:
+    """Their numbers, rising."""
+    return tuple(sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+
+
+def chosen_cores(wanted: int | None) -> tuple[int, ...]:
+    """The first `wanted` of them; None: all. Raises ValueError where there are fewer."""
+    allowed = usable_cores()
+    if wanted is not None and wanted > len(allowed):
+        raise ValueError(f"--cores must be at most {len(allowed)}, which this process may use; got {wanted}")
+    return allowed[:wanted]
+
+
+@contextlib.contextmanager
+def free_core() -> Iterator[int]:
+    """A core that no other work is on, of whatever worker of this user; where none is, the one with this turn."""
+    cores = usable_cores()
+    folder = Path(tempfile.gettempdir(), f"splatnode-cores-{os.getuid()}")
+    make_owner_only_folder(folder, "$TMPDIR", ours=True)
+    for core in cores:
+        with (folder / str(core)).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield core
+            return
+    yield cores[os.getpid() % len(cores)]
+
+
+ALONE = 0.05  # others take at most so much of the time of the cores; the kernel counts in steps of 10 ms
+_SLACK_S = 0.05  # of that counting
+_NOT_IDLE = (0, 1, 2, 5, 6, 7)  # of a line of /proc/stat: user, nice, system, irq, softirq, stolen by other machines
+_STAT = Path("/proc/stat")
+_CPUS = Path("/sys/devices/system/cpu")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The processor time that was used by a moment."""
+
+    at_s: float  # of a clock that never goes back
+    own_s: float  # processor time of this process and of those of its helpers that have ended
+    busy_s: float | None  # time in which the cores did anything for anybody; None: the system does not tell
+    cores: tuple[int, ...]  # on which this process may run
+
+
+def now() -> Moment:
+    """Returns the usage of this process's cores, and of those that share their circuits."""
+    cores = usable_cores()
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    own_s = sum(each.ru_utime + each.ru_stime for each in used)
+    return Moment(time.monotonic(), own_s, _busy_s(add_sibling_cores(cores)), cores)
+
+
+def others_share(since: Moment, until: Moment) -> float | None:
+    """The share of the time of the cores that others took between two moments; None where the system does not tell."""
+    if since.busy_s is None or until.busy_s is None:
+        return None
+    passed_s = (until.at_s - since.at_s) * len(since.cores)
+    others_s = until.busy_s - since.busy_s - (until.own_s - since.own_s)
+    return max(0.0, others_s - _SLACK_S) / max(passed_s, _SLACK_S)
+
+
+def add_sibling_cores(cores: tuple[int, ...], cpus: Path = _CPUS) -> set[int]:
+    """The cores, and those that are further threads of the same physical ones: what runs there slows them."""
+    found = set(cores)
+    for core in cores:
+        with contextlib.suppress(OSError, ValueError):
+            found |= _parse_cpu_list((cpus / f"cpu{core}" / "topology" / "thread_siblings_list").read_text())
+    return found
+
+
+def _parse_cpu_list(text: str) -> set[int]:
+    """Parses a list such as 0-3,8."""
+    bounds = (part.partition("-") for part in text.strip().split(",") if part)
+    return {number for first, _, last in bounds for number in range(int(first), int(last or first) + 1)}
+
+
+def _busy_s(cores: set[int]) -> float | None:
+    try:
+        lines = [line.split() for line in _STAT.read_text().splitlines() if line.startswith("cpu")]
+        counts = {line[0]: line[1:] for line in lines}
+        ticks = sum(int(counts[f"cpu{core}"][column]) for core in cores for column in _NOT_IDLE)
+    except (OSError, KeyError, IndexError, ValueError):  # not Linux, or a container that hides it
+        return None
+    return ticks / os.sysconf("SC_CLK_TCK") if ticks else None
+
+
+_DIGITS = 8  # hexadecimal
+_ROOMS = ("capture", "recon")  # whose code results depend on
+
+
+@cache
+def own_version() -> str:
+    """Such as "0.1.0 (1f3a5b7c)"; two that are the same give the same results on one kind of processor."""
+    package = Path(__file__).parents[2]
+    digest = hashlib.sha256()
+    for room in _ROOMS:
+        for file in sorted((package / room).rglob("*.py")) + sorted((package / room / "core").glob("*.cpp")):
+            digest.update(str(file.relative_to(package)).encode() + b"\0" + file.read_bytes())
+    try:
+        version = metadata.version("splatnode")
+    except metadata.PackageNotFoundError:
+        version = "not installed"
+    return f"{version} ({digest.hexdigest()[:_DIGITS]})"
+
+
+def other_version(begun_with: str) -> str | None:
+    """Returns a message if this machine's splatnode is not the one that began the work; None if it is."""
+    if (version := own_version()) == begun_with:
+        return None
+    there = f"the worker on {platform.node()} has splatnode {version}, the work was begun with {begun_with}"
+    return f"{there}; install the same on all machines"
 
 
 class Copies:

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import IO, NoReturn
 
 from splatnode.capture.process.files import check_owner_only
-from splatnode.extras.jobs.call import CALL, LOG
 from splatnode.extras.jobs.called import RAISED, module_of, run_call
+from splatnode.extras.jobs.calls import CALL, LOG
 from splatnode.extras.jobs.launch import end_with
 
 

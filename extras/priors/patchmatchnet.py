@@ -23,11 +23,9 @@ from torch.nn import functional
 
 from splatnode.recon.networks import weights as networks_weights
 from splatnode.recon.networks.weights import find
-from splatnode.recon.priors import classical, multi_view_consistency, stereo
+from splatnode.recon.priors import classical, stereo
 from splatnode.recon.priors.classical import ClassicalPrior
-from splatnode.recon.priors.multi_view_consistency import DepthMap
-from splatnode.recon.priors.patchmatch import Planes, make_level
-from splatnode.recon.priors.stereo import SparsePoints, StereoView
+from splatnode.recon.priors.stereo import DepthMap, Planes, SparsePoints, StereoView, make_level
 
 # PatchmatchNet's image networks: a pyramid of features, and depth made twice as fine along a photograph's edges.
 
@@ -452,7 +450,7 @@ class NetworkStereo:
                 found = _resize_depth(depth.clamp(*view.depth_range).numpy(), view.image)
                 inverse_depth = np.reciprocal(found, dtype=np.float32)
             planes.append(_make_planes(inverse_depth))
-        return multi_view_consistency.cross_check(levels, planes, checked, config.matching, config.consistency)
+        return stereo.cross_check(levels, planes, checked, config.matching, config.consistency)
 
 
 def _make_source(view: StereoView) -> Source:

@@ -7,7 +7,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from splatnode.capture.process.terminal import say
-from splatnode.viewer.further import FurtherViewer
+from splatnode.viewer.verbs import FurtherViewer
 
 if TYPE_CHECKING:
     from splatnode.viewer.sources import Source

@@ -23,7 +23,7 @@ struct Transfer {
     float t[3];  // K_other t_other_this
 };
 
-// A view that the reference view is compared with. The layout is repeated in recon/priors/patchmatch.py.
+// A view that the reference view is compared with. The layout is repeated in recon/priors/stereo.py.
 struct Source {
     const int32_t* packed;       // (height, width) 2x2 neighbourhoods of grey values, see patchmatch_pack
     const float* inverse_depth;  // (height, width), 0 where unknown; read only where Problem.geometric is not 0

@@ -17,7 +17,7 @@ from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import membership, submap_index
+from splatnode.recon.daemon import submap, submap_index
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
 from splatnode.recon.daemon.checkpoint import checkpoint, records
 from splatnode.recon.daemon.checkpoint.records import CheckpointError
@@ -178,11 +178,9 @@ class InactiveSubmaps:
             store.forget(name, reason)
             work.remove_keyframes([name])
 
-        for keyframe in membership.screen_keyframes(
-            work, found.new, forget
-        ):  # that came shortly before the place was left
+        for keyframe in submap.screen_keyframes(work, found.new, forget):  # that came shortly before the place was left
             work.add_keyframe(keyframe, pause)
-        membership.verify_keyframes(work, forget, pause)
+        submap.verify_keyframes(work, forget, pause)
         if self._split_off(store, work, pause):
             work.estimate_thoroughly(pause)
         for keyframe in work.keyframes_deferred:
@@ -190,7 +188,7 @@ class InactiveSubmaps:
 
     def _split_off(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> bool:
         """Whether some of the keyframes showed other places, and are places of their own now, which wait here."""
-        parts = membership.find_separate_groups(work, pause)
+        parts = submap.find_separate_groups(work, pause)
         for keyframes in parts:
             names = [keyframe.name for keyframe in keyframes]
             scene = store.split_off(names)
@@ -222,6 +220,6 @@ class InactiveSubmaps:
 
 def _refine_to_end(work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause) -> SceneWithVerdict:
     show = SceneWithVerdict()
-    for show in membership.refine(work, config, pause):  # noqa: B007
+    for show in submap.refine(work, config, pause):  # noqa: B007
         pass
     return show

@@ -21,7 +21,7 @@ from scipy.special import chdtr
 
 from splatnode.capture.config import PreviewHeader, decode_preview
 from splatnode.capture.frame import Intrinsics, Stamp
-from splatnode.capture.lenses.undistort import undistort_image
+from splatnode.capture.lenses import undistort_image
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.messaging.wire import Message

@@ -18,15 +18,15 @@ import numpy.typing as npt
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.geometry import compute_rms_radius
-from splatnode.recon.locating import pose_candidates, verification
+from splatnode.recon.locating import pose_refinement, verification
 from splatnode.recon.locating.outcome import Located, NotLocated, Reason
-from splatnode.recon.locating.pose_candidates import LensAssumption
 from splatnode.recon.locating.pose_refinement import (
     CameraModel,
     Correspondences,
+    LensAssumption,
     PosePrior,
     match_landmarks,
     measure_mirror_gain,
@@ -57,7 +57,7 @@ class LocalizationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     features: matching_features.FeatureConfig = matching_features.FeatureConfig()
     neighbours: matching_features.NearestNeighbourConfig = matching_features.NearestNeighbourConfig()
-    posing: pose_candidates.PoseSearchConfig = pose_candidates.PoseSearchConfig()
+    posing: pose_refinement.PoseSearchConfig = pose_refinement.PoseSearchConfig()
     checks: verification.LocalizationCheckConfig = verification.LocalizationCheckConfig()
 
 
@@ -128,12 +128,12 @@ def localize_with_inliers(
     frame = photograph.frame
     known = match_landmarks(photograph.features, principal_point(frame), landmarks, config.neighbours)
     judged = QueryContext(known, frame.width, frame.height, landmarks.noise_px, landmarks.unit, config.posing)
-    assumed = pose_candidates.assume_lenses(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
+    assumed = pose_refinement.assume_lenses(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
     case = _find_best_hypothesis(judged, assumed)
     refusal = verification.run_checks(case, config.checks)
     if refusal is not None and refusal.code in _OF_STRETCHED:
         stretched = choose_hypothesis(
-            judged, search_cameras(judged, (), pose_candidates.make_non_square_lenses(judged.side)), assumed
+            judged, search_cameras(judged, (), pose_refinement.make_non_square_lenses(judged.side)), assumed
         )
         if len(stretched.inliers) > _MORE_STRETCHED * len(case.inliers):
             case, refusal = stretched, verification.run_checks(stretched, config.checks)
@@ -201,7 +201,7 @@ def make_localization(
 
 def _find_best_hypothesis(judged: QueryContext, assumed: Sequence[LensAssumption]) -> PoseHypothesis:
     """The best camera: quickly, and where too little agrees with it for a sure answer, by a longer search."""
-    others = pose_candidates.make_lens_grid(judged.side, assumed)
+    others = pose_refinement.make_lens_grid(judged.side, assumed)
     best = choose_hypothesis(judged, search_cameras(judged, assumed, others), assumed)
     if best.log10_nfa < _AMPLE_NFA and len(best.inliers) >= _AMPLE_POINTS:
         return best
@@ -227,7 +227,7 @@ def choose_hypothesis(
 # Fewer features, of a smaller picture: it is seen from nearly the same place.
 QUICK = LocalizationConfig(
     features=matching_features.FeatureConfig(max_num_features=3000, min_longer_side=800, max_image_size=1000),
-    posing=pose_candidates.PoseSearchConfig(iterations=2_000, rounds=2),
+    posing=pose_refinement.PoseSearchConfig(iterations=2_000, rounds=2),
 )
 _STRONGEST = 1500  # features by which the camera is found at first
 
@@ -272,7 +272,7 @@ def localize_near(
     known = match_landmarks(_select_strongest(all_features), principal, landmarks, config.neighbours, rough)
     judged = QueryContext(known, *size, landmarks.noise_px, landmarks.unit, config.posing)
     chosen = choose_lens(
-        judged, search_cameras(judged, assumed, pose_candidates.make_lens_grid(side, assumed)), assumed
+        judged, search_cameras(judged, assumed, pose_refinement.make_lens_grid(side, assumed)), assumed
     )
     if chosen is None or not chosen.as_assumed:
         return None
@@ -297,10 +297,10 @@ def _select_strongest(found: Features) -> Features:
 
 def _assume_lenses(near: Located | Array, landmarks: Landmarks, frame: Frame) -> list[LensAssumption]:
     """Returns the lenses to assume: the given one, that of the image before, or what any image may have."""
-    assumed = pose_candidates.assume_lenses(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
+    assumed = pose_refinement.assume_lenses(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
     if not isinstance(near, Located) or (assumed and assumed[0].exact):
         return assumed
-    return [pose_candidates.carry_over(near, principal_point(frame), longer_side(frame))]
+    return [pose_refinement.carry_over(near, principal_point(frame), longer_side(frame))]
 
 
 # The photographs that a command line names, and what it says of their lens.

@@ -13,19 +13,20 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
-from splatnode.recon.locating import pose_candidates
+from splatnode.recon.locating import pose_refinement
 from splatnode.recon.locating.outcome import NORMAL_95, LensSource, LocalizationBounds, NotLocated, Reason
-from splatnode.recon.locating.pose_candidates import LensAssumption, PoseEstimate
 from splatnode.recon.locating.pose_refinement import (
     POSE,
     CameraFit,
     CameraModel,
     Correspondences,
     Lens,
+    LensAssumption,
+    PoseEstimate,
     optimize_camera,
     pose_covariance,
 )
-from splatnode.recon.matching.two_view import log10_number_of_false_alarms
+from splatnode.recon.matching.pair_matching import log10_number_of_false_alarms
 from splatnode.recon.result.snapshot import Landmarks
 from splatnode.recon.result.verdict import compute_length_95
 from splatnode.recon.verification import consistency
@@ -48,7 +49,7 @@ class QueryContext:
     height: int
     reference_noise_px: float  # of an observation, pixels at REFERENCE_SIDE
     unit: float  # the median depth of the scene's points
-    settings: pose_candidates.PoseSearchConfig
+    settings: pose_refinement.PoseSearchConfig
 
     @property
     def side(self) -> int:
@@ -67,11 +68,11 @@ class QueryContext:
 
     def estimate_pose(self, *lenses: Lens) -> PoseEstimate | None:
         """The camera with that of the lenses on which most correspondences agree."""
-        return pose_candidates.estimate_pose(self.known, lenses, self.scale, self.noise_px, self.settings)
+        return pose_refinement.estimate_pose(self.known, lenses, self.scale, self.noise_px, self.settings)
 
     def refine_pose(self, camera: CameraModel, lens: Lens) -> PoseEstimate | None:
         """The camera refined, with its inliers found again."""
-        return pose_candidates.refine_pose(camera, self.known, lens, self.scale, self.noise_px, self.settings)
+        return pose_refinement.refine_pose(camera, self.known, lens, self.scale, self.noise_px, self.settings)
 
     def make_hypothesis(
         self, posed: PoseEstimate | None, source: LensSource = LensSource.FREE, rivals: Sequence[PoseEstimate] = ()
@@ -177,18 +178,18 @@ def search_cameras(
     The first is that on which most correspondences agree.
     """
     known, scale, settings = judged.known, judged.scale, judged.settings
-    tried = pose_candidates.select_distinct_focals(assumed, _TRIED_APART)
-    found = [pose_candidates.search_pose(known, lens, scale, settings) for lens in tried]
+    tried = pose_refinement.select_distinct_focals(assumed, _TRIED_APART)
+    found = [pose_refinement.search_pose(known, lens, scale, settings) for lens in tried]
     few = known.select(np.random.default_rng(0).permutation(len(known))[:_SUBSET])
     most = min(settings.iterations, _SUBSET_ITERATIONS)
-    found += [pose_candidates.search_pose(few, lens, scale, settings, most) for lens in others]
+    found += [pose_refinement.search_pose(few, lens, scale, settings, most) for lens in others]
     return _best_first(judged, found, len(tried))
 
 
 def search_cameras_longer(judged: QueryContext, lenses: Sequence[Lens]) -> list[CameraModel]:
     """As `search_cameras`, with each of the `lenses` by all correspondences, which finds more where inliers are few."""
     most = min(judged.settings.iterations, _LONGER_ITERATIONS)
-    found = [pose_candidates.search_pose(judged.known, lens, judged.scale, judged.settings, most) for lens in lenses]
+    found = [pose_refinement.search_pose(judged.known, lens, judged.scale, judged.settings, most) for lens in lenses]
     return _best_first(judged, found)
 
 
@@ -197,7 +198,7 @@ def _best_first(judged: QueryContext, found: Sequence[CameraModel | None], prefe
     limit_px, ranked = judged.settings.search_px * judged.scale, list[tuple[float, CameraModel]]()
     for number, camera in enumerate(found):
         if camera is not None:
-            count = int(pose_candidates.agreement(camera, judged.known, limit_px).sum())
+            count = int(pose_refinement.agreement(camera, judged.known, limit_px).sum())
             ranked.append((count * (_CLEARLY_MORE if number < preferred else 1.0), camera))
     return [camera for _, camera in sorted(ranked, key=lambda each: -each[0])]
 
@@ -212,7 +213,7 @@ def choose_lens(
     """
     side = judged.side
     found = [
-        (camera, judged.refine_pose(camera, pose_candidates.free_lens(camera.lens, side)))
+        (camera, judged.refine_pose(camera, pose_refinement.free_lens(camera.lens, side)))
         for camera in cameras[:_REFINED]
     ]
     starts = [(int(wide.agreeing.sum()), camera, wide) for camera, wide in found if wide is not None]
@@ -223,9 +224,9 @@ def choose_lens(
         if start[0] > _CLEARLY_MORE * count:
             count, camera, wide = start
     shaped, usual = _test_shape(
-        wide, _nearest(assumed, wide) or pose_candidates.make_typical_lens(camera.lens, side), side
+        wide, _nearest(assumed, wide) or pose_refinement.make_typical_lens(camera.lens, side), side
     )
-    prior = replace(pose_candidates.free_lens(camera.lens, side).copy_shape(shaped), shift=np.zeros(2))
+    prior = replace(pose_refinement.free_lens(camera.lens, side).copy_shape(shaped), shift=np.zeros(2))
     free = judged.refine_pose(camera if usual else wide.fit.camera, prior)
     if free is None:
         return None
@@ -254,7 +255,7 @@ def _test_shape(wide: PoseEstimate, expected: Lens, side: int) -> tuple[Lens, bo
     Whether it does not is the second value.
     """
     lens, sigmas = wide.fit.camera.lens, _sigmas(wide)
-    limits, free = _REFUTED_SHAPE_SIGMAS, pose_candidates.free_lens(lens, side)
+    limits, free = _REFUTED_SHAPE_SIGMAS, pose_refinement.free_lens(lens, side)
     bent = not abs(lens.radial[0] - expected.radial[0]) <= limits * np.hypot(sigmas[1], expected.radial_sigma)
     stretched = not abs(lens.log_aspect - expected.log_aspect) <= limits * np.hypot(
         sigmas[4], expected.log_aspect_sigma
@@ -320,7 +321,7 @@ def _refine_with_free_lens(judged: QueryContext, free: PoseEstimate, prior: Lens
     lens, sigmas, usual = (
         free.fit.camera.lens,
         _sigmas(free)[2:4],
-        pose_candidates.make_typical_lens(prior, judged.side),
+        pose_refinement.make_typical_lens(prior, judged.side),
     )
     if not (np.abs(lens.shift) <= _REFUTED_SIGMAS * np.hypot(sigmas, usual.shift_sigma)).all():
         return LensChoice(free, LensSource.FREE, False)
@@ -332,7 +333,7 @@ def _refine_with_free_lens(judged: QueryContext, free: PoseEstimate, prior: Lens
 class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Checks of the camera that was found for a query image. Each check refuses by the evidence of its own."""
 
-    max_log10_nfa: float = -12.0  # as of a pair of photographs (recon/matching/two_view.py)
+    max_log10_nfa: float = -12.0  # as of a pair of photographs (recon/matching/pair_matching.py)
     min_points: int = 15  # that agree, as of a view that is added to a map (recon/registration/resection.py)
     min_share_of_picture: float = 0.04  # that their hull covers: less may be a thing that stood elsewhere
     max_elsewhere: float = 0.5  # agreement with a second camera, over that with the first
@@ -347,7 +348,7 @@ class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     max_shift: float = 0.5  # of the principal point, over the longer side: it is in the picture, or was before a crop
     max_log_aspect: float = 0.7  # of the focal length across over that down: 2
     max_radial: float = 0.5  # the first coefficient of a lens that bends lines; beyond, it is a fisheye
-    max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (extras/evaluate/stability/case.py)
+    max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (extras/evaluate/stability/trial.py)
     max_centre_percent: float = 10.0  # likewise
 
 
@@ -471,11 +472,11 @@ def _check_elsewhere(case: PoseHypothesis, config: LocalizationCheckConfig) -> N
     camera = case.posed.fit.camera
     lens, explained = camera.lens, np.isin(case.correspondences.feature_of, case.inliers.feature_of)
     rest = replace(case.by, known=case.correspondences.select(~explained))
-    starts, by = [pose_candidates.search_pose(rest.known, lens, rest.scale, rest.settings)], case.by
+    starts, by = [pose_refinement.search_pose(rest.known, lens, rest.scale, rest.settings)], case.by
     if case.source is LensSource.FREE:
-        starts += search_cameras(rest, (), pose_candidates.make_lens_grid(rest.side, ()))[:1]
+        starts += search_cameras(rest, (), pose_refinement.make_lens_grid(rest.side, ()))[:1]
         # A free lens could reach the points of the first camera from elsewhere.
-        lens, by = pose_candidates.free_lens(lens, rest.side), rest
+        lens, by = pose_refinement.free_lens(lens, rest.side), rest
     found = [posed for start in starts if start is not None and (posed := by.refine_pose(start, lens)) is not None]
     apart = [int(each.agreeing.sum()) for each in found if not _is_near(camera, each.fit.camera, case.by)]
     count = max(apart, default=0)

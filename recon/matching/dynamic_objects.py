@@ -28,7 +28,7 @@ from splatnode.recon.frames.keyframe import (
     principal_point,
     resize_image,
 )
-from splatnode.recon.matching import features, two_view
+from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_pending
 from splatnode.recon.threads import map_parallel
 
@@ -162,7 +162,7 @@ def _groups(graph: ViewGraph, pair: Pair, matches: Index) -> Iterator[_Group]:
     (others,) = np.nonzero(~plane)
     size = second.frame.width, second.frame.height
     own1, own2 = points1 - principal_point(first.frame), points2 - principal_point(second.frame)
-    geometry, _ = two_view.estimate(own1[others], own2[others], matches[others], size, config)
+    geometry, _ = pair_matching.estimate(own1[others], own2[others], matches[others], size, config)
     if geometry is None:
         yield _Group(pair, matches[plane], moves=False)
         return
@@ -188,7 +188,7 @@ def _plane(points1: Array, points2: Array, threshold: float) -> Mask:
     return np.zeros(len(points1), bool) if inliers is None else inliers.ravel() > 0
 
 
-def _share_on_lines(geometry: two_view.TwoView, points1: Array, points2: Array, threshold: float) -> float:
+def _share_on_lines(geometry: pair_matching.TwoView, points1: Array, points2: Array, threshold: float) -> float:
     """The share of matches, pixels (M, 2) from the principal points, within `threshold` of the geometry's lines."""
     fundamental, _ = cv2.findFundamentalMat(geometry.points1, geometry.points2, cv2.FM_LMEDS)
     if fundamental is None or fundamental.shape != (3, 3):

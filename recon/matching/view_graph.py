@@ -21,12 +21,19 @@ from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.clock import is_over
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Keyframe, content_key
-from splatnode.recon.matching import candidates, features
+from splatnode.recon.matching import features
+from splatnode.recon.matching import pair_matching as candidates
 from splatnode.recon.matching import pair_matching as matching_pair_matching
-from splatnode.recon.matching.candidates import find_components, select_pairs_worth_matching, select_short_list_pairs
 from splatnode.recon.matching.features import Code, compute_global_descriptor
-from splatnode.recon.matching.pair_matching import MatchedPair, is_strong_pair, select_weak_pairs
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import (
+    MatchedPair,
+    TwoView,
+    find_components,
+    is_strong_pair,
+    select_pairs_worth_matching,
+    select_short_list_pairs,
+    select_weak_pairs,
+)
 from splatnode.recon.threads import map_parallel, map_parallel_lazily
 
 # The configuration of matching: local features, which pairs are matched and how, which get simulated tilts.

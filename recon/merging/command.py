@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from splatnode.capture.process.terminal import say, show_waiting
-from splatnode.recon.merging.merge import MergedScene, merge_submaps
-from splatnode.recon.merging.submap import Submap, Submaps, load_submaps, scale_and_up
+from splatnode.recon.merging.merge import MergedScene, Submap, Submaps, load_submaps, merge_submaps, scale_and_up
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians, encode_ply
 from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians

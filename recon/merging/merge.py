@@ -1,34 +1,404 @@
-"""One scene out of the submaps of a map."""
+"""One scene out of the submaps of a map: each a finished scene, in the world of the map that it is part of.
+
+What stays of the submaps is fitted so that every camera sees what its own submap showed it. At a seam two scenes meet
+that were fitted apart: their surfaces are a little beside each other, and what one camera never saw may hang before
+another one. What each submap shows to its own cameras is known, so the Gaussians are refined to show that, all
+together, and the cameras find their places among them. On the way those go that no camera would miss, and where there
+is a limit, those that the cameras would miss least.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
+import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
-from splatnode.recon.merging.merge_fit import (
-    DepthView,
-    PointVisibility,
-    depth_views,
-    fit_gaussians,
-    measure_visibility,
-    surface_views,
-)
-from splatnode.recon.merging.submap import Submap
+from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
+from splatnode.recon.geometry import transform_to_camera
+from splatnode.recon.optimize import training
+from splatnode.recon.optimize.control import prune
+from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.rasterize.dispatch import Camera
+from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians
 from splatnode.recon.result.export.quaternions import matrices_from_quats
-from splatnode.recon.result.levels_of_detail import concatenate_gaussians
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.levels_of_detail import concatenate_gaussians, find_far_shell
+from splatnode.recon.result.npz_files import read_depths
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.rendering import render_arrays
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.recon.result.reference_frame import ReferenceFrame
+from splatnode.recon.result.rendering import NEAR, render_arrays
+from splatnode.recon.result.report import render_camera
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, format_rounded_up
+from splatnode.recon.result.stored_snapshot import read_up
+from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry, group_edges, walk_edges
+from splatnode.recon.result.verdict import SURE, TWO_SIDED_95, Scale, Up
 from splatnode.recon.scene.background import SHELL
+from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A scene's Gaussians and cameras in the map's world and unit."""
+
+    scene_id: str
+    verdict: str
+    gaussians: GaussianArrays
+    cameras: tuple[CameraEstimate, ...]
+    shell: npt.NDArray[np.bool_]  # (N,) which of the Gaussians are its far shell
+    # Confirmed z by camera, as of a Snapshot; none of a scene that is known too roughly for a map of free space
+    depths: Mapping[str, npt.NDArray[np.float16]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Submaps:
+    """The submaps of a map that can be merged, and why the rest cannot."""
+
+    used: tuple[Submap, ...]
+    left_out: dict[str, str]  # scene_id: why
+
+
+def load_submaps(whole: MapSet, of: JoinedMap) -> Submaps:
+    """The scenes of a map that are final and published, in the order of places.json.
+
+    Raises SceneFileError where a result is damaged, OSError where it cannot be read.
+    """
+    used, left_out = [], {}
+    for scene_id, placement in of.placements.items():
+        place = whole.places[scene_id]
+        why = _explain_exclusion(place)
+        if why:
+            left_out[scene_id] = why
+        else:
+            used.append(_load(place, placement))
+    return Submaps(tuple(used), left_out)
+
+
+def place_submap(
+    scene_id: str,
+    verdict: str,
+    gaussians: GaussianArrays,
+    cameras: tuple[CameraEstimate, ...],
+    placement: Placement,
+    depths: Mapping[str, npt.NDArray[np.float16]] = MappingProxyType({}),
+) -> Submap:
+    """The scene, given in its own world, where `placement` puts it."""
+    shell = find_far_shell(gaussians, cameras)
+    moved = tuple(placement.transform_camera(camera) for camera in cameras)
+    farther = {name: (placement.scale * depth.astype(np.float32)).astype(np.float16) for name, depth in depths.items()}
+    return Submap(scene_id, verdict, placement.transform_gaussians(gaussians), moved, shell, farther)
+
+
+def _explain_exclusion(place: SubmapEntry) -> str:
+    if place.folder is None or not place.publishable:
+        return f"it has no result: {place.verdict}"
+    if place.provisional:
+        return "its scene is not final yet"
+    if not (place.folder / "scene.ply").is_file():
+        return f"{place.folder.name}/scene.ply is not there"
+    return ""
+
+
+def _load(place: SubmapEntry, placement: Placement) -> Submap:
+    assert place.folder is not None  # `_explain_exclusion` has seen to it
+    result = StoredResult.create_from_path(place.folder)
+    try:
+        sure = place.verdict in {code.value for code in SURE}
+        depths = read_depths(place.folder) if sure else {}
+        return place_submap(place.scene_id, place.verdict, result.gaussians(), result.cameras(), placement, depths)
+    except SceneFileError as error:
+        raise SceneFileError(f"{place.folder}: {error}") from error
+
+
+# The unit and the up of a map: those of its first scene, and how well they are known in the others.
+#
+# The others hang on the first one by links. Where a scene lies by all links together is known no worse than by any one
+# way along them; so the way of the fewest links bounds how wrong its scale and its rotation are to those of the first.
+# By that much more than the first scene's, and independently, they may be wrong.
+
+_MOST_SIGMA = 1.0  # of the logarithm of a scale: beyond, nothing is known of it
+
+
+@dataclass(frozen=True)
+class _Sigmas:
+    """Standard deviations, to the first scene: of the logarithm of the scale, and of the rotation."""
+
+    scale: float
+    deg: float
+
+    def add_link(self, scale: float, deg: float) -> _Sigmas:
+        return _Sigmas(math.hypot(self.scale, scale), math.hypot(self.deg, deg))
+
+
+def scale_and_up(whole: MapSet, of: JoinedMap, scenes: Sequence[str]) -> tuple[Scale, Up | None]:
+    """Combines scale and up of a map of these scenes: what is said of all holds for the one that is known worst.
+
+    The world and the unit are those of the scene that the map is named after. Raises SceneFileError, OSError.
+    """
+    place = whole.places.get(of.name)
+    if place is None or place.folder is None:
+        return Scale(), None
+    scale, up = StoredResult.create_from_path(place.folder).scale(), read_up(place.folder)
+    further = [each for each in scenes if each != of.name]
+    if not further:
+        return scale, up
+    worst = _find_largest_sigmas(whole, of.name, further)
+    scale = replace(scale, frame=_combine_frames(scale.frame, worst, of.name))
+    return _combine_scales(scale, worst, of.name, len(further)), up and _combine_up(up, worst, of.name)
+
+
+def _find_largest_sigmas(whole: MapSet, first: str, further: Sequence[str]) -> _Sigmas | None:
+    """The largest of all further scenes; None where it is not known of one of them."""
+    known = {first: _Sigmas(0.0, 0.0)}
+    for here, there, link in walk_edges(first, group_edges(whole.links)):
+        if here in known and link.sigma_scale is not None and link.sigma_deg is not None:
+            known[there] = known[here].add_link(link.sigma_scale, link.sigma_deg)
+    if not all(each in known for each in further):
+        return None
+    return _Sigmas(max(known[each].scale for each in further), max(known[each].deg for each in further))
+
+
+def _combine_scales(scale: Scale, worst: _Sigmas | None, first: str, further: int) -> Scale:
+    if not scale.metric:
+        return scale
+    scenes = "a further scene hangs" if further == 1 else f"{further} further scenes hang"
+    told = f"{scale.source or 'metres'}, in {first}; {scenes} on it by links, "
+    if scale.interval_95 is None or worst is None or worst.scale > _MOST_SIGMA:
+        return _set_source(
+            replace(scale, interval_95=None), f"{told}and how well the metres are known there is not told"
+        )
+    low, high = scale.interval_95
+    of_links = TWO_SIDED_95 * worst.scale
+    wider = math.exp(-math.hypot(math.log(low), of_links)), math.exp(math.hypot(math.log(high), of_links))
+    told += f"known to {format_rounded_up(100 * (wider[1] - 1.0))} % in all"
+    return _set_source(replace(scale, interval_95=wider), told)
+
+
+def _set_source(scale: Scale, source: str) -> Scale:
+    """Sets the source, unless it is longer than files may have it."""
+    return replace(scale, source=source) if len(source) <= LONGEST_TEXT else scale
+
+
+def _combine_frames(frame: ReferenceFrame, worst: _Sigmas | None, first: str) -> ReferenceFrame:
+    """The frame of the first scene, in which the further ones may be turned; its first camera stays that of a map."""
+    if frame.source is None:
+        return frame
+    source = sanitize_text(f"{frame.source}, in {first}", LONGEST_TEXT)
+    if frame.sigma_deg is None or worst is None:
+        return replace(frame, source=source)
+    return replace(frame, source=source, sigma_deg=min(math.hypot(frame.sigma_deg, worst.deg), 180.0))
+
+
+def _combine_up(up: Up, worst: _Sigmas | None, first: str) -> Up:
+    sigma_deg = up.sigma_deg if worst is None else min(math.hypot(up.sigma_deg, worst.deg), 180.0)
+    return replace(up, source=f"{up.source}, in {first}", sigma_deg=sigma_deg)
+
+
+PASSES = 16  # iterations for each camera
+RATE = 0.5  # of the step sizes of a refinement: the submaps are fitted already
+SHELL_SHARE = 0.1  # of a limit on the Gaussians, at most, for the far shells
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """The Gaussians of a map, each with the number of its submap as source frame, or SHELL; and all its cameras."""
+
+    gaussians: GaussianArrays
+    cameras: tuple[tuple[CameraEstimate, ...], ...]  # of each submap, where they see what that submap showed
+
+
+def fit_gaussians(
+    submaps: Sequence[Submap],
+    gaussians: GaussianArrays,
+    *,
+    most: int | None = None,
+    passes: int = PASSES,
+    seed: int = 0,
+) -> FitResult:
+    """The `gaussians` of the `submaps`, whose median depth must be about 1, at most `most` of them.
+
+    Their source frames are as `FitResult` has them.
+    """
+    views = [_view(each.gaussians, camera) for each in submaps for camera in each.cameras]
+    begun = _tensors(gaussians)
+    if most is not None:
+        begun = _limit_shells(begun, [_camera(view) for view in views], most, seed)
+    config = training.RefinementConfig(
+        iterations=passes * len(views),
+        checkpoints=(),
+        first_opacity=None,
+        control=ControlChoice("prune", prune.Config()),
+        lr=_rates(),
+    )
+    *_, scene = training.refine(Scene(tuple(views), begun), config, seed=seed, max_gaussians=most)
+    found = iter(scene.views)
+    cameras = tuple(
+        tuple(replace(camera, T_world_camera=_rigid(next(found).T_world_camera)) for camera in each.cameras)
+        for each in submaps
+    )
+    return FitResult(scene.arrays(), cameras)
+
+
+def _rates() -> training.LearningRates:
+    whole = training.CAUTIOUS
+    slower = {name: RATE * getattr(whole, name) for name in ("means", "quats", "log_scales", "sh")}
+    return msgspec.structs.replace(whole, **slower)
+
+
+def _view(gaussians: GaussianArrays, camera: CameraEstimate) -> TrainingView:
+    """Renders the submap in its own camera, as the image to fit."""
+    return TrainingView(
+        camera.name,
+        camera.frame_id,
+        render_camera(gaussians, camera),
+        torch.from_numpy(camera.T_world_camera).float(),
+        torch.from_numpy(camera.K).float(),
+    )
+
+
+def _camera(view: TrainingView) -> Camera:
+    return Camera(view.T_world_camera, view.K, view.width, view.height)
+
+
+def _limit_shells(gaussians: Gaussians, cameras: Sequence[Camera], most: int, seed: int) -> Gaussians:
+    """Without the shells' Gaussians that are missed least, where a limit left too little beside all of them."""
+    shell = (gaussians.source_frame == SHELL).nonzero()[:, 0]
+    room = int(SHELL_SHARE * most)
+    if len(shell) <= room:
+        return gaussians
+    worth = prune.estimate_removal_changes(gaussians, cameras, 1, torch.Generator().manual_seed(seed))
+    keep = gaussians.source_frame != SHELL
+    keep[shell[worth[shell].topk(room).indices]] = True
+    return gaussians.subset(keep)
+
+
+def _tensors(gaussians: GaussianArrays) -> Gaussians:
+    opacities = np.clip(gaussians.opacities.astype(np.float64), 1e-6, 1 - 1e-6)
+
+    def tensor(values: npt.NDArray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+    return Gaussians(
+        means=tensor(gaussians.means),
+        quats=tensor(gaussians.quats),
+        log_scales=tensor(np.log(gaussians.scales)),
+        logit_opacities=tensor(np.log(opacities) - np.log1p(-opacities)),
+        sh=tensor(gaussians.sh),
+        source_frame=torch.from_numpy(gaussians.source_frame),
+    )
+
+
+def _rigid(T: Tensor) -> npt.NDArray[np.float64]:
+    """(4, 4) in float64, with a rotation that is one: that of float32 is rounded in every step."""
+    exact = T.double().numpy().copy()
+    u, _, vt = np.linalg.svd(exact[:3, :3])
+    exact[:3, :3] = u @ vt
+    return exact
+
+
+# What a submap's cameras know of a point: whether they see a surface there, through it, or something before it.
+
+Array = npt.NDArray[np.float64]
+
+ALIKE = 0.05  # part of the depth within which a point lies on the surface: the depth that is rendered is a mean
+BEFORE = 0.1  # part of the depth from which on a point lies before the surface
+SOLID = 0.5  # opacity from which on a pixel has a surface
+_AROUND = np.ones((3, 3), np.uint8)  # pixels among which a point's own is looked for: edges are blurred
+
+
+@dataclass(frozen=True, eq=False)
+class DepthView:
+    """A camera, and between which depths the surface lies around each of its pixels."""
+
+    camera: CameraEstimate
+    nearest: npt.NDArray[np.float32]  # (H, W) infinite where there is no surface
+    farthest: npt.NDArray[np.float32]  # (H, W) 0 where there is none
+
+
+@dataclass(frozen=True, eq=False)
+class PointVisibility:
+    """The visibility of M points in the cameras of one submap. Pixels are those of the cameras at modelled size."""
+
+    resolution: Array  # (M,) pixels a unit of length of the best camera that has the point on its surface, or 0
+    on: npt.NDArray[np.int32]  # (M,) cameras that have the point on their surface
+    before: npt.NDArray[np.int32]  # (M,) cameras that have it before their surface: they look through it
+    veiled: Array  # (M,) pixels a unit of length at the surface behind the point, of the best such camera, or 0
+
+    @property
+    def quality(self) -> Array:
+        """(M,) how well the point's surface is seen: the resolution, less for few views or disagreeing ones."""
+        return self.resolution * self.on / (self.on + 1.0) * self.on / np.maximum(self.on + self.before, 1)
+
+
+def depth_views(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> tuple[DepthView, ...]:
+    """Renders the surface of the Gaussians in each camera."""
+    return tuple(_depth_view(gaussians, camera) for camera in cameras)
+
+
+def surface_views(
+    gaussians: GaussianArrays, shell: npt.NDArray[np.bool_], cameras: Sequence[CameraEstimate]
+) -> tuple[DepthView, ...]:
+    """The same without the far shell, which is no surface."""
+    return depth_views(select_gaussians(gaussians, ~shell), cameras)
+
+
+def measure_visibility(views: Sequence[DepthView], points: npt.NDArray[np.floating]) -> PointVisibility:
+    """Measures the visibility of the world points (M, 3) in all `views` together."""
+    count = len(points)
+    resolution, veiled = np.zeros(count), np.zeros(count)
+    on, before = np.zeros(count, np.int32), np.zeros(count, np.int32)
+    for view in views:
+        index, depth, nearest, farthest = _look_up_depths(view, points)
+        focal = float(view.camera.K[0, 0])
+        here = (depth >= (1 - ALIKE) * nearest) & (depth <= (1 + ALIKE) * farthest)
+        through = depth < (1 - BEFORE) * nearest
+        through &= np.isfinite(nearest)
+        on[index[here]] += 1
+        before[index[through]] += 1
+        resolution[index[here]] = np.maximum(resolution[index[here]], focal / depth[here])
+        veiled[index[through]] = np.maximum(veiled[index[through]], focal / nearest[through])
+    return PointVisibility(resolution, on, before, veiled)
+
+
+def _depth_view(gaussians: GaussianArrays, camera: CameraEstimate) -> DepthView:
+    height, width = camera.height, camera.width
+    if not len(gaussians):
+        return DepthView(camera, np.full((height, width), np.inf, np.float32), np.zeros((height, width), np.float32))
+    rendered = render_arrays(gaussians, camera.T_world_camera, camera.K, width, height, channels=("depth",))
+    solid = (rendered.alpha >= SOLID) & (rendered.depth > 0)
+    nearest = np.where(solid, rendered.depth, np.float32(np.inf)).astype(np.float32)
+    farthest = np.where(solid, rendered.depth, np.float32(0)).astype(np.float32)
+    eroded, dilated = cv2.erode(nearest, _AROUND), cv2.dilate(farthest, _AROUND)
+    return DepthView(camera, np.asarray(eroded, np.float32), np.asarray(dilated, np.float32))
+
+
+def _look_up_depths(
+    view: DepthView, points: npt.NDArray[np.floating]
+) -> tuple[npt.NDArray[np.intp], Array, Array, Array]:
+    """Looks up the points (M, 3) inside the image: returns indices, depths, and the nearest and farthest surface."""
+    camera = view.camera
+    local = transform_to_camera(points.astype(np.float64), camera.T_world_camera)
+    ahead = np.flatnonzero(local[:, 2] > NEAR)
+    x, y, z = local[ahead].T
+    columns = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
+    rows = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
+    inside = (columns >= 0) & (columns < camera.width) & (rows >= 0) & (rows < camera.height)
+    at = rows[inside].astype(np.intp), columns[inside].astype(np.intp)
+    nearest, farthest = view.nearest[at].astype(np.float64), view.farthest[at].astype(np.float64)
+    return ahead[inside], z[inside], nearest, farthest
+
 
 # Regions of space, and which submap sees each best: voxels whose size follows the resolution of the views.
 
-Array = npt.NDArray[np.float64]
 
 REGION_PX = 16.0  # side of a region in pixels of the camera that sees it best, up to a factor of 2
 NOBODY = -1

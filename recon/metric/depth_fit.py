@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses.lens import project
+from splatnode.capture.lenses import project
 from splatnode.recon.metric.depth_smoothing import smooth_depth
 from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.threads import map_parallel

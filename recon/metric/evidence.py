@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.lenses.undistort import straighten_depth
+from splatnode.capture.lenses import straighten_depth
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.metric.markers import MarkerDetection, detect_markers

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from splatnode.recon import poselib
 from splatnode.recon.core import library, pointer
 from splatnode.recon.geometry import undistort_iterations
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment
 
 Array = npt.NDArray[np.float64]

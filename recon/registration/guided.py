@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Keyframe, longer_side, principal_point
 from splatnode.recon.geometry import cross_matrix
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration.known_poses import Given
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment, triangulation
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import cross_matrix
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
     guided,

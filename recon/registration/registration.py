@@ -14,7 +14,7 @@ from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
     incremental_mapper,

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from splatnode.recon import poselib
 from splatnode.recon.geometry import cross
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment, epipolar
 from splatnode.recon.registration.mapping_problem import MapperInput, Pair, Pairs, PartialMap
 from splatnode.recon.registration.triangulation import Tracks

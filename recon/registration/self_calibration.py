@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe, longer_side
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment
 from splatnode.recon.registration.mapping_problem import Lens
 

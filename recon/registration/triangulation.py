@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from splatnode.recon.core import library, pointer
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment
 
 # Tracks: the observations, in several frames, that pairwise matches say are of one scene point.

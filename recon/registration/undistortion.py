@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture import lenses as opencv
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses import opencv
-from splatnode.capture.lenses.undistort import SQUARE_TOLERANCE, undistort_frame
+from splatnode.capture.lenses import SQUARE_TOLERANCE, undistort_frame
 from splatnode.recon.frames.keyframe import Features, Keyframe, resize_image, resize_mask
 from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -96,7 +96,7 @@ def undistort_keyframe(keyframe: Keyframe, lens: Intrinsics) -> Keyframe:
 
 def undistort_pixels(pixels: Array, lens: Intrinsics, pinhole: Intrinsics) -> Array:
     """(M, 2) where `pinhole` shows what `lens` shows at `pixels` (M, 2), each in pixels of its own picture."""
-    return opencv.project(opencv.unproject(pixels, lens), pinhole) if len(pixels) else pixels
+    return opencv.project_opencv(opencv.unproject_opencv(pixels, lens), pinhole) if len(pixels) else pixels
 
 
 def corner_shift(lens: Intrinsics | None) -> float:

@@ -1,4 +1,4 @@
-"""report.json: what happened in a reconstruction, for people and for programs."""
+"""report.json: what happened in a reconstruction, for people and for programs; and what a command tells of it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.process.terminal import say
 from splatnode.capture.rig_file import format_rig
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import make_camera_dict
@@ -22,8 +23,15 @@ from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.export.prepare import sanitize_gaussians
 from splatnode.recon.result.export.stored import SOURCES, encode_sources
 from splatnode.recon.result.npz_files import DEPTHS, LANDMARKS, encode_depths, encode_landmarks
+from splatnode.recon.result.reference_frame import FIRST_CAMERA
 from splatnode.recon.result.rendering import render_arrays
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import (
+    CameraEstimate,
+    GaussianArrays,
+    Snapshot,
+    describe_moving,
+    format_widest_bounds,
+)
 from splatnode.recon.result.verdict import find_widest
 
 _PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
@@ -228,3 +236,31 @@ def write_result_folder(
         further[RIG] = format_rig(snapshot.rig.mounts, snapshot.scale.metric).encode()
     write_result(snapshot, out, report, preview=preview, further=further)
     return report
+
+
+def print_summary(snapshot: Snapshot, out: Path) -> None:
+    """Prints the verdict, what was left out, how large and how good the scene is, and where its files are."""
+    verdict = snapshot.verdict
+    say(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
+    for frame in snapshot.dropped:
+        say(f"left out: {frame.name}: {frame.reason}")
+    if moved := describe_moving(snapshot.moving):
+        say(moved)
+    for hit in snapshot.budget:
+        say(hit["message"])
+    if verdict.publishable:
+        counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
+        say(f"{snapshot.seconds['total']:.1f} s, {counts}")
+        if known := format_widest_bounds(snapshot.cameras, snapshot.scale):
+            say(f"how well the cameras are known: {known}")
+        if snapshot.scale.source is not None:
+            say(f"lengths: {snapshot.scale.sentence}")
+        if snapshot.scale.frame != FIRST_CAMERA:
+            say(f"frame: {snapshot.scale.frame.sentence}")
+    further = snapshot.seconds.get("ladder", 0.0)
+    if further >= 0.1:
+        say(
+            f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches "
+            "(--no-fallbacks leaves them out)"
+        )
+    say(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

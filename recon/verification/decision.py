@@ -16,8 +16,7 @@ from splatnode.capture import quality
 from splatnode.recon.frames.keyframe import longer_side
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.geometry import distortion
-from splatnode.recon.matching.pair_matching import median_motion_px
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView, median_motion_px
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, find_widest

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.matching.candidates import find_components
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView, find_components
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.registration.resection import compute_pooled_ratio

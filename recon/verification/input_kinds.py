@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe, longer_side
-from splatnode.recon.matching import features, two_view
+from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification.rejections import Refusal, refuse
@@ -144,7 +144,7 @@ def measure_static(graph: ViewGraph, pair: Pair) -> StaticPair:
     matches, side = graph.plain[pair].matches, longer_side(second.frame)
     size = np.array([first.frame.width, first.frame.height], float)
     points1, points2 = first.features.points[matches[:, 0]], second.features.points[matches[:, 1]]
-    still = two_view.motion_px(points1, points2, side) < STATIC_PX
+    still = pair_matching.motion_px(points1, points2, side) < STATIC_PX
     cells = _mark_occupied_cells(points1[still], size, STATIC_GRID)
     across, down = (count // 4 for count in STATIC_GRID)
     middle = cells[across:-across], cells[:, down:-down]

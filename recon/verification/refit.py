@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, umeyama
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
     incremental_mapper,

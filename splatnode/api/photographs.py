@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from splatnode.api.image_arguments import Lens, check_camera_id, make_intrinsics
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
-from splatnode.capture.exif import exif_exposure, exif_intrinsics, exif_time, read_tags
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.image_file import (
     ORIENTATION,
@@ -24,6 +23,7 @@ from splatnode.capture.image_file import (
     measure_extent,
     upright,
 )
+from splatnode.capture.image_header import exif_exposure, exif_intrinsics, exif_time, read_tags
 from splatnode.capture.lens_file import ALL, Lenses, find_key
 from splatnode.capture.masks import Find, Mask, apply_mask, open_masks, parse_mask, read_mask
 from splatnode.capture.process.terminal import Tell

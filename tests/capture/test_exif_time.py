@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.capture.exif import DATE_TIME_ORIGINAL, OFFSET_ORIGINAL, SUB_SECONDS_ORIGINAL, exif_time
 from splatnode.capture.frame import Clock, Stamp
+from splatnode.capture.image_header import DATE_TIME_ORIGINAL, OFFSET_ORIGINAL, SUB_SECONDS_ORIGINAL, exif_time
 from tests.capture.cameras.test_folder import tiff
 
 DATE = "2024:05:06 10:00:07"

@@ -11,9 +11,9 @@ import pytest
 import zmq
 
 from splatnode.capture.cameras.folder import Config, stream
-from splatnode.capture.exif import exif_exposure, read_tags
 from splatnode.capture.frame import ExposureSettings, Frame, Intrinsics, parse_exposure, rename_frame
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.image_header import exif_exposure, read_tags
+from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.masks import apply_mask
 from splatnode.capture.messaging.messages import FrameHeader, decode_frame, encode_frame
 from splatnode.capture.messaging.spool import Key

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.capture.exif import name_time
 from splatnode.capture.frame import Clock, Stamp
+from splatnode.capture.image_header import name_time
 
 SHOWN_S = 1_706_715_901  # of a clock that shows 2024-01-31 15:45:01 in UTC
 

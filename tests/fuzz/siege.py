@@ -28,7 +28,6 @@ import numpy as np
 import zmq
 
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
-from splatnode.capture.messaging.keys import create_keys
 from splatnode.capture.messaging.network import (
     CAPTURE_CONTROL,
     CAPTURE_KEYFRAMES,
@@ -38,6 +37,7 @@ from splatnode.capture.messaging.network import (
     RECON_SCENE,
     RECON_STATUS,
     Network,
+    create_keys,
 )
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.status import CaptureStatus

@@ -29,7 +29,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "capture",
-        "capture/exif.py",
+        "capture/image_header.py",
         ("the time zone's sign is lost", 'return -offset if sign == "-" else offset', "return offset"),
         (
             "the equivalent focal length compares widths",
@@ -147,7 +147,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "matching",
-        "recon/matching/two_view.py",
+        "recon/matching/pair_matching.py",
         (
             "the number of false alarms counts no choice of a sample",
             "        + log10_choose(num_inliers, sample_size)\n",
@@ -170,7 +170,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "matching",
-        "recon/matching/candidates.py",
+        "recon/matching/pair_matching.py",
         (
             "the smallest component comes first",
             "key=lambda group: (-len(group), group)",
@@ -254,7 +254,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "depth",
-        "recon/priors/multi_view_consistency.py",
+        "recon/priors/stereo.py",
         (
             "confidence grows with views that look through",
             "per_conflicting: float = -0.67",
@@ -451,7 +451,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "extras/evaluate/stability/case.py",
+        "extras/evaluate/stability/trial.py",
         (
             "claim: right is within 5 degrees",
             "RIGHT_ROTATION_DEG, RIGHT_SPREAD_PCT = 2.0, 5.0",
@@ -480,7 +480,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "extras/evaluate/camera_errors.py",
+        "extras/evaluate/protocol.py",
         (
             "centre error is the largest and not the root mean square",
             "math.sqrt(float(((moved - target) ** 2).sum(1).mean()))",
@@ -554,7 +554,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/membership.py",
+        "recon/daemon/submap.py",
         ("the newest keyframes may be given up", "old = len(graph.keyframes) - NEWEST", "old = len(graph.keyframes)"),
         (
             "a merged scene may lose most cameras",
@@ -617,7 +617,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "viewer",
-        "viewer/colours.py",
+        "viewer/analysis.py",
         ("a hidden Gaussian counts as seen", "_BEHIND = 1.05", "_BEHIND = 100.0"),
     ),
     *_list_mutants(

@@ -9,7 +9,7 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistort_image
+from splatnode.capture.lenses import undistort_image
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.pipeline import run

@@ -7,31 +7,31 @@ import re
 
 import pytest
 
-from splatnode.recon import cost
+from splatnode.recon import cli
 from tests.conftest import ROOT
 
 
 def test_the_figures_are_those_that_were_measured():
     rows = json.loads((ROOT / "tests" / "bench" / "results" / "growth.json").read_text())["rows"]
     measured = tuple((row["views"], round(row["seconds"]["total"], 1), round(row["peak_rss_mb"])) for row in rows)
-    assert measured == cost.MEASURED
+    assert measured == cli.MEASURED
 
 
 def said(count: int, side: tuple[int, int] = (640, 480)) -> list[float]:
     """The numbers of the line: how many, megapixels, shortest, longest, least, most."""
-    line = cost.format_cost([side] * count)
+    line = cli.format_cost([side] * count)
     assert line is not None and "\n" not in line
     return [float(number) for number in re.findall(r"[0-9.]+", line)]
 
 
 def test_of_a_few_photographs_nothing_is_said():
-    assert cost.format_cost([(4000, 3000)] * cost.FEW) is None
-    assert cost.format_cost([(640, 480)] * (cost.FEW + 1)) is not None
+    assert cli.format_cost([(4000, 3000)] * cli.FEW) is None
+    assert cli.format_cost([(640, 480)] * (cli.FEW + 1)) is not None
 
 
-@pytest.mark.parametrize(("views", "seconds", "megabytes"), cost.MEASURED[-2:])
+@pytest.mark.parametrize(("views", "seconds", "megabytes"), cli.MEASURED[-2:])
 def test_what_was_measured_lies_within_what_is_said(views, seconds, megabytes):
-    line = cost.format_cost([(640, 480)] * views)
+    line = cli.format_cost([(640, 480)] * views)
     assert line is not None and line.startswith(f"{views} photographs, ")
     *_, shortest, longest, least, most = said(views)
     unit = 60 if "minutes" in line else 1

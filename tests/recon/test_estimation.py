@@ -11,9 +11,8 @@ import pytest
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import PROVISIONAL, extend_reconstruction
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.incremental import IncrementalReconstruction, StreamState
+from splatnode.recon.incremental import IncrementalReconstruction, ReconstructionCache, StreamState
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.memory import ReconstructionCache
 from splatnode.recon.registration import registration
 from splatnode.recon.verification import consistency
 from tests.support.synthetic import photographs, places, view_graph

@@ -16,7 +16,7 @@ from splatnode.recon import preparation
 from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.matching import features, pair_matching, two_view
+from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.dynamic_objects import moving_points
 from splatnode.recon.matching.view_graph import match
 from splatnode.recon.preparation import UnusableFrame, prepare_all
@@ -74,7 +74,7 @@ def test_a_thumbnail_is_matched_without_a_fault(caplog):
 @pytest.mark.parametrize("error", [FAULT, np.linalg.LinAlgError("SVD did not converge")])
 def test_a_pair_on_which_a_library_fails_shares_nothing(monkeypatch, caplog, error):
     keyframes, _ = prepare_all(photographs()[:3], ReconstructionConfig())
-    estimate = two_view.estimate
+    estimate = pair_matching.estimate
     first = keyframes[0]
 
     def fail(points1, points2, *others):
@@ -84,7 +84,7 @@ def test_a_pair_on_which_a_library_fails_shares_nothing(monkeypatch, caplog, err
             raise error
         return estimate(points1, points2, *others)
 
-    monkeypatch.setattr(two_view, "estimate", fail)
+    monkeypatch.setattr(pair_matching, "estimate", fail)
     with caplog.at_level(logging.WARNING):
         graph = match(keyframes, ReconstructionConfig().matching)
     assert set(graph.pairs) == {(1, 2)}

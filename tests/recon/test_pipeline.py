@@ -13,8 +13,7 @@ from msgspec.structs import replace
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
-from splatnode.extras.evaluate.camera_errors import compare_cameras
-from splatnode.extras.evaluate.protocol import average_intrinsics, find_test_pose, psnr
+from splatnode.extras.evaluate.protocol import average_intrinsics, compare_cameras, find_test_pose, psnr
 from splatnode.extras.evaluate.regions import GaussianAppearance
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.geometry import align_cameras

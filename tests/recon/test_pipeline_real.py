@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
 from splatnode.extras.evaluate.dataset import load_scene, load_split
+from splatnode.extras.evaluate.protocol import CameraErrors, compare_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import registration

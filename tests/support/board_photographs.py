@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture import lenses
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses import lens as lenses
 from splatnode.extras.calibration.board import Board
 
 Array = npt.NDArray[np.float64]

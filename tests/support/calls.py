@@ -8,11 +8,9 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-from splatnode.extras.jobs.call import Answer
 from splatnode.extras.jobs.called import module_of
-from splatnode.extras.jobs.calls import Engine, Take
+from splatnode.extras.jobs.calls import Answer, Engine, Take, usable_cores
 from splatnode.extras.jobs.child import NOT_RUN, Limits
-from splatnode.extras.jobs.cores import usable_cores
 
 
 def in_this_process(cores_each: int | None = None) -> Engine:

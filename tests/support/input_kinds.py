@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.render import cast, look_at
-from splatnode.capture.diorama.scene import PALETTES, Builder, table
+from splatnode.capture.diorama.scene import PALETTES, Builder, cast, look_at, table
 from splatnode.capture.frame import Frame
 from splatnode.extras.building import walk
 from splatnode.extras.cameras import building

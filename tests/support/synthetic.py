@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.render import Camera, cast
-from splatnode.capture.diorama.scene import BRICK_WALL, place
+from splatnode.capture.diorama.scene import BRICK_WALL, Camera, cast, place
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.extras.evaluate.protocol import CameraErrors, compare_cameras
 from splatnode.recon.frames.keyframe import Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching

@@ -9,7 +9,7 @@ import numpy as np
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict

@@ -7,7 +7,7 @@ import re
 
 from splatnode.extras.calibration.board import Board
 from splatnode.extras.calibration.estimate import MODELS
-from splatnode.extras.calibration.verb import CALIBRATE
+from splatnode.extras.verbs import CALIBRATE
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "calibrate.md").read_text(encoding="utf-8")

@@ -21,7 +21,7 @@ STARTS = {
     "recon/core/release.py",  # the Python of a clean environment, isolated
 }
 UNPICKLES = {
-    "extras/jobs/call.py",  # from a folder of this user alone, or from Ray
+    "extras/jobs/calls.py",  # from a folder of this user alone, or from Ray
     "extras/jobs/called.py",  # from a folder of this user alone
     "extras/evaluate/runner.py",  # from a temporary folder of this user alone
     "extras/evaluate/stability/windows/campaign.py",  # arguments of a call

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_SCENE, Network, NetworkError, runtime_directory

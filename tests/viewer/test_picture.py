@@ -9,8 +9,7 @@ import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.result.verdict import Bounds, Scale, make_ball
-from splatnode.viewer.analysis import analyse
-from splatnode.viewer.colours import source_colour
+from splatnode.viewer.analysis import analyse, source_colour
 from splatnode.viewer.paint import add_caption, blend_image, paint, paint_gaussians
 from splatnode.viewer.shapes import (
     ImageQuad,

@@ -12,8 +12,16 @@ from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Bounds, Code, Scale, Verdict, make_ball
 from splatnode.viewer import text
-from splatnode.viewer.analysis import GOOD_ANGLE_DEG, Points, next_view, surface_points
-from splatnode.viewer.colours import UNKNOWN, colour_gaussians, source_colour, support
+from splatnode.viewer.analysis import (
+    GOOD_ANGLE_DEG,
+    UNKNOWN,
+    Points,
+    colour_gaussians,
+    next_view,
+    source_colour,
+    support,
+    surface_points,
+)
 from splatnode.viewer.state import Colouring, Moment, ViewerState, append_moment
 from splatnode.viewer.viewpoint import look_at
 

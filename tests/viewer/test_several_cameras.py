@@ -12,7 +12,7 @@ from splatnode.recon.result.message import decode_snapshot, encode_snapshot
 from splatnode.recon.result.snapshot import GivenCameraPose
 from splatnode.recon.result.verdict import Scale
 from splatnode.viewer import text
-from splatnode.viewer.colours import camera_colours, source_colour
+from splatnode.viewer.analysis import camera_colours, source_colour
 from splatnode.viewer.shapes import shapes
 from splatnode.viewer.state import ViewerState
 from splatnode.viewer.web.server import Content

@@ -13,9 +13,8 @@ import time
 from pathlib import Path
 
 from splatnode import command_line
-from splatnode.capture import v4l2_device
-from splatnode.capture.cameras.v4l2 import find
-from splatnode.capture.v4l2_device import Device
+from splatnode.capture.cameras import v4l2
+from splatnode.capture.cameras.v4l2 import Device, find
 
 WIDTH, HEIGHT = 720, 576  # of PAL
 OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT
@@ -46,33 +45,31 @@ def main() -> int:
 def show(path: str, pictures: list[bytes]) -> None:
     """Gives each picture to the driver's output for a while, again and again."""
     device = os.open(path, os.O_RDWR)
-    wish = v4l2_device.FormatStruct(type=OUTPUT)
+    wish = v4l2.FormatStruct(type=OUTPUT)
     wish.fmt.pix.width, wish.fmt.pix.height = WIDTH, HEIGHT
-    wish.fmt.pix.pixelformat, wish.fmt.pix.field = v4l2_device.fourcc("YUYV"), INTERLACED
-    fcntl.ioctl(device, v4l2_device.S_FMT, wish)
-    request = v4l2_device.BufferRequest(count=4, type=OUTPUT, memory=v4l2_device.MMAP)
-    fcntl.ioctl(device, v4l2_device.REQBUFS, request)
+    wish.fmt.pix.pixelformat, wish.fmt.pix.field = v4l2.fourcc("YUYV"), INTERLACED
+    fcntl.ioctl(device, v4l2.S_FMT, wish)
+    request = v4l2.BufferRequest(count=4, type=OUTPUT, memory=v4l2.MMAP)
+    fcntl.ioctl(device, v4l2.REQBUFS, request)
     maps = []
     for index in range(request.count):
-        buffer = v4l2_device.Buffer(index=index, type=OUTPUT, memory=v4l2_device.MMAP)
-        fcntl.ioctl(device, v4l2_device.QUERYBUF, buffer)
+        buffer = v4l2.Buffer(index=index, type=OUTPUT, memory=v4l2.MMAP)
+        fcntl.ioctl(device, v4l2.QUERYBUF, buffer)
         maps.append(mmap.mmap(device, buffer.length, offset=buffer.m.offset))
         give(device, maps, index, pictures[0])
-    fcntl.ioctl(device, v4l2_device.STREAMON, ctypes.c_int(OUTPUT))
+    fcntl.ioctl(device, v4l2.STREAMON, ctypes.c_int(OUTPUT))
     for picture in itertools.cycle(pictures):
         until_s = time.monotonic() + HOLD_S
         while time.monotonic() < until_s:
-            buffer = v4l2_device.Buffer(type=OUTPUT, memory=v4l2_device.MMAP)
-            fcntl.ioctl(device, v4l2_device.DQBUF, buffer)
+            buffer = v4l2.Buffer(type=OUTPUT, memory=v4l2.MMAP)
+            fcntl.ioctl(device, v4l2.DQBUF, buffer)
             give(device, maps, buffer.index, picture)
 
 
 def give(device: int, maps: list[mmap.mmap], index: int, picture: bytes) -> None:
     maps[index][: len(picture)] = picture
-    buffer = v4l2_device.Buffer(
-        index=index, type=OUTPUT, memory=v4l2_device.MMAP, bytesused=len(picture), field=INTERLACED
-    )
-    fcntl.ioctl(device, v4l2_device.QBUF, buffer)
+    buffer = v4l2.Buffer(index=index, type=OUTPUT, memory=v4l2.MMAP, bytesused=len(picture), field=INTERLACED)
+    fcntl.ioctl(device, v4l2.QBUF, buffer)
 
 
 sys.exit(main())

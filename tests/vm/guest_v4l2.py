@@ -10,12 +10,11 @@ from typing import Any
 
 import msgspec
 
-from splatnode.capture import v4l2_device
-from splatnode.capture.cameras.v4l2 import Config, find, stream
+from splatnode.capture.cameras import v4l2
+from splatnode.capture.cameras.v4l2 import Config, Device, find, stream
 from splatnode.capture.frame import CameraUnavailable, Frame
 from splatnode.capture.reader import Config as ReaderConfig
 from splatnode.capture.reader import Reader, ReaderState
-from splatnode.capture.v4l2_device import Device
 
 DISCONNECT = 0x00F0F000 + 65  # vivid's control of that name
 
@@ -27,8 +26,8 @@ def main() -> None:
     result["frames"] = [described(frame) for frame in itertools.islice(stream(config), 8)]
     result["busy"] = second_reader(config)
     with Device(camera["device"]) as device:
-        result["held"] = v4l2_device.hold(device)
-        result["gain_is_automatic"] = device.get_control(v4l2_device.AUTO_GAIN)
+        result["held"] = v4l2.hold(device)
+        result["gain_is_automatic"] = device.get_control(v4l2.AUTO_GAIN)
     result["unplugged"] = unplugged_while_streaming(config)
     result["replugged"] = lost_and_back(config)
     Path("/mnt/result.json").write_text(json.dumps(result))
@@ -70,7 +69,7 @@ def unplug(device):
     """As pulling the cable does. vivid plugs itself in again when nobody has it open any more."""
     with Device(device) as handle:
         name = handle.control_range(DISCONNECT).name
-        handle._ioctl(v4l2_device.S_CTRL, v4l2_device.Control(id=DISCONNECT, value=1))
+        handle._ioctl(v4l2.S_CTRL, v4l2.Control(id=DISCONNECT, value=1))
     return name
 
 

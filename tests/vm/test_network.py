@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging import network as network_module
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, Network

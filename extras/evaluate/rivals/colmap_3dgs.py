@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.extras.evaluate.rivals import outcome
 from splatnode.extras.evaluate.rivals.colmap import RegisteredFrame, SparseModel, reconstruct_sparse_model
 from splatnode.recon.clock import Clock

@@ -1,4 +1,9 @@
-"""All trials of a plan, some at a time; what is on the disk already is not run again; and its verb."""
+"""All trials of a plan, some at a time; what is on the disk already is not run again; and its verb.
+
+The matrix has all rows, by number: every `MatrixRow` of the modules in `_FAMILIES`. A new row is one function in one of
+these files; a new file of rows is that file and its name in `_FAMILIES`. Those of `degradations.ROWS` are made from its
+kinds.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,7 @@ import dataclasses
 import logging
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,21 +20,49 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.terminal import say
-from splatnode.extras.evaluate.colmap_model import read_json
+from splatnode.extras.evaluate.dataset import read_json
 from splatnode.extras.evaluate.report import check_same_cores, describe_machine, explain_missing_seconds
 from splatnode.extras.evaluate.runner import Journal
-from splatnode.extras.evaluate.stability.case import MatrixRow, TrialCase
-from splatnode.extras.evaluate.stability.matrix import select_rows
+from splatnode.extras.evaluate.stability import cases, degradations
 from splatnode.extras.evaluate.stability.perturbations import Sampler, ScenesByMotion, load_scenes_by_motion
 from splatnode.extras.evaluate.stability.report import Rate, make_report, summarise
-from splatnode.extras.evaluate.stability.trial import FAILED, Trial, find_method, judge_trial, run_trial
+from splatnode.extras.evaluate.stability.trial import (
+    FAILED,
+    MatrixRow,
+    Trial,
+    TrialCase,
+    find_method,
+    judge_trial,
+    run_trial,
+)
 from splatnode.extras.evaluate.stability.windows.campaign import run_windows_verb
-from splatnode.extras.jobs.call import pack_call
-from splatnode.extras.jobs.calls import Engine, Task, work_folder
+from splatnode.extras.jobs.calls import Engine, Task, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.folder import hold_result_folder
+
+_FAMILIES = (cases, degradations)
+
+ROWS: tuple[MatrixRow, ...] = tuple(
+    sorted(
+        (
+            *(found for family in _FAMILIES for found in vars(family).values() if isinstance(found, MatrixRow)),
+            *degradations.ROWS,
+        ),
+        key=lambda r: r.number,
+    )
+)
+
+
+def select_rows(numbers: Collection[int]) -> tuple[MatrixRow, ...]:
+    """The rows with these numbers; all, where there are none. Raises ValueError for a number that no row has."""
+    known = {found.number for found in ROWS}
+    unknown = sorted(set(numbers) - known)
+    if unknown:
+        raise ValueError(f"no row {', '.join(map(str, unknown))}; there are {min(known)} to {max(known)}")
+    return tuple(found for found in ROWS if not numbers or found.number in numbers)
+
 
 logger = logging.getLogger(__name__)
 

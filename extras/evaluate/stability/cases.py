@@ -15,24 +15,10 @@ import numpy as np
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.lenses.wide_pinhole import wide_pinhole
+from splatnode.capture.lenses import wide_pinhole
 from splatnode.capture.quality import Limits, novelty, why_redundant
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
 from splatnode.extras.evaluate.stability import perturbations
-from splatnode.extras.evaluate.stability.case import (
-    LIGHT,
-    Demand,
-    ProbeResult,
-    TrialCase,
-    describe_case,
-    make_accept_case,
-    make_either_case,
-    make_frames,
-    make_refuse_case,
-    make_stream_source,
-    make_world,
-    row,
-)
 from splatnode.extras.evaluate.stability.perturbations import (
     Image,
     Sampler,
@@ -43,11 +29,23 @@ from splatnode.extras.evaluate.stability.perturbations import (
     resize_image,
 )
 from splatnode.extras.evaluate.stability.trial import (
+    LIGHT,
+    Demand,
+    ProbeResult,
+    TrialCase,
+    describe_case,
+    make_accept_case,
     make_budget_probe,
+    make_either_case,
+    make_frames,
     make_overfit_probe,
+    make_refuse_case,
     make_repeatability_probe,
     make_same_cameras_probe,
     make_stream_quality_probe,
+    make_stream_source,
+    make_world,
+    row,
     splatnode,
 )
 from splatnode.recon.config import ReconstructionConfig

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.optimize import lsq_linear, minimize
 
 from splatnode.capture.process.records import record_of
-from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, has_only_right_cameras, make_finite_bounds
+from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError, has_only_right_cameras, make_finite_bounds
 from splatnode.extras.evaluate.stability.windows.campaign import KINDS, compute_share_within
 from splatnode.extras.evaluate.stability.windows.windows import OURS, WindowRow
 from splatnode.recon.result.verdict import Code
@@ -38,7 +38,7 @@ from splatnode.recon.verification.error_model import (
 from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.refit import Errors
 
-CLEAN = "clean"  # the kind of trials of `lens_assumptions` that break nothing
+CLEAN = "clean"  # the kind of trials of lens assumptions that break nothing
 GROSS_SPREAD_PCT = 20.0  # of the true centres' spread
 
 
@@ -53,7 +53,7 @@ class Sample:
     stood_still: bool  # the pairs alone refused it: the camera only turned, or not even that
     evidence: Evidence
     errors: Mapping[str, CameraError]  # by camera; of those that have a true one
-    broken: bool = False  # its images break what is assumed of lenses, on purpose: a trial of `lens_assumptions`
+    broken: bool = False  # its images break what is assumed of lenses, on purpose: a trial of lens assumptions
     told: bool = False  # what EXIF or a calibration says of the lens came with the photographs of a window
 
     @property

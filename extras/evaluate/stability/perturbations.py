@@ -18,8 +18,13 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
-from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, check_distinct_names, load_scene
-from splatnode.extras.evaluate.demo import write_capture
+from splatnode.extras.evaluate.dataset import (
+    EvaluationScene,
+    TrueCamera,
+    check_distinct_names,
+    load_scene,
+    write_capture,
+)
 from splatnode.recon.geometry import angles_deg, distortion
 
 # Where the photographs of the trials come from: recorded scenes with true cameras, or the built-in place.

@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from splatnode.extras.evaluate.colmap_model import read_json
-from splatnode.extras.evaluate.stability.case import Demand, Outcome
+from splatnode.extras.evaluate.dataset import read_json
+from splatnode.extras.evaluate.stability.trial import Demand, Outcome
 from splatnode.recon.result.export.staged import write_files
 
 _Z95 = 1.959963984540054  # normal quantile of a two-sided 95 % interval

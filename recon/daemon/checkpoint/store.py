@@ -61,7 +61,7 @@ from splatnode.recon.daemon.checkpoint.records import (
 )
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.registration import RegisteredCamera, Registration

@@ -6,8 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.messaging.keys import allow, create_keys, expect_server
-from splatnode.capture.messaging.network import RECON_SCENE, Network, NotAllowed
+from splatnode.capture.messaging.network import RECON_SCENE, Network, NotAllowed, allow, create_keys, expect_server
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
 from splatnode.recon.result.message import SceneHeader

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.messaging.keys import create_keys, expect_server
-from splatnode.capture.messaging.network import RECON_SCENE, Network
+from splatnode.capture.messaging.network import RECON_SCENE, Network, create_keys, expect_server
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
 from splatnode.capture.status import heartbeats

@@ -27,8 +27,7 @@ import yaml
 
 from splatnode.capture.cameras.synthetic import TARGET, Config, intrinsic_matrix, look_at, render_image
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.messaging.keys import create_keys
-from splatnode.capture.messaging.network import CAPTURE_PREVIEW
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, create_keys
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.status import heartbeats
 from tests.bench.node.soak import SAMPLE_S, change, sample

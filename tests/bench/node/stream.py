@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.status import heartbeats
-from splatnode.extras.evaluate.camera_errors import compare_cameras
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.pipeline import reconstruct

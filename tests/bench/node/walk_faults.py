@@ -24,7 +24,7 @@ from typing import Any
 import cv2
 import msgspec
 
-from splatnode.capture.messaging.keys import create_keys, expect_server
+from splatnode.capture.messaging.network import create_keys, expect_server
 from splatnode.capture.status import heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node import on_the_way

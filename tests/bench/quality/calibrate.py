@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
+from splatnode.capture import lenses
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses import lens as lenses
 from splatnode.extras.calibration.board import Board
 from splatnode.extras.calibration.collect import (
     CORNERS,

@@ -20,8 +20,7 @@ from pathlib import Path
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.lenses.undistort import undistort_frame
-from splatnode.capture.lenses.wide_pinhole import wide_pinhole
+from splatnode.capture.lenses import undistort_frame, wide_pinhole
 from splatnode.extras.evaluate.dataset import Split, load_scene
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.config import preset

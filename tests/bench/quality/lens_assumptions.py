@@ -1,6 +1,6 @@
 """Images that break what is assumed of lenses: `python -m tests.bench lens_assumptions SCENE ... --out FILE`.
 
-For each scene, number of images (3, 6, 12), kind of `extras/evaluate/stability/lens_assumptions.py` and setting
+For each scene, number of images (3, 6, 12), kind of `extras/evaluate/stability/degradations.py` and setting
 (nothing told, EXIF right and unchanged, lens given for all), cameras and verdict are estimated from a window that
 overlaps well, and compared with the truth. Wrong is a camera beyond 2.5 times a bound, or beyond 5 degrees or 10 % of
 the distance without the word rough. A trial counts as answered where it is published and not wrong.
@@ -26,7 +26,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from splatnode.extras.evaluate.dataset import load_scene
-from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, make_frames, make_world, score_cameras
+from splatnode.extras.evaluate.stability.degradations import COUNTS, KINDS, SETTINGS, AssumptionBreak, set_intrinsics
 from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     exceeds_bounds,
@@ -36,20 +36,21 @@ from splatnode.extras.evaluate.stability.fitting import (
     make_trial_samples,
     read_samples,
 )
-from splatnode.extras.evaluate.stability.lens_assumptions import (
-    COUNTS,
-    KINDS,
-    SETTINGS,
-    AssumptionBreak,
-    set_intrinsics,
-)
 from splatnode.extras.evaluate.stability.perturbations import (
     TrialImage,
     TrialScene,
     find_neighbour_sets,
     find_parallel_sets,
 )
-from splatnode.extras.evaluate.stability.trial import ensure_registration, list_registered_cameras
+from splatnode.extras.evaluate.stability.trial import (
+    ROUGH,
+    CameraError,
+    ensure_registration,
+    list_registered_cameras,
+    make_frames,
+    make_world,
+    score_cameras,
+)
 from splatnode.extras.evaluate.stability.windows.windows import (
     OURS,
     PieceKey,
@@ -59,7 +60,7 @@ from splatnode.extras.evaluate.stability.windows.windows import (
 )
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.preparation import load_prior, prepare

@@ -39,7 +39,7 @@ from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, load_
 from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.locating.localize import QUICK, follow, localize_image, localize_query, prepare_query_image

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.metric.evidence import Evidence, gather_evidence

@@ -17,10 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.extras.evaluate.camera_errors import compare_cameras
 from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
-from splatnode.extras.evaluate.stability.case import measure_camera_errors
-from splatnode.extras.evaluate.stability.trial import list_registered_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
+from splatnode.extras.evaluate.stability.trial import list_registered_cameras, measure_camera_errors
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.frames.keyframe import Keyframe, resize_image

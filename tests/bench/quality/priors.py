@@ -19,9 +19,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatnode.extras.evaluate.camera_errors import compare_cameras
-from splatnode.recon.priors.mast3r.global_alignment import align_views
-from splatnode.recon.priors.mast3r.network import Mast3r
+from splatnode.extras.evaluate.protocol import compare_cameras
+from splatnode.recon.priors.mast3r import Mast3r, align_views
 from splatnode.recon.priors.stereo import StereoConfig
 from splatnode.recon.result.report import peak_rss_mb
 from tests.bench.speed.stereo import METHODS, make_case, run

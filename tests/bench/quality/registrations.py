@@ -20,10 +20,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatnode.extras.evaluate.stability.case import ROUGH, MatrixRow, classify_outcome, score_cameras
-from splatnode.extras.evaluate.stability.matrix import ROWS
+from splatnode.extras.evaluate.stability.campaign import ROWS
 from splatnode.extras.evaluate.stability.perturbations import Sampler, load_scenes_by_motion, load_trial_scenes
-from splatnode.extras.evaluate.stability.trial import ensure_registration, list_registered_cameras
+from splatnode.extras.evaluate.stability.trial import (
+    ROUGH,
+    MatrixRow,
+    classify_outcome,
+    ensure_registration,
+    list_registered_cameras,
+    score_cameras,
+)
 from splatnode.extras.evaluate.stability.windows import campaign
 from splatnode.extras.evaluate.stability.windows.windows import (
     OURS,
@@ -40,7 +46,7 @@ from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 
 SEEDS = 4
-LENS_ROWS = 31  # of the matrix from this number on: `lens_assumptions` has them on more scenes
+LENS_ROWS = 31  # of the matrix from this number on: `degradations` has them on more scenes
 # Rows that ask something else than whether cameras are right
 OTHERS = (
     "soak", "determinism", "overfit", "gross model", "a huge file", "damaged files", "nothing but damaged files",

@@ -21,13 +21,11 @@ import cv2
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.lens import unproject
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame, unproject
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import TrueCamera, load_scene
-from splatnode.extras.evaluate.stability.case import ROUGH, CameraError, score_cameras
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, TrialScene
-from splatnode.extras.evaluate.stability.trial import list_registered_cameras
+from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError, list_registered_cameras, score_cameras
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.pipeline import estimate_frame_cameras

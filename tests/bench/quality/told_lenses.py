@@ -16,10 +16,9 @@ import cv2
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.lens import project, unproject
-from splatnode.extras.evaluate.camera_errors import CameraErrors, compare_cameras
+from splatnode.capture.lenses import project, unproject
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split
-from splatnode.extras.evaluate.protocol import PerceptualNetworks
+from splatnode.extras.evaluate.protocol import CameraErrors, PerceptualNetworks, compare_cameras
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.config import preset
 from splatnode.recon.pipeline import run

@@ -24,9 +24,9 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses.lens import unproject
+from splatnode.capture.lenses import unproject
 from splatnode.capture.process.terminal import say
-from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import distortion

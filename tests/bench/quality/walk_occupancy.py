@@ -17,7 +17,7 @@ import msgspec
 
 from splatnode.extras.cameras import building
 from splatnode.recon.merging.command import write_maps
-from splatnode.recon.merging.submap import Submap
+from splatnode.recon.merging.merge import Submap
 from splatnode.recon.occupancy.command import read_to_map
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.threads import apply_thread_limit

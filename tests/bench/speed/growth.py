@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.evaluate.demo import write_training_images
+from splatnode.extras.evaluate.dataset import write_training_images
 from splatnode.extras.evaluate.report import describe_machine
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -23,8 +23,8 @@ from splatnode.extras.priors.patchmatchnet import WEIGHTS, NetworkStereo, load_n
 from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors.classical import DepthEstimator
-from splatnode.recon.priors.multi_view_consistency import DepthMap
 from splatnode.recon.priors.stereo import (
+    DepthMap,
     SparsePoints,
     StereoConfig,
     StereoView,

@@ -15,7 +15,7 @@ def agreement(result: Path) -> dict:
     """Differences between the engines' pictures on black, in levels of 255, at the result's cameras."""
     from open3d.visualization import rendering  # pyright: ignore[reportMissingImports]
 
-    from splatnode.viewer.scene3d import Scene3D
+    from splatnode.viewer.stage import Scene3D
 
     moment = load_result(result)
     cameras, gaussians = moment.snapshot.cameras, moment.snapshot.gaussians

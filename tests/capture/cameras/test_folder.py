@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras.folder import Config, stream
-from splatnode.capture.exif import exif_intrinsics, read_tags
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.image_file import UnusableImage, decode_image
-from splatnode.capture.image_header import read_header
+from splatnode.capture.image_header import exif_intrinsics, read_header, read_tags
 
 # Left half red, right half blue, the top left corner white: tells every orientation and channel order apart.
 PICTURE = np.zeros((48, 64, 3), np.uint8)

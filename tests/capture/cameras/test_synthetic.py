@@ -7,10 +7,9 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.cameras.synthetic import Config
-from splatnode.capture.diorama.render import Shape, face_points, ray_interval, surface_coordinates
-from splatnode.capture.diorama.scene import place
+from splatnode.capture.diorama.scene import Shape, face_points, place, ray_interval, surface_coordinates
 from splatnode.capture.frame import Clock, Intrinsics, Stamp
-from splatnode.capture.lenses.lens import unproject
+from splatnode.capture.lenses import unproject
 from tests.support.synthetic import SMALL, photographs, planar, pure_rotation, pure_rotation_cameras, tiny_scene
 
 

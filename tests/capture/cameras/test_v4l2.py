@@ -12,11 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture import v4l2_device
 from splatnode.capture.cameras import v4l2
-from splatnode.capture.cameras.v4l2 import Config, find, stream
+from splatnode.capture.cameras.v4l2 import Config, Device, System, find, stream
 from splatnode.capture.frame import CameraUnavailable, Clock, DroppedFrame, Frame, Intrinsics
-from splatnode.capture.v4l2_device import Device, System
 
 IMAGE = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8), (0, 0), 3)
 JPEG = cv2.imencode(".jpg", cv2.cvtColor(IMAGE, cv2.COLOR_RGB2BGR))[1].tobytes()
@@ -54,25 +52,25 @@ class Driver:
 
     def _ioctl(self, fd, request, argument):
         assert fd == 7 and not self.closed
-        name = next(name for name in dir(v4l2_device) if getattr(v4l2_device, name) == request)
+        name = next(name for name in dir(v4l2) if getattr(v4l2, name) == request)
         getattr(self, f"_{name.lower()}")(argument)
 
     def _querycap(self, it):
         it.card, it.bus_info = b"Fake Webcam", b"usb-1"
-        it.capabilities = v4l2_device.HAS_DEVICE_CAPS | v4l2_device.CAN_CAPTURE
-        it.device_caps = v4l2_device.CAN_CAPTURE | v4l2_device.CAN_STREAM
+        it.capabilities = v4l2.HAS_DEVICE_CAPS | v4l2.CAN_CAPTURE
+        it.device_caps = v4l2.CAN_CAPTURE | v4l2.CAN_STREAM
 
     def _enum_fmt(self, it):
         if it.index >= len(self.formats):
             raise OSError(errno.EINVAL, "Invalid argument")
-        it.pixelformat = v4l2_device.fourcc(self.formats[it.index])
+        it.pixelformat = v4l2.fourcc(self.formats[it.index])
 
     def _s_fmt(self, it):
         pix = it.fmt.pix
-        self.pixels = v4l2_device.fourcc_name(pix.pixelformat)
+        self.pixels = v4l2.fourcc_name(pix.pixelformat)
         if self.pixels not in self.formats:
             self.pixels = self.formats[0]
-        pix.pixelformat, pix.width, pix.height = v4l2_device.fourcc(self.pixels), 64, 48
+        pix.pixelformat, pix.width, pix.height = v4l2.fourcc(self.pixels), 64, 48
         pix.bytesperline = 128 + self.padding if self.pixels == "YUYV" else 0
 
     def _s_parm(self, it):
@@ -90,7 +88,7 @@ class Driver:
         self.queued.append(it.index)
 
     def _streamon(self, it):
-        assert isinstance(it, ctypes.c_int) and it.value == v4l2_device.CAPTURE
+        assert isinstance(it, ctypes.c_int) and it.value == v4l2.CAPTURE
 
     _streamoff = _streamon
 
@@ -106,7 +104,7 @@ class Driver:
         self.memory[it.index][: len(data)] = data
         it.bytesused, it.sequence = len(data), self.delivered
         it.timestamp.seconds, it.timestamp.microseconds = 100, 1000 * self.delivered
-        it.flags = v4l2_device.TIMESTAMP_MONOTONIC | (v4l2_device.BUFFER_ERROR if event == "error" else 0)
+        it.flags = v4l2.TIMESTAMP_MONOTONIC | (v4l2.BUFFER_ERROR if event == "error" else 0)
 
     def _padded(self):
         lines = np.frombuffer(YUYV, np.uint8).reshape(48, 128)
@@ -138,15 +136,15 @@ def no_real_cameras(monkeypatch):
 
 def test_the_structs_are_as_large_as_the_kernels():
     sizes = (
-        v4l2_device.Capability,
-        v4l2_device.FormatStruct,
-        v4l2_device.BufferRequest,
-        v4l2_device.Buffer,
-        v4l2_device.StreamParameters,
+        v4l2.Capability,
+        v4l2.FormatStruct,
+        v4l2.BufferRequest,
+        v4l2.Buffer,
+        v4l2.StreamParameters,
     )
     assert [ctypes.sizeof(size) for size in sizes] == [104, 208, 20, 88, 204]
-    assert (v4l2_device.QUERYCAP, v4l2_device.S_FMT, v4l2_device.DQBUF) == (0x80685600, 0xC0D05605, 0xC0585611)
-    assert (v4l2_device.STREAMON, v4l2_device.S_PARM, v4l2_device.QUERYCTRL) == (0x40045612, 0xC0CC5616, 0xC0445624)
+    assert (v4l2.QUERYCAP, v4l2.S_FMT, v4l2.DQBUF) == (0x80685600, 0xC0D05605, 0xC0585611)
+    assert (v4l2.STREAMON, v4l2.S_PARM, v4l2.QUERYCTRL) == (0x40045612, 0xC0CC5616, 0xC0445624)
 
 
 def test_jpeg_frames_keep_their_bytes():
@@ -214,27 +212,27 @@ def test_a_lost_camera_says_why(driver, config, message):
 
 def test_exposure_and_white_balance_are_held_at_what_the_camera_chose():
     controls = {
-        v4l2_device.AUTO_EXPOSURE: 1,
-        v4l2_device.EXPOSURE: 156,
-        v4l2_device.AUTO_WHITE_BALANCE: 0,
-        v4l2_device.EXPOSURE_PRIORITY: 1,
+        v4l2.AUTO_EXPOSURE: 1,
+        v4l2.EXPOSURE: 156,
+        v4l2.AUTO_WHITE_BALANCE: 0,
+        v4l2.EXPOSURE_PRIORITY: 1,
     }
     driver = Driver(controls=controls)
     frames(driver, 1, lock_exposure=True)
     assert driver.controls == {
-        v4l2_device.AUTO_EXPOSURE: v4l2_device.EXPOSURE_MANUAL,
-        v4l2_device.EXPOSURE: 156,
-        v4l2_device.AUTO_WHITE_BALANCE: 0,
-        v4l2_device.EXPOSURE_PRIORITY: 0,
+        v4l2.AUTO_EXPOSURE: v4l2.EXPOSURE_MANUAL,
+        v4l2.EXPOSURE: 156,
+        v4l2.AUTO_WHITE_BALANCE: 0,
+        v4l2.EXPOSURE_PRIORITY: 0,
     }
     frames(driver, 1, lock_exposure=True, exposure_us=5000)
-    assert driver.controls[v4l2_device.EXPOSURE] == 50
+    assert driver.controls[v4l2.EXPOSURE] == 50
 
 
 def test_what_cannot_be_held_is_told():
-    controls = {v4l2_device.AUTO_EXPOSURE: "stubborn", v4l2_device.AUTO_WHITE_BALANCE: 1}
+    controls = {v4l2.AUTO_EXPOSURE: "stubborn", v4l2.AUTO_WHITE_BALANCE: 1}
     with Device("/dev/video0", Driver(controls=controls).system()) as device:
-        assert v4l2_device.hold(device) == {"exposure": False, "gain": None, "white_balance": True, "focus": None}
+        assert v4l2.hold(device) == {"exposure": False, "gain": None, "white_balance": True, "focus": None}
 
 
 def test_closing_the_stream_closes_the_device():

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from splatnode.capture import lenses
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses import fisheye
-from splatnode.capture.lenses.lens import project, unproject
+from splatnode.capture.lenses import project, unproject
 
 OPENCV = Intrinsics(640, 480, 500, 510, 322, 238, "calibration", (-0.2, 0.05, 0.001, -0.002, 0.01))
 FISHEYE = Intrinsics(640, 480, 210, 212, 322, 238, "calibration", (0.03, -0.01, 0.002, -0.0005), "fisheye")
@@ -45,10 +45,10 @@ def test_a_pinhole_does_not_see_what_is_behind_it_and_a_fisheye_does():
 
 def test_terms_that_turn_back_end_where_they_do():
     turning = Intrinsics(640, 480, 200, 200, 320, 240, "given", (-0.25,), "fisheye")  # 1 - 0.75 t^2 = 0
-    assert abs(fisheye.largest_angle(turning) - math.sqrt(1 / 0.75)) < 1e-9
+    assert abs(lenses.largest_angle(turning) - math.sqrt(1 / 0.75)) < 1e-9
     assert np.isnan(project(np.array([[1.0, 0.0, 0.1]]), turning)).all()
     assert np.isnan(unproject(np.array([[639.0, 240.0]]), turning)).all()
-    assert fisheye.largest_angle(FISHEYE) > math.radians(100)
+    assert lenses.largest_angle(FISHEYE) > math.radians(100)
 
 
 def test_shapes_are_told():

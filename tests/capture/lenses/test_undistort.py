@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 
 WIDTH, HEIGHT = 320, 240
 

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.lens import project, unproject
-from splatnode.capture.lenses.undistort import undistort_frame
-from splatnode.capture.lenses.wide_pinhole import MOST_DEG
+from splatnode.capture.lenses import MOST_DEG, project, undistort_frame, unproject
 
 WIDTH, HEIGHT = 640, 480
 

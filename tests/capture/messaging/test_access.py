@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import zmq
 
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging.messages import DroppedHeader
 from splatnode.capture.messaging.network import (
     CAPTURE_PREVIEW,

@@ -9,10 +9,8 @@ import socket
 import pytest
 import zmq
 
-from splatnode.capture.messaging import gate as gate_module
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.gate import PLACES
-from splatnode.capture.messaging.network import CAPTURE_PREVIEW, files_for_strangers
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, PLACES, Gate, files_for_strangers
 from splatnode.capture.messaging.pubsub import Publisher, Subscriber
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.crowd import network_of, next_to_go
@@ -54,7 +52,7 @@ def test_a_crowd_has_few_places_and_who_has_the_key_is_let_in(tmp_path, crowd, s
 
 
 def test_many_who_have_the_key_are_no_crowd(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(network_module, "Gate", lambda bound: gate_module.Gate(bound, 3))
+    monkeypatch.setattr(network_module, "Gate", lambda bound: Gate(bound, 3))
     network, numbering = tcp(tmp_path), Numbering()
     with contextlib.ExitStack() as stack:
         publisher = stack.enter_context(Publisher(CAPTURE_PREVIEW, network))
@@ -64,7 +62,7 @@ def test_many_who_have_the_key_are_no_crowd(tmp_path, monkeypatch, caplog):
 
 
 def test_a_wrong_key_is_no_key(tmp_path, monkeypatch):
-    monkeypatch.setattr(network_module, "Gate", lambda bound: gate_module.Gate(bound, 2))
+    monkeypatch.setattr(network_module, "Gate", lambda bound: Gate(bound, 2))
     network, numbering = tcp(tmp_path), Numbering()
     with contextlib.ExitStack() as stack, Publisher(CAPTURE_PREVIEW, network) as publisher:
         context = stack.enter_context(zmq.Context())

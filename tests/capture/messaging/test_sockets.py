@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zmq
 
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging.network import (
     CAPTURE_PREVIEW,
     RECON_CONTROL,

@@ -8,8 +8,7 @@ import pytest
 
 from splatnode import command_line
 from splatnode.capture.frame import CameraUnavailable
-from splatnode.capture.messaging.keys import KeyFileError
-from splatnode.capture.messaging.network import NotAllowed
+from splatnode.capture.messaging.network import KeyFileError, NotAllowed
 from splatnode.capture.process.system import FailedAfterReady, ServiceManager, wrap_late_errors
 from tests.conftest import ROOT
 

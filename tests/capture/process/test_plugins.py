@@ -134,7 +134,7 @@ def test_a_verb_of_another_package_is_offered_and_one_that_is_broken_is_left_out
 BROKEN = """
 from types import SimpleNamespace
 from splatnode.capture.process.arguments import Verb
-from splatnode.viewer.further import FurtherViewer
+from splatnode.viewer.verbs import FurtherViewer
 
 def fail(parser):
     raise KeyError("nothing")

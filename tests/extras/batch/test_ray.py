@@ -13,8 +13,7 @@ from splatnode.batch import reconstruct_dataset, recordings
 from splatnode.extras.batch.batch import BatchRecording
 from splatnode.extras.batch.command import EXIT_SOME_FAILED, run_batch
 from splatnode.extras.batch.remote import Job, run_recording
-from splatnode.extras.jobs.call import pack_call
-from splatnode.extras.jobs.calls import Task, engine
+from splatnode.extras.jobs.calls import Task, engine, pack_call
 from splatnode.extras.jobs.child import Limits
 from tests.support.hostile_folder import make_hostile
 from tests.support.recordings import GOOD, REFUSED, options, simulated

@@ -14,9 +14,8 @@ import pytest
 from splatnode.extras.batch import command
 from splatnode.extras.batch.batch import BatchRecording
 from splatnode.extras.batch.remote import Job, run_recording
+from splatnode.extras.jobs.calls import free_core, own_version
 from splatnode.extras.jobs.child import Limits
-from splatnode.extras.jobs.cores import free_core
-from splatnode.extras.jobs.version import own_version
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from splatnode.capture import lenses
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses import lens as lenses
 from splatnode.extras.calibration.board import Board, BoardView
 from splatnode.extras.calibration.collect import ENOUGH
 from splatnode.extras.calibration.estimate import MODELS, choose, estimate_lens, pixel_sigmas

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.capture.lenses import lens as lenses
+from splatnode.capture import lenses
 from splatnode.extras.calibration.estimate import MODELS, project_points
 
 RNG = np.random.default_rng(0)

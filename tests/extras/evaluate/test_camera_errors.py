@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.extras.evaluate.camera_errors import compare_cameras, compute_ate_instantsplat, compute_centre_error_pct
+from splatnode.extras.evaluate.protocol import compare_cameras, compute_ate_instantsplat, compute_centre_error_pct
 from splatnode.recon.geometry import Similarity, angles_deg, exp_se3, umeyama
 
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.extras.evaluate.dataset import Split, load_scene
 from splatnode.extras.evaluate.protocol import (
     Run,

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.extras.evaluate.colmap_model import EvaluationFileError
-from splatnode.extras.evaluate.dataset import Split, load_scene, load_split, make_paper_split
+from splatnode.extras.evaluate.dataset import EvaluationFileError, Split, load_scene, load_split, make_paper_split
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.image_file import encode_png
-from splatnode.extras.evaluate.colmap_model import EvaluationFileError
-from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, load_scene, load_split
+from splatnode.extras.evaluate.dataset import EvaluationFileError, EvaluationScene, TrueCamera, load_scene, load_split
 from splatnode.extras.evaluate.report import read_bench
 from tests.support.crafted import Crafted
 from tests.support.crafted.bounded import MARGIN, readings

@@ -14,11 +14,23 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process import python
-from splatnode.extras.jobs.call import ANSWER, CALL, Answer, pack_call, start_call, write_call
-from splatnode.extras.jobs.calls import Engine, Task, engine, make_serial_engine, run_here, work_folder
+from splatnode.extras.jobs.calls import (
+    ANSWER,
+    CALL,
+    Answer,
+    Engine,
+    Task,
+    engine,
+    make_serial_engine,
+    own_version,
+    pack_call,
+    run_here,
+    start_call,
+    usable_cores,
+    work_folder,
+    write_call,
+)
 from splatnode.extras.jobs.child import NOT_RUN, Child, Limits, wait_for_end
-from splatnode.extras.jobs.cores import usable_cores
-from splatnode.extras.jobs.version import own_version
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.extras.viewers.viser_stage import ViserStage, _go, make_splat_arguments
+from splatnode.extras.viewers.viser import ViserStage, _go, make_splat_arguments
 from splatnode.viewer.paint import paint_gaussians
 from splatnode.viewer.shapes import frustum_depth
 from splatnode.viewer.state import ViewerState

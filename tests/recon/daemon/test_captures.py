@@ -24,12 +24,18 @@ from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.logs import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon import captures, ingest
-from splatnode.recon.daemon.captures import FrameSetConfig, FrameSetQueue, WaitingFrame
+from splatnode.recon.daemon import ingest
 from splatnode.recon.daemon.checkpoint.records import read_frame
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import (
+    ArrivedKeyframe,
+    FrameSetConfig,
+    FrameSetQueue,
+    Inbox,
+    RemovedFrame,
+    WaitingFrame,
+)
 from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
 from splatnode.recon.daemon.worker import number_frame_sets
 from tests.capture.messaging.test_sockets import wait_for
@@ -122,7 +128,7 @@ def plain(monkeypatch):
 
 
 def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain, monkeypatch):
-    monkeypatch.setattr(captures, "CONNECT_S", 30.0)  # a busy machine connects them one by one
+    monkeypatch.setattr(ingest, "CONNECT_S", 30.0)  # a busy machine connects them one by one
     patient = FrameSetConfig(wait_s=30.0)
     network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
     with ExitStack() as resources:

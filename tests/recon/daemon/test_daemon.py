@@ -23,7 +23,7 @@ from splatnode.capture.process.files import LOCK
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import PREVIEW
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
-from splatnode.recon.daemon import membership, worker
+from splatnode.recon.daemon import submap, worker
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.node import Answer, Daemon, RemoveKeyframe
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
@@ -282,7 +282,7 @@ def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_to
 
 
 def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
-    add = membership.add
+    add = submap.add
 
     def failing(work, keyframes, pause):
         strangers = add(work, keyframes, pause)
@@ -291,7 +291,7 @@ def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, mo
         return strangers
 
     frames = photographs()[:4]
-    monkeypatch.setattr(membership, "add", failing)
+    monkeypatch.setattr(submap, "add", failing)
     for frame in frames:
         peer.server.offer(frame)
     with running(config):
@@ -304,7 +304,7 @@ def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, mo
 
 @pytest.mark.parametrize(
     ("where", "step"),
-    [(membership, "add"), (IncrementalReconstruction, "update"), (IncrementalReconstruction, "rebuild")],
+    [(submap, "add"), (IncrementalReconstruction, "update"), (IncrementalReconstruction, "rebuild")],
 )
 def test_a_step_for_which_the_memory_did_not_suffice_costs_no_keyframe(config, peer, monkeypatch, where, step):
     real, failures = (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import PRESETS, ReconstructionConfig
-from splatnode.recon.daemon import membership
+from splatnode.recon.daemon import submap
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.modelling import SceneWithVerdict
 from splatnode.recon.optimize import training
@@ -45,7 +45,7 @@ def test_the_scene_is_that_of_an_offline_run_to_the_bit():
     work = IncrementalReconstruction(config)
     for frame in frames:
         work.add_frame(frame)
-    *_, live = membership.refine(work, config, lambda: None)
+    *_, live = submap.refine(work, config, lambda: None)
     *_, offline = reconstruct(frames, config)
     assert live.scene is not None and len(offline.gaussians) > 1000
     found = live.scene.arrays()
@@ -56,7 +56,7 @@ def test_the_scene_is_that_of_an_offline_run_to_the_bit():
 @pytest.mark.parametrize("name", PRESETS)
 def test_its_refinement_is_that_of_photographs_that_are_all_at_hand(name):
     work = Work()
-    assert len(list(membership.refine(work, PRESETS[name], lambda: None))) == 1
+    assert len(list(submap.refine(work, PRESETS[name], lambda: None))) == 1
     # No checkpoint more: before one that comes early a scene would not start with soft Gaussians.
     assert work.asked == [PRESETS[name].optimize]
 
@@ -74,7 +74,7 @@ def test_it_can_be_abandoned_every_few_steps():
 
     config = PRESETS["fast"]
     with pytest.raises(Abandoned):
-        list(membership.refine(Work(), config, pause))
+        list(submap.refine(Work(), config, pause))
     paused.clear()
-    list(membership.refine(Work(), config, lambda: paused.append(0)))
-    assert len(paused) == 1 + config.optimize.steps // membership.STEP
+    list(submap.refine(Work(), config, lambda: paused.append(0)))
+    assert len(paused) == 1 + config.optimize.steps // submap.STEP

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from splatnode.recon.daemon import membership
+from splatnode.recon.daemon import submap
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict
@@ -98,7 +98,7 @@ def named(keyframes: Iterable[SimpleNamespace]) -> list[str]:
 
 
 def come(work: Any, *names: str) -> set[str]:
-    return membership.add(work, [keyframe(name) for name in names])  # pyright: ignore[reportArgumentType]
+    return submap.add(work, [keyframe(name) for name in names])  # pyright: ignore[reportArgumentType]
 
 
 def test_before_there_is_a_scene_every_keyframe_is_taken():
@@ -114,18 +114,18 @@ def test_of_a_batch_only_the_keyframe_that_does_not_fit_at_once_is_set_aside():
 
 def test_keyframes_that_only_all_together_have_a_place_join_the_scene():
     work = reconstruction("0", "1", "2")
-    assert come(work, "3-late") == {"3-late"} and membership.has_links_to_deferred(work)
-    assert membership.join(work, ["3-late"]) and named(membership.find_untracked(work)) == ["3-late"]
-    assert come(work, "4-late") == {"4-late"} and named(membership.find_untracked(work)) == ["3-late", "4-late"]
-    assert membership.join(work, named(work.keyframes_deferred))
-    assert work.names == ["0", "1", "2", "3-late", "4-late"] and membership.find_untracked(work) == []
+    assert come(work, "3-late") == {"3-late"} and submap.has_links_to_deferred(work)
+    assert submap.join(work, ["3-late"]) and named(submap.find_untracked(work)) == ["3-late"]
+    assert come(work, "4-late") == {"4-late"} and named(submap.find_untracked(work)) == ["3-late", "4-late"]
+    assert submap.join(work, named(work.keyframes_deferred))
+    assert work.names == ["0", "1", "2", "3-late", "4-late"] and submap.find_untracked(work) == []
 
 
 def test_what_was_refused_once_is_not_estimated_again_and_stays_aside():
     work = reconstruction("0", "1", "2")
     come(work, "3-bad")
-    assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
-    assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
+    assert not submap.join(work, ["3-bad"]) and len(work.refusals) == 1
+    assert not submap.join(work, ["3-bad"]) and len(work.refusals) == 1
     assert named(work.keyframes_deferred) == ["3-bad"] and work.names == ["0", "1", "2"]
 
 
@@ -133,9 +133,9 @@ def test_frames_with_which_most_of_the_scene_has_no_place_do_not_join_it():
     work = reconstruction("0", "1", "2")
     come(work, "3-far")
     work.estimate_thoroughly = lambda pause: work._estimated(("0", "1"))  # of the scene, one of three is left
-    assert not membership.join(work, ["3-far"]) and named(work.keyframes_deferred) == ["3-far"]
+    assert not submap.join(work, ["3-far"]) and named(work.keyframes_deferred) == ["3-far"]
     work.estimate_thoroughly = lambda pause: work._estimated(("0",))
-    assert membership.join(work, ["3-far"])
+    assert submap.join(work, ["3-far"])
 
 
 def test_only_the_last_strangers_in_a_row_count_and_those_before_contradict_the_scene():
@@ -143,33 +143,31 @@ def test_only_the_last_strangers_in_a_row_count_and_those_before_contradict_the_
     come(work, "3-bad")
     come(work, "4")
     come(work, "5-other")
-    assert named(membership.find_untracked(work)) == ["5-other"] and named(membership.find_contradicting(work)) == [
-        "3-bad"
-    ]
+    assert named(submap.find_untracked(work)) == ["5-other"] and named(submap.find_contradicting(work)) == ["3-bad"]
 
 
 def test_no_pair_leads_to_another_place():
     work = reconstruction("0", "1", "2")
     come(work, "3-other")
-    assert not membership.has_links_to_deferred(work) and named(work.keyframes_deferred) == ["3-other"]
+    assert not submap.has_links_to_deferred(work) and named(work.keyframes_deferred) == ["3-other"]
     come(work, "4-bad")
-    assert membership.has_links_to_deferred(work)
+    assert submap.has_links_to_deferred(work)
 
 
 def test_what_was_added_for_now_and_spoils_the_scene_is_found_when_all_is_proven():
     work = reconstruction("0", "1", "2")
     assert come(work, "3", "4-worse", "5") == set()
-    membership.verify_provisional(work)
+    submap.verify_provisional(work)
     assert work.names == ["0", "1", "2", "3", "5"] and named(work.keyframes_deferred) == ["4-worse"]
-    assert named(membership.find_contradicting(work)) == ["4-worse"]
+    assert named(submap.find_contradicting(work)) == ["4-worse"]
 
 
 def test_proof_brings_in_what_only_all_together_have_a_place_for():
     work = reconstruction("0", "1", "2")
     come(work, "3-late")
     come(work, "4-late")
-    membership.verify_provisional(work)
-    assert membership.find_untracked(work) == [] and not work.keyframes_deferred
+    submap.verify_provisional(work)
+    assert submap.find_untracked(work) == [] and not work.keyframes_deferred
 
 
 def test_proof_that_is_abandoned_changes_nothing():
@@ -180,14 +178,14 @@ def test_proof_that_is_abandoned_changes_nothing():
     come(work, "3-worse")
     come(work, "4-bad")
     with pytest.raises(InterruptedError):
-        membership.verify_provisional(work, pause)
+        submap.verify_provisional(work, pause)
     assert work.names == ["0", "1", "2", "3-worse"] and named(work.keyframes_deferred) == ["4-bad"]
 
 
 def test_a_scene_that_was_never_proven_is_not_taken_apart():
     work = reconstruction()
     come(work, "0", "1", "2-worse")
-    membership.verify_provisional(work)
+    submap.verify_provisional(work)
     assert work.names == ["0", "1", "2-worse"]
 
 
@@ -203,22 +201,22 @@ def test_a_scene_that_was_never_proven_is_not_taken_apart():
 def test_the_older_of_the_two_most_alike_is_given_up(matches, spared):
     pairs: Any = {pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()}
     graph = ViewGraph(matching.MatchingConfig(), tuple(keyframe(str(i)) for i in range(6)), pairs)
-    assert membership.find_most_redundant(graph) == spared
+    assert submap.find_most_redundant(graph) == spared
 
 
 def test_keyframes_that_only_each_other_join_are_a_place_of_their_own():
     work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
-    assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
-    assert membership.find_separate_groups(reconstruction("0", "1", "2", "3-other", "4-other")) == []
+    assert [named(group) for group in submap.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
+    assert submap.find_separate_groups(reconstruction("0", "1", "2", "3-other", "4-other")) == []
 
 
 def test_of_those_that_were_set_aside_too():
     work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
     work.defer_keyframes(["4-other", "5-other"])
-    assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
+    assert [named(group) for group in submap.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
     assert work.names == ["0", "1", "2", "3-other"]
 
 
 def test_without_a_scene_what_most_keyframes_show_stays():
     work = reconstruction("0-bad", "1", "2", "3-other", "4-other", "5-other", "6")
-    assert [named(group) for group in membership.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]
+    assert [named(group) for group in submap.find_separate_groups(work)] == [["3-other", "4-other", "5-other"]]

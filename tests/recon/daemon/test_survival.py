@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.config import Config as PreviewConfig
 from splatnode.capture.config import encode_preview
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.messages import FrameHeader
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_CONTROL

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from splatnode.capture import lenses
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lenses import opencv
 from splatnode.recon.daemon.relocalization import (
     KeyframeLandmarks,
     Tracker,
@@ -157,6 +157,6 @@ def test_landmarks_lie_on_what_the_gaussians_show():
     plain = keyframe.features
     keyframe = Keyframe(large, frame.image, replace(plain, points=2 * plain.points))  # as it was photographed
     (found,) = compute_landmarks(replace(snapshot, cameras=(replace(camera, lens=lens),)), [keyframe], CONFIG)
-    rays = opencv.unproject(keyframe.features.points, lens)
+    rays = lenses.unproject_opencv(keyframe.features.points, lens)
     expected = 2.0 * rays[:, :2] / rays[:, 2:]
     np.testing.assert_allclose(found.points[0, :2], expected[plain.point_of[plain.tilt == 1.0]][0], rtol=1e-3)

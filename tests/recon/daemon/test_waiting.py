@@ -26,7 +26,7 @@ from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap import ActiveSubmap
 from splatnode.recon.daemon.worker import Worker
-from splatnode.recon.fallbacks.run import make_fallback_key
+from splatnode.recon.fallbacks import make_fallback_key
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
 from tests.capture.messaging.test_sockets import wait_for
@@ -96,8 +96,8 @@ def test_keyframes_of_several_places_that_come_together_after_a_scene_begin_one_
 
 def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(config, monkeypatch):
     """Such as one whose first keyframes made no scene until the camera was elsewhere."""
-    monkeypatch.setattr("splatnode.recon.daemon.membership.is_split", lambda *_: False)
-    monkeypatch.setattr("splatnode.recon.daemon.membership.find_untracked", lambda *_: [])
+    monkeypatch.setattr("splatnode.recon.daemon.submap.is_split", lambda *_: False)
+    monkeypatch.setattr("splatnode.recon.daemon.submap.find_untracked", lambda *_: [])
     frames = places(msgspec.structs.replace(SMALL, views=8), (0, 1))
     names = [frame.name for frame in frames]
     with closing(Store(config.checkpoint)) as store:

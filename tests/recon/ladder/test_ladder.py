@@ -15,11 +15,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from splatnode.recon import fallbacks
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.fallbacks import run
-from splatnode.recon.fallbacks.fallback import Fallback, FallbackState, choose_better_reconstruction
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import Fallback, FallbackState, choose_better_reconstruction, run_fallbacks
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.row_of_views import graph_of, registration_of
@@ -62,7 +61,7 @@ def estimated(monkeypatch):
             seeds.append(config.seed)
             return next(coming)
 
-        monkeypatch.setattr(run, "estimate_cameras", estimate_cameras)
+        monkeypatch.setattr(fallbacks, "estimate_cameras", estimate_cameras)
         return seeds
 
     return of
@@ -114,7 +113,7 @@ def test_the_work_ends_the_climb_between_pieces_and_between_rungs(estimated):
 @pytest.mark.parametrize(("beyond", "tried"), [(-0.1, [2]), (0.1, [2, 3])])
 def test_to_estimate_again_is_work_too(beyond, tried, estimated):
     seeds = estimated(NO_OVERLAP, NO_OVERLAP)
-    work = 2.0 + run.CAMERAS * len(NAMES) + beyond
+    work = 2.0 + fallbacks.CAMERAS * len(NAMES) + beyond
     climb(NO_OVERLAP, rung("short", 2), rung("late"), config=working(work))
     assert seeds == tried
 

@@ -8,11 +8,10 @@ from typing import Any
 
 import pytest
 
+from splatnode.recon import fallbacks
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.fallbacks import others
-from splatnode.recon.fallbacks.others import estimate_without_doubtful
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import estimate_without_doubtful, run_fallbacks
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.row_of_views import graph_of, registration_of
 
@@ -40,7 +39,7 @@ def asked(monkeypatch):
             graphs.append(graph)
             return replace(next(coming), graph=graph)
 
-        monkeypatch.setattr(others, "estimate_cameras", estimate_cameras)
+        monkeypatch.setattr(fallbacks, "estimate_cameras", estimate_cameras)
         return graphs
 
     return of

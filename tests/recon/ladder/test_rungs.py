@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.fallbacks import affine_simulation, learned
-from splatnode.recon.fallbacks.fallback import FallbackState, find_weak_pairs
-from splatnode.recon.fallbacks.run import RUNGS
+from splatnode.recon.fallbacks import AFFINE_SIMULATION, LEARNED_MATCHES, RUNGS, FallbackState, find_weak_pairs
 from splatnode.recon.matching.view_graph import ViewGraph
 from tests.support.synthetic import photographs, renumbered, view_graph
 
@@ -30,7 +28,7 @@ def far_aside() -> ViewGraph:
 
 def test_stronger_tilts_connect_what_nothing_else_does(far_aside):
     assert set(far_aside.pairs) == {(0, 1)}
-    *_, after = affine_simulation.RUNG.climb(FallbackState(far_aside, ReconstructionConfig()), {far_aside.names[2]})
+    *_, after = AFFINE_SIMULATION.climb(FallbackState(far_aside, ReconstructionConfig()), {far_aside.names[2]})
     assert (0, 2) in after.graph.pairs
     np.testing.assert_array_equal(after.graph.pairs[0, 1].matches, far_aside.pairs[0, 1].matches)
     assert set(far_aside.keyframes[2].features.tilt) <= {1.0, 1.6}  # a graph is a value
@@ -46,17 +44,17 @@ def test_only_weak_pairs_of_doubtful_keyframes_are_matched_further(far_aside):
 
 def test_tilting_is_work_by_what_there_is_to_do(far_aside):
     both = {far_aside.names[2]}
-    *_, once = affine_simulation.RUNG.climb(FallbackState(far_aside, ReconstructionConfig()), both)
-    *_, twice = affine_simulation.RUNG.climb(once, both)
+    *_, once = AFFINE_SIMULATION.climb(FallbackState(far_aside, ReconstructionConfig()), both)
+    *_, twice = AFFINE_SIMULATION.climb(once, both)
     assert once.work > 0.2  # three photographs of 1000 x 750 pixels are tilted, and compared
     assert 0.0 < twice.work - once.work < 0.5 * once.work  # and then compared alone
-    first = next(iter(affine_simulation.RUNG.climb(FallbackState(far_aside, ReconstructionConfig()), both)))
+    first = next(iter(AFFINE_SIMULATION.climb(FallbackState(far_aside, ReconstructionConfig()), both)))
     assert 0.0 < first.work < once.work
 
 
 def test_a_network_without_weights_says_how_to_get_them(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
-    assert learned.RUNG.obstacle() in (
+    assert LEARNED_MATCHES.obstacle() in (
         "no weights: splatnode weights fetch xfeat_640x640",
         "pip install onnxruntime",
     )
@@ -64,4 +62,4 @@ def test_a_network_without_weights_says_how_to_get_them(monkeypatch, tmp_path):
 
 def test_the_table_names_each_rung_once():
     names = [rung.name for rung in RUNGS]
-    assert len(set(names)) == len(names) and {affine_simulation.RUNG.name, learned.RUNG.name} <= set(names)
+    assert len(set(names)) == len(names) and {AFFINE_SIMULATION.name, LEARNED_MATCHES.name} <= set(names)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.locating import pose_candidates, verification
+from splatnode.recon.locating import pose_refinement, verification
 from splatnode.recon.locating.outcome import LocalizationBounds, Reason
 from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens
 from splatnode.recon.locating.verification import PoseHypothesis, QueryContext
@@ -50,7 +50,7 @@ def unrelated(count: int) -> Correspondences:
 
 
 def judged(known: Correspondences) -> PoseHypothesis:
-    by = QueryContext(known, WIDTH, HEIGHT, 0.5, 1.0, pose_candidates.PoseSearchConfig())
+    by = QueryContext(known, WIDTH, HEIGHT, 0.5, 1.0, pose_refinement.PoseSearchConfig())
     return by.make_hypothesis(by.estimate_pose(LENS))
 
 

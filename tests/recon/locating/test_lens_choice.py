@@ -9,11 +9,19 @@ import pytest
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames.keyframe import Features
-from splatnode.recon.locating import pose_candidates
+from splatnode.recon.locating import pose_refinement
 from splatnode.recon.locating.localize import follow, localize_image, prepare_query_image
 from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason
-from splatnode.recon.locating.pose_candidates import LensAssumption, assume_lenses, make_lens_grid
-from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens, measure_mirror_gain
+from splatnode.recon.locating.pose_refinement import (
+    PINHOLE,
+    CameraModel,
+    Correspondences,
+    Lens,
+    LensAssumption,
+    assume_lenses,
+    make_lens_grid,
+    measure_mirror_gain,
+)
 from splatnode.recon.locating.verification import LensChoice, QueryContext, choose_lens, search_cameras
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
 from splatnode.recon.verification import consistency
@@ -173,7 +181,7 @@ def seen(lens: Lens, relief: float, count: int = 600, noise_px: float = 0.5) -> 
 
 
 def chosen_of(known: Correspondences, assumed: list[LensAssumption]) -> LensChoice:
-    judged = QueryContext(known, WIDTH, HEIGHT, 0.5, 4.0, pose_candidates.PoseSearchConfig())
+    judged = QueryContext(known, WIDTH, HEIGHT, 0.5, 4.0, pose_refinement.PoseSearchConfig())
     chosen = choose_lens(judged, search_cameras(judged, assumed, make_lens_grid(judged.side, assumed)), assumed)
     assert chosen is not None
     return chosen

@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from splatnode.recon.matching import candidates
-from splatnode.recon.matching.candidates import Pair, select_pairs_worth_matching, select_short_list_pairs
+from splatnode.recon.matching import pair_matching
+from splatnode.recon.matching.pair_matching import Pair, select_pairs_worth_matching, select_short_list_pairs
 
-CONFIG = candidates.PairSelectionConfig()
+CONFIG = pair_matching.PairSelectionConfig()
 RING = 40  # keyframes around a place, each of which overlaps its neighbours
 
 

@@ -12,7 +12,7 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching import view_graph as matching
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.merging.merge import NOBODY, REGION_PX, merge_submaps, owners, regions, resolve_seams
-from splatnode.recon.merging.merge_fit import measure_visibility, surface_views
-from splatnode.recon.merging.submap import Submap, place_submap
+from splatnode.recon.merging.merge import (
+    NOBODY,
+    REGION_PX,
+    Submap,
+    measure_visibility,
+    merge_submaps,
+    owners,
+    place_submap,
+    regions,
+    resolve_seams,
+    surface_views,
+)
 from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.levels_of_detail import concatenate_gaussians
 from splatnode.recon.result.rendering import render_arrays

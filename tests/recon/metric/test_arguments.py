@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 from splatnode.command_line import build_parser
-from splatnode.extras.batch.verb import replay_options
+from splatnode.extras.verbs import replay_options
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.metric.arguments import (
     FRAMES,

@@ -11,8 +11,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.lenses.lens import project
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import project, undistort_frame
 from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.markers import MarkerDetection, detect_markers, estimate_scale_from_markers
 from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig, MetricView

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView
 from splatnode.recon.metric.metres import apply_metric_scale

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.optimize.monitor import check_divergence, compute_photometric_misfit
-from splatnode.recon.optimize.training import refine
+from splatnode.recon.optimize.training import check_divergence, compute_photometric_misfit, refine
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene.scene import Scene
 from tests.recon.optimize.test_refinement import QUICK, disturbed, photographed
@@ -65,7 +64,7 @@ def test_numbers_that_nothing_can_show_are_refused(truth):
 def test_of_many_photographs_some_are_looked_at(truth, monkeypatch):
     looked_at: list[str] = []
     monkeypatch.setattr(
-        "splatnode.recon.optimize.monitor._misfit", lambda scene, view, valid: looked_at.append(view.name) or 1.0
+        "splatnode.recon.optimize.training._misfit", lambda scene, view, valid: looked_at.append(view.name) or 1.0
     )
     views = tuple(replace(truth.views[0], name=f"{index}.png") for index in range(30))
     assert check_divergence(1.0, replace(scattered(truth), views=views)) is None

@@ -12,8 +12,8 @@ from msgspec.structs import replace as replace_fields
 from splatnode.recon import modelling
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.modelling import refine_scene
-from splatnode.recon.optimize import monitor, training
-from splatnode.recon.optimize.monitor import SHORT, RefinementWatch, examine, start_watch
+from splatnode.recon.optimize import training
+from splatnode.recon.optimize.training import SHORT, RefinementWatch, examine, start_watch
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
@@ -69,21 +69,21 @@ def faded(scene: Scene, iterations: int) -> Scene:
 
 
 def test_the_true_scene_meets_what_is_expected_between_its_photographs(truth):
-    expected = monitor.make_expectations(truth)
+    expected = training.make_expectations(truth)
     assert len(expected) == 2
-    right = monitor.compute_dssim_misfit(expected, truth.gaussians)
-    wrong = monitor.compute_dssim_misfit(expected, faded(truth, 0).gaussians)
-    assert right < 0.2 and wrong > monitor.OVERFITTED * right
+    right = training.compute_dssim_misfit(expected, truth.gaussians)
+    wrong = training.compute_dssim_misfit(expected, faded(truth, 0).gaussians)
+    assert right < 0.2 and wrong > training.OVERFITTED * right
 
 
 def test_without_point_maps_nothing_is_expected():
     scene = photographed()
-    assert monitor.make_expectations(scene) == () and monitor.compute_dssim_misfit((), scene.gaussians) == 0.0
+    assert training.make_expectations(scene) == () and training.compute_dssim_misfit((), scene.gaussians) == 0.0
 
 
 def test_an_overfitted_scene_gives_way_to_the_best_before_it(truth, monkeypatch):
     monkeypatch.setattr(
-        "splatnode.recon.optimize.monitor.compute_photometric_misfit", lambda scene: 0.1
+        "splatnode.recon.optimize.training.compute_photometric_misfit", lambda scene: 0.1
     )  # the photographs fit
     watching = start_watch(truth, SHORT + 1)
     better = replace(truth, iterations=150)
@@ -104,7 +104,7 @@ def test_a_scene_that_diverged_is_not_published_and_a_short_refinement_is_not_te
 
 
 def test_the_refinement_ends_with_the_best_scene_and_the_verdict(truth, monkeypatch):
-    monkeypatch.setattr(monitor, "OVERFITTED", 0.0)  # whatever comes is too much
+    monkeypatch.setattr(training, "OVERFITTED", 0.0)  # whatever comes is too much
     steps = plain(iterations=SHORT + 1, checkpoints=(training.MIN_SOFT,), first_opacity=None)
     (only,) = refine_scene(truth, replace_fields(ReconstructionConfig(), optimize=steps), steps)
     assert only.verdict is not None and only.verdict.code is Code.OVERFIT

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.optimize.point_render import PointRender, render_points
+from splatnode.recon.optimize.regularizers import PointRender, render_points
 
 K = np.array([[10.0, 0.0, 4.0], [0.0, 10.0, 3.0], [0.0, 0.0, 1.0]])
 FACING = np.array([0.0, 0.0, -1.0])

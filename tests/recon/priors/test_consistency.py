@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.priors.multi_view_consistency import (
+from splatnode.recon.priors.pointmap import compute_depth_normals
+from splatnode.recon.priors.stereo import (
     Agreement,
     Confidence,
     ConsistencyConfig,
+    Planes,
     compute_agreement,
     compute_confidence,
+    make_level,
 )
-from splatnode.recon.priors.patchmatch import Planes, make_level
-from splatnode.recon.priors.pointmap import compute_depth_normals
 
 WIDTH, HEIGHT = 48, 32
 K = np.array([[40.0, 0, 24], [0, 40.0, 16], [0, 0, 1]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.extras.evaluate.camera_errors import compare_cameras
-from splatnode.recon.priors.mast3r.global_alignment import PairPoints, align_views
+from splatnode.extras.evaluate.protocol import compare_cameras
+from splatnode.recon.priors.mast3r import PairPoints, align_views
 
 HEIGHT, WIDTH, FOCAL = 36, 48, 45.0
 

@@ -18,7 +18,7 @@ import torch
 
 from splatnode.recon.networks.vit import Rotary, grid_positions
 from splatnode.recon.networks.weights import check_names_and_shapes
-from splatnode.recon.priors.mast3r.network import Mast3r, Size, load_network
+from splatnode.recon.priors.mast3r import Mast3r, Size, load_network
 from tests.support.generated import generated, generated_weights, shapes_of
 
 TINY = Size(encoder_width=96, encoder_depth=3, encoder_heads=6, decoder_width=64, decoder_depth=12, decoder_heads=4)

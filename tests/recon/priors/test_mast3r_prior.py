@@ -11,13 +11,21 @@ import pytest
 import torch
 
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.networks.vit import crop
-from splatnode.recon.priors.mast3r.network import EncodedImage, Prediction
-from splatnode.recon.priors.mast3r.prior import PATCH, Config, Mast3rPrior, NetworkCache, load, prepare_image
+from splatnode.recon.priors.mast3r import (
+    PATCH,
+    Config,
+    EncodedImage,
+    Mast3rPrior,
+    NetworkCache,
+    Prediction,
+    load,
+    prepare_image,
+)
 from splatnode.recon.priors.pointmap import compute_depth_normals
 from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration

@@ -8,9 +8,11 @@ import pytest
 
 from splatnode.recon.clock import OutOfTime
 from splatnode.recon.core import library, set_threads
-from splatnode.recon.priors import multi_view_consistency
-from splatnode.recon.priors.patchmatch import Matching, Planes, Search, make_level
+from splatnode.recon.priors import stereo
 from splatnode.recon.priors.stereo import (
+    Matching,
+    Planes,
+    Search,
     SparsePoints,
     StereoConfig,
     StereoStage,
@@ -19,6 +21,7 @@ from splatnode.recon.priors.stereo import (
     estimate_depth_range,
     estimate_further_depth_map,
     estimate_planes,
+    make_level,
     rank_partners,
     select_sources,
 )
@@ -165,35 +168,29 @@ def flat_planes(inverse_depth: float) -> Planes:
     return Planes(values, np.zeros((HEIGHT, WIDTH), np.float32))
 
 
-def check_side_by_side(
-    first: Planes, second: Planes, config: multi_view_consistency.ConsistencyConfig
-) -> list[multi_view_consistency.DepthMap]:
+def check_side_by_side(first: Planes, second: Planes, config: stereo.ConsistencyConfig) -> list[stereo.DepthMap]:
     """Two cameras side by side before a striped wall at z = 4, with the planes given."""
     stripes = np.repeat((np.arange(WIDTH) % 16 * 10).astype(np.uint8)[None, :, None], HEIGHT, 0).repeat(3, 2)
     levels = [make_level(stripes, K, camera(x, 0.0), (1.0, 10.0), 0) for x in (0.0, 0.4)]
-    return multi_view_consistency.cross_check(levels, [first, second], [[1], [0]], Matching(), config)
+    return stereo.cross_check(levels, [first, second], [[1], [0]], Matching(), config)
 
 
 def test_depth_is_the_mean_of_agreeing_views():
-    first, _ = check_side_by_side(
-        flat_planes(1 / 4.0), flat_planes(1 / 4.02), multi_view_consistency.ConsistencyConfig()
-    )
+    first, _ = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 4.02), stereo.ConsistencyConfig())
     seen_by_both = first.num_consistent == 1
     assert seen_by_both[:, 20:].all() and not seen_by_both[:, :12].any()
     assert (first.depth[seen_by_both] > 4.001).all() and (first.depth[seen_by_both] < 4.019).all()
 
 
 def test_views_that_disagree_leave_no_depth():
-    first, second = check_side_by_side(
-        flat_planes(1 / 4.0), flat_planes(1 / 6.0), multi_view_consistency.ConsistencyConfig()
-    )
+    first, second = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 6.0), stereo.ConsistencyConfig())
     assert not first.depth.any() and not second.depth.any()
 
 
 def test_a_wrong_pixel_takes_the_plane_of_its_neighbours_and_counts_as_unconfirmed():
     planes = flat_planes(1 / 4.0)
     planes.values[60, 80, 0] = 1 / 2.0
-    first, _ = check_side_by_side(planes, flat_planes(1 / 4.0), multi_view_consistency.ConsistencyConfig())
+    first, _ = check_side_by_side(planes, flat_planes(1 / 4.0), stereo.ConsistencyConfig())
     assert first.depth[60, 80] == pytest.approx(4.0, rel=1e-3)
     assert first.num_consistent[60, 80] == 0
     assert 0 < first.confidence[60, 80] < first.confidence[60, 90]

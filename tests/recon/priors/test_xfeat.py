@@ -10,7 +10,7 @@ from tests.support.synthetic import SMALL, photographs
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="learned features need onnxruntime")
 
-from splatnode.recon.priors.xfeat.network import Keypoints, Xfeat, load_network  # noqa: E402  only where onnxruntime is
+from splatnode.recon.priors.xfeat import Keypoints, Xfeat, load_network  # noqa: E402  only where onnxruntime is
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.matching import two_view
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching import pair_matching
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
     epipolar,
@@ -84,7 +84,7 @@ def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, i
             wrong = generator.integers(0, len(taken.pixels[i]), (int(share_wrong * len(common)), 2))
             matches = np.concatenate([np.stack([common, common], 1), wrong])
             points1, points2 = taken.pixels[i][matches[:, 0]], taken.pixels[j][matches[:, 1]]
-            pair, _ = two_view.estimate(points1, points2, matches, SIZE, two_view.TwoViewConfig())
+            pair, _ = pair_matching.estimate(points1, points2, matches, SIZE, pair_matching.TwoViewConfig())
             if pair is not None:
                 pairs[i, j] = pair
     return pairs
@@ -142,7 +142,7 @@ def test_unrelated_points_are_no_pair():
     generator = np.random.default_rng(0)
     points1, points2 = ((generator.random((300, 2)) - 0.5) * SIZE for _ in range(2))
     matches = np.stack([np.arange(300)] * 2, 1)
-    assert two_view.estimate(points1, points2, matches, SIZE, two_view.TwoViewConfig())[0] is None
+    assert pair_matching.estimate(points1, points2, matches, SIZE, pair_matching.TwoViewConfig())[0] is None
 
 
 def test_a_camera_that_only_turned_is_told():
@@ -151,23 +151,24 @@ def test_a_camera_that_only_turned_is_told():
     turned = rays @ cv2.Rodrigues(np.array([0.02, 0.15, 0.0]))[0].T
     points1, points2 = rays[:, :2] * FOCAL, turned[:, :2] / turned[:, 2:] * FOCAL
     points2 = points2 + generator.normal(size=points2.shape) * NOISE_PX
-    pair, _ = two_view.estimate(points1, points2, np.stack([np.arange(300)] * 2, 1), SIZE, two_view.TwoViewConfig())
+    matches = np.stack([np.arange(300)] * 2, 1)
+    pair, _ = pair_matching.estimate(points1, points2, matches, SIZE, pair_matching.TwoViewConfig())
     assert pair is not None
     assert pair.is_pure_rotation
     assert pair.rotation_focal_ratio == pytest.approx(FOCAL / SIZE[0], rel=0.1)
 
 
 def test_false_alarms_fall_with_every_match_that_agrees():
-    assert two_view.log10_number_of_false_alarms(100, 7, 7, 0.01) == 0.0
-    alarms = [two_view.log10_number_of_false_alarms(100, k, 7, 0.01) for k in (10, 20, 40)]
+    assert pair_matching.log10_number_of_false_alarms(100, 7, 7, 0.01) == 0.0
+    alarms = [pair_matching.log10_number_of_false_alarms(100, k, 7, 0.01) for k in (10, 20, 40)]
     assert alarms == sorted(alarms, reverse=True)
     assert alarms[-1] < -25.0
 
 
 def test_the_number_of_false_alarms_by_hand():
     """(10 - 7) choices of a model, C(10, 8) sets of 8 inliers, C(8, 7) samples among them, and .1 for the eighth."""
-    assert two_view.log10_number_of_false_alarms(10, 8, 7, 0.1) == pytest.approx(np.log10(3 * 45 * 8 * 0.1))
-    assert two_view.log10_number_of_false_alarms(10, 7, 7, 0.1) == 0.0  # a sample agrees with itself
+    assert pair_matching.log10_number_of_false_alarms(10, 8, 7, 0.1) == pytest.approx(np.log10(3 * 45 * 8 * 0.1))
+    assert pair_matching.log10_number_of_false_alarms(10, 7, 7, 0.1) == 0.0  # a sample agrees with itself
 
 
 def test_pairs_vote_for_the_focal_length(pairs):

@@ -12,10 +12,9 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import TrueCamera
-from splatnode.extras.evaluate.stability.case import make_frames, make_world, score_cameras
-from splatnode.extras.evaluate.stability.lens_assumptions import KINDS, correct_keystone, set_intrinsics, zoom_image
+from splatnode.extras.evaluate.stability.degradations import KINDS, correct_keystone, set_intrinsics, zoom_image
 from splatnode.extras.evaluate.stability.perturbations import TrialImage
-from splatnode.extras.evaluate.stability.trial import list_registered_cameras
+from splatnode.extras.evaluate.stability.trial import list_registered_cameras, make_frames, make_world, score_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.frames.keyframe import Features, Keyframe

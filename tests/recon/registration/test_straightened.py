@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatnode.capture import lenses
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.lenses import opencv
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import undistort_frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -30,7 +30,7 @@ LENS = Intrinsics(160, 120, 150.0, 150.0, 80.5, 59.5, "estimated", (-0.25, 0.0, 
 def pattern(lens: Intrinsics) -> np.ndarray:
     """(H, W, 3) smooth colours by direction, as `lens` shows them."""
     pixels = np.stack(np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5), -1).reshape(-1, 2)
-    x, y = (20.0 * opencv.unproject(pixels, lens)[:, :2]).T
+    x, y = (20.0 * lenses.unproject_opencv(pixels, lens)[:, :2]).T
     colours = 127.5 + 120.0 * np.stack([np.sin(x), np.cos(y), np.sin(x + y)], -1)
     return np.rint(colours).astype(np.uint8).reshape(lens.height, lens.width, 3)
 
@@ -44,7 +44,7 @@ def seen(lens: Intrinsics) -> tuple[ViewGraph, Registration, np.ndarray]:
     frame = photograph()
     generator = np.random.default_rng(0)
     points = np.column_stack([generator.uniform(-0.6, 0.6, (400, 2)) * (1.0, 0.75), np.ones(400)]) * 3.0
-    pixels = opencv.project(points, lens)
+    pixels = lenses.project_opencv(points, lens)
     features = Features(pixels, np.zeros((0, 128), np.uint8), np.zeros(0, np.int64), np.zeros(0))
     graph = ViewGraph(matching.MatchingConfig(), (Keyframe(frame, frame.image, features),))
     camera = replace(

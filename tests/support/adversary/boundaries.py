@@ -12,7 +12,7 @@ from splatnode.capture import recording
 from splatnode.capture.config import CaptureConfig, PreviewHeader, decode_preview
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage, decode_image
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network
 from splatnode.capture.messaging.messages import (
     ConsumerStatus,
     Delivery,
@@ -28,8 +28,7 @@ from splatnode.capture.messaging.wire import Limits, WireError, decode
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.status import CaptureStatus, Heartbeat
-from splatnode.extras.evaluate.colmap_model import EvaluationFileError
-from splatnode.extras.evaluate.dataset import load_scene
+from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
 from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
@@ -176,7 +175,7 @@ def _read_store(files: tuple[stored.Files, stored.Files], folder: Path) -> objec
 
 def _read_keys(files: stored.Files, folder: Path) -> object:
     stored.lay(files, folder / "keys")
-    return keys.read_keys(folder / "keys")
+    return network.read_keys(folder / "keys")
 
 
 def _read_recording(files: stored.Files, folder: Path) -> object:
@@ -204,9 +203,7 @@ _PREVIEWS = Reader((WireError,), ("splatnode.capture.config", f"{_MESSAGING}.jpe
 _SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
 _IMAGES = Reader(
     (UnusableImage,),
-    tuple(
-        f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exif", "exif_time", "exposure_settings")
-    ),
+    tuple(f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exposure_settings")),
 )
 _CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
 _RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.recon.result.stored_snapshot",))
@@ -216,7 +213,7 @@ _YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.c
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
 _SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
 _CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))
-_KEYS = Reader((keys.KeyFileError,), (f"{_MESSAGING}.keys",))
+_KEYS = Reader((network.KeyFileError,), (f"{_MESSAGING}.keys",))
 
 
 def _formats(name: str) -> Reader:

@@ -20,7 +20,7 @@ import numpy as np
 
 from splatnode.capture import film
 from splatnode.capture.daemon import LastRun
-from splatnode.capture.exif import name_time
+from splatnode.capture.image_header import name_time
 from splatnode.capture.messaging.spool import Quarantine, QuarantineConfig
 from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.capture.process.records import record_in
@@ -306,7 +306,7 @@ _QUARANTINES = Reader((), ("splatnode.capture.messaging.spool",))
 _LAST_RUNS = Reader((Refused,), ("splatnode.capture.daemon",))
 _MANIFESTS = Reader((), ("splatnode.recon.result.export.result",))
 _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))
-_NAMES = Reader((ValueError,), ("splatnode.capture.exif", "splatnode.capture.film"))
+_NAMES = Reader((ValueError,), ("splatnode.capture.image_header", "splatnode.capture.film"))
 _ARGUMENTS = Reader((Refused,), ("splatnode.capture.process.arguments", "splatnode.capture.process.text"))
 _REQUESTS = Reader((Refused,), (f"{_WEB}.server", f"{_WEB}.access"))
 _SHOWN = Reader((ValueError,), (f"{_WEB}.content", "splatnode.viewer.text"))

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture import exif, image_header
+from splatnode.capture import image_header
 from splatnode.capture.depth_image import make_depth_image
-from splatnode.capture.exif import exif_time
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.image_file import ORIENTATION, check_whole, measure_values, upright_size
-from splatnode.capture.image_header import UnusableImage
+from splatnode.capture.image_header import UnusableImage, exif_time
 from splatnode.capture.lens_file import UnusableLens, read_lens
 from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
 from splatnode.capture.pose_files import PosesFileError, read_poses
@@ -75,9 +74,9 @@ def _read_poses(files: stored.Files, folder: Path) -> object:
 
 
 def _read_exif(tiff: bytes, folder: Path) -> object:
-    tags = exif.read_tags(tiff)
-    told = exif.exif_intrinsics(tags, 4000, 3000), exif.exif_exposure(tags), exif_time(tiff)
-    return told, exif.first(tags, ORIENTATION), exif.camera_identity(tiff)
+    tags = image_header.read_tags(tiff)
+    told = image_header.exif_intrinsics(tags, 4000, 3000), image_header.exif_exposure(tags), exif_time(tiff)
+    return told, image_header.first(tags, ORIENTATION), image_header.camera_identity(tiff)
 
 
 def _read_header(data: bytes, folder: Path) -> object:
@@ -154,7 +153,7 @@ def _modules(*names: str) -> tuple[str, ...]:
 
 _LENSES = Reader((UnusableLens,), _modules("lens_file"))
 _POSES = Reader((PosesFileError,), _modules("poses_file", "colmap_images"))
-_EXIF = Reader((), _modules("exif", "exif_time"))
+_EXIF = Reader((), _modules("image_header"))
 _HEADERS = Reader((UnusableImage,), _modules("image_header", "jpeg2000", "heif_file"))
 _LOGGED = Reader(
     (UnusableMessage,), tuple(f"splatnode.extras.logged.{name}" for name in ("messages", "depth_messages"))

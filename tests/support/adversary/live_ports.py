@@ -19,7 +19,7 @@ import msgspec
 import zmq
 
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.messages import Delivery, FrameHeader, Request
 from splatnode.capture.messaging.network import (
@@ -102,7 +102,7 @@ class _Port:
         """Over tcp with keys: of what a stranger without one sends, nothing may reach the application."""
         from tests.bench.node.malformed import FRAME
 
-        keys.create_keys(Path(self._folder, "keys"))
+        network.create_keys(Path(self._folder, "keys"))
         whole = {"tcp": "127.0.0.1", "keys": Path(self._folder, "keys"), "first_port": _free_port()}
         self._network = Network(directory=Path(self._folder, "run"), **whole)
         server = KeyframeServer(self._network, Spool(SpoolConfig(Path(self._folder, "state"))))

@@ -9,8 +9,7 @@ import stat
 import pytest
 
 from splatnode.capture.process.files import NotOwnerOnly
-from splatnode.viewer.web.server import Access, load_or_create_key, new_key
-from splatnode.viewer.web.stage import invitation, resolve_address
+from splatnode.viewer.web.server import Access, invitation, load_or_create_key, new_key, resolve_address
 
 KEY = "k" * 43
 

@@ -16,8 +16,7 @@ from splatnode.viewer.paint import paint_gaussians
 from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import ViewerState
 from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint, look_at, move_to_camera, orbit, pan, zoom
-from splatnode.viewer.web.server import describe_session
-from splatnode.viewer.web.stage import ListenAddress, make_content, open_server
+from splatnode.viewer.web.server import ListenAddress, describe_session, make_content, open_server
 from tests.bench.viewer.drive_web import WINDOW, drive, fact, settle, watched
 from tests.support.chromium import NAMES, browser, chromium
 from tests.viewer.test_scene import camera, moment, wall

@@ -21,8 +21,15 @@ from splatnode.recon.result.verdict import Bounds, Code, Scale, Verdict, make_ba
 from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import Moment
 from splatnode.viewer.web import server as server_module
-from splatnode.viewer.web.server import Board, Content, Server, describe_session
-from splatnode.viewer.web.stage import ListenAddress, make_content, open_server
+from splatnode.viewer.web.server import (
+    Board,
+    Content,
+    ListenAddress,
+    Server,
+    describe_session,
+    make_content,
+    open_server,
+)
 from tests.capture.messaging.test_sockets import wait_for
 from tests.viewer.test_scene import camera, moment, wall
 

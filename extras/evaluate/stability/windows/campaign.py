@@ -30,7 +30,7 @@ from matplotlib.ticker import NullLocator, PercentFormatter
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.terminal import say
-from splatnode.extras.evaluate.colmap_model import read_json
+from splatnode.extras.evaluate.dataset import read_json
 from splatnode.extras.evaluate.report import (
     Timing,
     check_same_cores,
@@ -67,14 +67,12 @@ from splatnode.extras.evaluate.stability.windows.windows import (
     select_keys,
     select_moving_scenes,
 )
-from splatnode.extras.jobs.call import Work, pack_call
-from splatnode.extras.jobs.calls import Engine, Task, work_folder
+from splatnode.extras.jobs.calls import Engine, Task, Work, now, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
-from splatnode.extras.jobs.cores import now
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.fallbacks.run import run_fallbacks
+from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import match

@@ -17,17 +17,16 @@ import numpy.typing as npt
 
 from splatnode.extras.evaluate.dataset import TrueCamera
 from splatnode.extras.evaluate.report import Timing, find_largest_share, had_alone
-from splatnode.extras.evaluate.stability.case import (
+from splatnode.extras.evaluate.stability.perturbations import TrialScene, classify_motion
+from splatnode.extras.evaluate.stability.trial import (
     ROUGH,
     CameraError,
     has_only_right_cameras,
     measure_camera_errors,
     measure_set_errors,
 )
-from splatnode.extras.evaluate.stability.perturbations import TrialScene, classify_motion
 from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
-from splatnode.recon.matching.pair_matching import MatchedPair
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import MatchedPair, TwoView
 from splatnode.recon.matching.view_graph import Matcher, MatchingConfig, Pair, ViewGraph, match_pending
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Verdict

@@ -22,7 +22,7 @@ from splatnode.capture.image_file import (
     find_common_range,
     read_image_file,
 )
-from splatnode.capture.lenses.undistort import undistort_image
+from splatnode.capture.lenses import undistort_image
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.limits import SceneFileError

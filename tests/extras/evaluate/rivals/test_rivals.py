@@ -14,7 +14,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.extras.evaluate.dataset import TrueCamera
 from splatnode.extras.evaluate.rivals import colmap
 from splatnode.extras.evaluate.stability import trial
-from splatnode.extras.evaluate.stability.case import score_cameras
+from splatnode.extras.evaluate.stability.trial import score_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.result.verdict import Code
 

@@ -18,11 +18,9 @@ import pytest
 from splatnode.capture.frame import Frame
 from splatnode.command_line import build_parser
 from splatnode.extras.evaluate.stability.campaign import Plan, run_campaign
-from splatnode.extras.evaluate.stability.case import Demand, MatrixRow, TrialCase, make_accept_case
 from splatnode.extras.evaluate.stability.perturbations import ScenesByMotion, TrialImage
-from splatnode.extras.evaluate.stability.trial import find_method
-from splatnode.extras.jobs.calls import engine
-from splatnode.extras.jobs.cores import usable_cores
+from splatnode.extras.evaluate.stability.trial import Demand, MatrixRow, TrialCase, find_method, make_accept_case
+from splatnode.extras.jobs.calls import engine, usable_cores
 from splatnode.recon.result.verdict import Code
 from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places

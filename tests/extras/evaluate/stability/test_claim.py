@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.extras.evaluate.dataset import TrueCamera
-from splatnode.extras.evaluate.stability.case import (
+from splatnode.extras.evaluate.stability.trial import (
     CameraError,
     FiniteBounds,
     has_only_right_cameras,

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from splatnode.extras.evaluate.stability import fitting
-from splatnode.extras.evaluate.stability.case import CameraError
 from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     count_judgements,
@@ -23,6 +22,7 @@ from splatnode.extras.evaluate.stability.fitting import (
     pair_held_out_models,
     read_samples,
 )
+from splatnode.extras.evaluate.stability.trial import CameraError
 from splatnode.recon.verification.error_model import VerdictModels
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.refit import Errors, PoseErrors

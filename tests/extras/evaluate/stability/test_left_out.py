@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from splatnode.extras.evaluate.stability import fitting
-from splatnode.extras.evaluate.stability.case import ROUGH, CameraError
 from splatnode.extras.evaluate.stability.fitting import (
     Sample,
     exceeds_bounds,
@@ -18,6 +17,7 @@ from splatnode.extras.evaluate.stability.fitting import (
     make_window_sample,
     passes_limits,
 )
+from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError
 from splatnode.extras.evaluate.stability.windows.windows import OURS, WindowOutcome, WindowRow
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.error_model import ErrorModel, OddsModel, VerdictModel, compute_measures

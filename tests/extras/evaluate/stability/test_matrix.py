@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.stability.case import Demand
-from splatnode.extras.evaluate.stability.matrix import ROWS, select_rows
+from splatnode.extras.evaluate.stability.campaign import ROWS, select_rows
 from splatnode.extras.evaluate.stability.perturbations import (
     Sampler,
     ScenesByMotion,
@@ -18,6 +17,7 @@ from splatnode.extras.evaluate.stability.perturbations import (
     load_scenes_by_motion,
     load_trial_scenes,
 )
+from splatnode.extras.evaluate.stability.trial import Demand
 from tests.support.stability_places import on_arc, three_places
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from splatnode.extras.evaluate.dataset import TrueCamera
-from splatnode.extras.evaluate.stability.case import Demand, Outcome, classify_outcome, score_cameras
 from splatnode.extras.evaluate.stability.report import compute_rate, make_report, summarise
+from splatnode.extras.evaluate.stability.trial import Demand, Outcome, classify_outcome, score_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Bounds, make_ball
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc

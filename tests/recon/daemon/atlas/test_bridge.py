@@ -12,7 +12,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.camera_errors import compare_cameras
+from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.atlas import loop_closure as module
 from splatnode.recon.daemon.atlas.loop_closure import (

@@ -18,7 +18,7 @@ from splatnode.recon.daemon.checkpoint.store import (
     parse_graph,
     parse_scene,
 )
-from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration.undistortion import undistort_keyframe
 from splatnode.recon.scene import exposure as scene_exposure
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView

@@ -11,8 +11,7 @@ from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
-from splatnode.extras.evaluate.dataset import load_scene
-from splatnode.extras.evaluate.demo import write_capture
+from splatnode.extras.evaluate.dataset import load_scene, write_capture
 from splatnode.extras.evaluate.report import Timing
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras
@@ -27,7 +26,7 @@ from splatnode.extras.evaluate.stability.windows.windows import (
     judge_window,
     select_keys,
 )
-from splatnode.extras.jobs.cores import usable_cores
+from splatnode.extras.jobs.calls import usable_cores
 from splatnode.recon import estimation
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.matching import pair_matching

@@ -16,10 +16,9 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.command_line import build_parser
-from splatnode.extras.evaluate.dataset import load_scene
-from splatnode.extras.evaluate.demo import write_capture
-from splatnode.extras.evaluate.stability.case import CameraError, FiniteBounds
+from splatnode.extras.evaluate.dataset import load_scene, write_capture
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
+from splatnode.extras.evaluate.stability.trial import CameraError, FiniteBounds
 from splatnode.extras.evaluate.stability.windows import campaign
 from splatnode.extras.evaluate.stability.windows.campaign import (
     Plan,
@@ -32,8 +31,7 @@ from splatnode.extras.evaluate.stability.windows.campaign import (
     tally_rows,
 )
 from splatnode.extras.evaluate.stability.windows.windows import Window, WindowAnswer, WindowOutcome, WindowRow
-from splatnode.extras.jobs.calls import engine
-from splatnode.extras.jobs.cores import usable_cores
+from splatnode.extras.jobs.calls import engine, usable_cores
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places

@@ -13,8 +13,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image, encode_png
-from splatnode.capture.lenses.lens import project
-from splatnode.capture.lenses.undistort import undistort_frame
+from splatnode.capture.lenses import project, undistort_frame
 from splatnode.recon.pipeline import _add_given_lenses
 from tests.support.exported import make_snapshot, write
 

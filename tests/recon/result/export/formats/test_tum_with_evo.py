@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.exif import name_time
+from splatnode.capture.image_header import name_time
 from splatnode.recon.result.export.formats.tum import encode_tum
 from splatnode.recon.result.snapshot import CameraEstimate
 

@@ -1,27 +1,101 @@
-"""XFeat features and their matches by LighterGlue, as published ONNX files, on the processor.
+"""XFeat (Potje et al. 2024) and LighterGlue as a prior: classical depth, learned matches where plain ones are few.
 
-"XFeat: Accelerated Features for Lightweight Image Matching" (Potje et al. 2024), section 3: a map of descriptors and of
-their reliability at an eighth of the image, and for each cell of 8 x 8 pixels the odds of a keypoint in each of them.
+Both networks are published ONNX files, and run on the processor. "XFeat: Accelerated Features for Lightweight Image
+Matching", section 3: a map of descriptors and of their reliability at an eighth of the image, and for each cell of 8 x
+8 pixels the odds of a keypoint in each of them. Keypoints are added to a keyframe's points, which the matches then
+name.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import onnxruntime
 
-from splatnode.recon.networks.weights import WeightsError
+from splatnode.capture.process.config_keys import Internal
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.networks.weights import WeightsError, find
+from splatnode.recon.priors import classical
+from splatnode.recon.priors.classical import ClassicalPrior
 
+if TYPE_CHECKING:
+    import onnxruntime
+
+WEIGHTS = ("xfeat/xfeat_640x640.onnx", "xfeat/lighterglue_L3.onnx")
+PACKAGE = "onnxruntime"
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
 _SIDE, _CELL = 640, 8  # the file's input is square; the network was trained on any shape
 _REACH = 2  # pixels: no two keypoints are closer
 _MIN_PROBABILITY = 0.05  # of a keypoint, as published
+_REMEMBERED = 64  # keyframes whose keypoints are kept: half a megabyte each
+
+
+class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
+    features: Path | None = None  # ONNX file of XFeat; None: where `splatnode weights` puts it
+    matcher: Path | None = None  # ONNX file of LighterGlue; None: the same
+    num_keypoints: Internal[int] = 2000  # of an image, at most
+
+
+def load(config: Config) -> ClassicalPrior:
+    """Raises WeightsError where onnxruntime or the weights are missing, or are not XFeat's."""
+    _import_onnxruntime()  # the first thing that may be missing
+    features = config.features or find(WEIGHTS[0])
+    matcher = config.matcher or find(WEIGHTS[1])
+    return ClassicalPrior(config, matcher=XfeatMatcher(load_network(features, matcher), config.num_keypoints))
+
+
+def _import_onnxruntime() -> Any:
+    """The package, which is an extra. Raises WeightsError where it is missing."""
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise WeightsError("the prior xfeat needs onnxruntime: pip install 'splatnode[xfeat]'") from error
+    return onnxruntime
+
+
+@dataclass(frozen=True, eq=False)
+class _AddedKeypoints:
+    """The keypoints that were added to a keyframe's points."""
+
+    first: int  # number of the keyframe's first point that is one of these
+    keypoints: Keypoints
+
+    def is_in(self, keyframe: Keyframe) -> bool:
+        """Whether the keyframe has them, at `first`."""
+        mine = self.keypoints.points
+        return np.array_equal(keyframe.features.points[self.first : self.first + len(mine)], mine)
+
+
+class XfeatMatcher:
+    """A `recon.matching.view_graph.Matcher`."""
+
+    def __init__(self, network: Xfeat, num_keypoints: int) -> None:
+        self._network, self._count = network, num_keypoints
+        self._added: dict[str, _AddedKeypoints] = {}  # by keyframe, the last ones that were asked about
+
+    def add_points(self, keyframe: Keyframe) -> Keyframe:
+        known = self._added.get(keyframe.name)
+        if known is not None and known.is_in(keyframe):
+            return keyframe
+        keypoints = self._network.extract(keyframe.frame.image, self._count)
+        features = keyframe.features
+        self._added[keyframe.name] = _AddedKeypoints(len(features.points), keypoints)
+        while len(self._added) > _REMEMBERED:
+            del self._added[next(iter(self._added))]
+        points = np.concatenate([features.points, keypoints.points])
+        return replace(keyframe, features=replace(features, points=points))
+
+    def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
+        first, second = self._added[keyframe1.name], self._added[keyframe2.name]
+        sizes = ((keyframe.frame.width, keyframe.frame.height) for keyframe in (keyframe1, keyframe2))
+        size1, size2 = sizes
+        return self._network.match(first.keypoints, size1, second.keypoints, size2) + [first.first, second.first]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +147,7 @@ class Xfeat:
 
 def load_network(features: Path, matcher: Path, threads: int = 2) -> Xfeat:
     """Raises WeightsError where a file is damaged or another network."""
-    sessions = []
+    onnxruntime, sessions = _import_onnxruntime(), []
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads sleep

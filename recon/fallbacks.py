@@ -1,0 +1,318 @@
+"""Fallbacks: what costs more is tried before photographs are refused for want of matches.
+
+The first estimate is the first rung of the ladder. While it lacks cameras for some keyframes, and there is work left,
+further rungs find more to estimate from, and cameras are estimated again. An answer is never made worse: the better
+one is kept. How much is tried depends on the photographs alone: work is counted by what is done, and no clock decides
+unless somebody asked for a deadline. One rung is simulated tilts in both directions, and stronger ones, as affine SIFT
+has them (Morel and Yu, 2009); another is matches by networks that were trained on wide baselines (XFeat, LighterGlue),
+where their weights are.
+
+Where a refusal is about a few photographs, the rest is judged by itself. A photograph that shows little of what the
+others show, or only something that may have been moved, says nothing against these. They are judged as if it had never
+been taken.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.clock import is_over
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.frames.keyframe import PLAIN
+from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.geometry import align_cameras, angles_deg
+from splatnode.recon.learned_parts import LearnedPart, find_unavailable_reason
+from splatnode.recon.matching.features import count_search_pixels
+from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_weak_pair
+from splatnode.recon.priors import xfeat
+from splatnode.recon.result.verdict import Code
+
+
+@dataclass(frozen=True, eq=False)
+class FallbackState:
+    """The view graph and configuration that cameras are estimated from, with the work spent so far."""
+
+    graph: ViewGraph
+    config: ReconstructionConfig
+    work: float = 0.0  # that went into them, as `config.fallbacks.budget` counts it
+
+    def add_work(self, work: float) -> FallbackState:
+        """The same, after so much further work."""
+        return replace(self, work=self.work + work)
+
+
+# The means after each further piece of work, given those so far and the names of the keyframes in doubt; none
+# where this rung has nothing to add.
+Climb = Callable[[FallbackState, Collection[str]], Iterator[FallbackState]]
+# The work of matching a pair of the view graph further, by what there is to do: never by a clock.
+Work = Callable[[ViewGraph, Pair], float]
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """One thing to try."""
+
+    name: str  # as the verdict says what was tried
+    climb: Climb
+    obstacle: Callable[[], str] = lambda: ""  # what keeps this rung from being tried, in a word; empty: nothing does
+
+
+def match_weak_pairs(
+    means: FallbackState,
+    doubtful: Collection[str],
+    work: Work,
+    tilts: tuple[float, ...] = (),
+    matcher: Matcher | None = None,
+) -> Iterator[FallbackState]:
+    """After each weak pair of a doubtful keyframe has got further matches, the most promising pairs first."""
+    for pair in find_weak_pairs(means.graph, doubtful):
+        cost = work(means.graph, pair)
+        means = replace(means, graph=match_weak_pair(means.graph, pair, tilts, matcher).select_geometries()).add_work(
+            cost
+        )
+        yield means
+
+
+def find_weak_pairs(graph: ViewGraph, doubtful: Collection[str]) -> list[Pair]:
+    """The pairs of these keyframes that are not firm and may overlap, those first whose matches agree best."""
+    names = graph.names
+    weak = [pair for pair in graph.select_weak_pairs() if names[pair[0]] in doubtful or names[pair[1]] in doubtful]
+    return sorted(weak, key=lambda pair: (graph.tilted.get(pair, graph.plain[pair]).log10_nfa, pair))
+
+
+# Which of two estimates of the same keyframes is better: an accepted answer is extended, never replaced.
+
+MAX_TURN_DEG = 2.0  # of an accepted camera from one estimate to the other, after the best similarity
+
+
+def choose_better_reconstruction(one: Reconstruction, other: Reconstruction) -> Reconstruction:
+    """`other` where it is publishable and has the cameras of `one`, where they were, and more; else `one`.
+
+    A rough answer that weak matches lead to is not taken: they may join two places, and rough bounds would hide it.
+    Of two refusals `one` stands: it says what is wrong with the photographs, `other` with what was made of them.
+    """
+    if (
+        not other.publishable
+        or other.verdict.code is Code.OK_ROUGH
+        or not one.publishable_camera_names < other.publishable_camera_names
+    ):
+        return one
+    return other if _compute_turn_deg(one, other) <= MAX_TURN_DEG else one
+
+
+def _compute_turn_deg(one: Reconstruction, other: Reconstruction) -> float:
+    """The largest angle between the cameras that `one` has placed and the same ones in `other`; 0 without any."""
+    if not one.publishable_camera_names:
+        return 0.0
+    source, target = _collect_poses(one), _collect_poses(other)
+    Ts, others = (
+        np.stack([cameras[name] for name in sorted(one.publishable_camera_names)]) for cameras in (source, target)
+    )
+    return float(angles_deg(align_cameras(Ts, others).rotation @ Ts[:, :3, :3], others[:, :3, :3]).max())
+
+
+def _collect_poses(estimate: Reconstruction) -> dict[str, npt.NDArray[np.float64]]:
+    """T_world_camera by the keyframe's name."""
+    if estimate.registration is None:
+        return {}
+    return {estimate.graph.names[camera.index]: camera.T_world_camera for camera in estimate.registration.cameras}
+
+
+# Of the width, and below 1 of the height. The first matching has 1.6 of the width.
+_TILTS = (1.0 / 1.6, 2.5)
+_PIXEL = 2.3e-7  # work of finding features of both tilts, for each pixel that plain ones are looked for in
+_COMPARISON = 2.8e-9  # work, for each two plain features: about 2.8 times as many of other tilts are compared
+
+
+def _match_affine(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
+    return match_weak_pairs(means, doubtful, _estimate_work, _TILTS)
+
+
+def _estimate_work(graph: ViewGraph, pair: Pair) -> float:
+    """Estimates the work of simulating tilts of the pair's images, and of comparing their features."""
+    both = [graph.keyframes[index] for index in pair]
+    untilted = [each for each in both if not np.isin(_TILTS, each.features.tilt).all()]
+    searched = sum(count_search_pixels(each.frame.image, graph.config.features) for each in untilted)
+    compared = np.prod([(each.features.tilt == PLAIN).sum() for each in both], dtype=float)
+    return _PIXEL * searched + _COMPARISON * float(compared)
+
+
+AFFINE_SIMULATION = Fallback("stronger tilts", _match_affine)
+
+
+PAIR = 0.48  # work, with its share of finding the photographs' points: the networks take pictures of one size only
+_PART = LearnedPart("xfeat", "matches of wide baselines", xfeat.WEIGHTS, xfeat.PACKAGE)
+
+
+def _match_learned(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
+    if means.config.prior.kind != "classical":  # another prior has been asked for matches
+        return iter(())
+    return match_weak_pairs(means, doubtful, lambda graph, pair: PAIR, matcher=xfeat.load(xfeat.Config()).matcher)
+
+
+LEARNED_MATCHES = Fallback("learned matches", _match_learned, partial(find_unavailable_reason, _PART))
+
+
+MIN_LEFT = 3  # photographs with cameras: of fewer, nothing tells whether one of them is wrong
+
+
+def estimate_without_doubtful(
+    estimate: Reconstruction, rejected: Sequence[Rejected], config: ReconstructionConfig, pause: Callable[[], None]
+) -> Reconstruction:
+    """The estimate of the others, where they are most photographs, and are published exactly; else `estimate`.
+
+    The photographs that are left out stay in its view graph, without pairs. `pause` may raise.
+    """
+    other, left_out = estimate, frozenset[str]()
+    while not other.verdict.publishable:
+        doubtful = frozenset(other.verdict.frames) - left_out
+        left_out |= doubtful
+        few = 2 * len(left_out) < len(estimate.graph.keyframes)
+        if not doubtful or not few or len(other.camera_names - left_out) < MIN_LEFT:
+            return estimate
+        other = estimate_cameras(estimate.graph.forget_pairs(left_out), rejected, config, pause)
+    if other is estimate or other.verdict.code is Code.OK_ROUGH:
+        return estimate
+    return _explain_left_out(other, estimate, left_out)
+
+
+def _explain_left_out(other: Reconstruction, refused: Reconstruction, left_out: frozenset[str]) -> Reconstruction:
+    """Explains in the verdict why the other images were left out."""
+    found, count = len(other.publishable_camera_names), len(other.graph.keyframes)
+    names = ", ".join(name for name in other.graph.names if name in left_out)
+    gone = f"{names} {'was' if len(left_out) == 1 else 'were'} left out"
+    message = f"{found} of {count} photographs were placed, after {gone}: {refused.verdict.message}"
+    verdict = replace(other.verdict, code=Code.OK_PARTIAL, message=message, advice=refused.verdict.advice)
+    return replace(other, verdict=verdict)
+
+
+log = logging.getLogger(__name__)
+
+RUNGS = (LEARNED_MATCHES, AFFINE_SIMULATION)  # what wins most for its work comes first
+CAMERAS = 0.2  # work of estimating the cameras again, for each keyframe
+LACKING_MATCHES = (Code.NO_OVERLAP, Code.SPLIT, Code.OK_PARTIAL, Code.AMBIGUOUS)
+# Of the others, what more cameras may mend, where some keyframes have none: few leave much open.
+UNCERTAIN = (Code.OK_ROUGH, Code.TOO_ROUGH, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY, Code.BASELINE_TOO_SMALL)
+
+
+def run_fallbacks(
+    estimate: Reconstruction,
+    rejected: Sequence[Rejected],
+    config: ReconstructionConfig,
+    pause: Callable[[], None] = lambda: None,
+    rungs: Sequence[Fallback] = RUNGS,
+    until: float = math.inf,
+) -> Reconstruction:
+    """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
+
+    With `config.no_fallbacks` it is `estimate`. `config.fallbacks` bounds the work that is added: what it comes to is
+    looked at between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate
+    that have begun are finished. Where that does not help, photographs in doubt are left out. `pause` may raise.
+    """
+    if config.no_fallbacks:
+        return estimate
+    if _lacks_matches(estimate):
+        estimate = _try_fallbacks(estimate, rejected, config, pause, rungs, until)
+    return estimate if is_over(until) else estimate_without_doubtful(estimate, rejected, config, pause)
+
+
+def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, rungs: Sequence[Fallback] = RUNGS) -> str:
+    """Identifies what the rungs start from: the keyframes, their matches, the budget, and which rungs are available.
+
+    Rungs that gained nothing gain nothing from an equal start. The key is the same in another process.
+    """
+    digest, names = hashlib.blake2b(digest_size=16), graph.names
+    available = [f"{rung.name}: {rung.obstacle()}" for rung in rungs]
+    for text in (repr(config.fallbacks), *available, *sorted(names)):
+        digest.update(f"{text}\0".encode(errors="surrogateescape"))
+    by_name = {tuple(sorted((names[i], names[j]))): pair for (i, j), pair in graph.pairs.items()}
+    for pair in sorted(by_name):
+        found = by_name[pair]
+        matched = f"{len(found.matches)}, {found.num_candidates}, {found.log10_nfa!r}"
+        digest.update("\0".join((*pair, matched, "")).encode(errors="surrogateescape"))
+    return digest.hexdigest()
+
+
+def _try_fallbacks(
+    estimate: Reconstruction,
+    rejected: Sequence[Rejected],
+    config: ReconstructionConfig,
+    pause: Callable[[], None],
+    rungs: Sequence[Fallback],
+    until: float,
+) -> Reconstruction:
+    means, most_s = FallbackState(estimate.graph, config), config.fallbacks.timeout_s
+    until = until if most_s is None else min(until, time.monotonic() + most_s)
+    tried: list[str] = []
+    not_tried: list[str] = []
+    for rung in rungs:
+        doubtful = find_doubtful_keyframes(estimate)
+        if not doubtful or _is_exhausted(means, until):
+            break
+        obstacle = rung.obstacle()
+        if obstacle:
+            not_tried.append(f"{rung.name} ({obstacle})")
+            continue
+        before = means
+        means = _run_fallback(rung.climb(before, doubtful), before, until, pause)
+        if means is before:
+            continue
+        other = estimate_cameras(means.graph, rejected, means.config, pause)
+        means = means.add_work(CAMERAS * len(means.graph.keyframes))
+        estimate = choose_better_reconstruction(estimate, other)
+        gained = "more photographs found their place" if estimate is other else "nothing gained"
+        log.info("looked for more matches: %s: %s by %.1f of work", rung.name, gained, means.work - before.work)
+        tried.append(rung.name)
+    return _append_tried(estimate, {"Also tried": tried, "Not tried": not_tried})
+
+
+def _lacks_matches(estimate: Reconstruction) -> bool:
+    code = estimate.verdict.code
+    return code in LACKING_MATCHES or (code in UNCERTAIN and bool(find_unplaced_keyframes(estimate)))
+
+
+def _run_fallback(
+    climb: Iterator[FallbackState], means: FallbackState, until: float, pause: Callable[[], None]
+) -> FallbackState:
+    """The means after the last piece of work that begins before the climb ends."""
+    for further in climb:
+        means = further
+        pause()
+        if _is_exhausted(means, until):
+            break
+    return means
+
+
+def _is_exhausted(means: FallbackState, until: float) -> bool:
+    """Whether nothing further begins, for these means or from `until` on, a time of `time.monotonic()`."""
+    return means.work >= means.config.fallbacks.budget or is_over(until)
+
+
+def find_doubtful_keyframes(estimate: Reconstruction) -> frozenset[str]:
+    """The names of those without a camera, and of those that the verdict is about; none where all are published."""
+    without = find_unplaced_keyframes(estimate)
+    return without if estimate.verdict.publishable else without.union(estimate.verdict.frames)
+
+
+def find_unplaced_keyframes(estimate: Reconstruction) -> frozenset[str]:
+    """The names of the keyframes that have no camera."""
+    return frozenset(estimate.graph.names) - estimate.camera_names
+
+
+def _append_tried(estimate: Reconstruction, rungs: Mapping[str, Sequence[str]]) -> Reconstruction:
+    """Appends the fallbacks to the verdict's message, unless nothing is left to explain."""
+    if not find_doubtful_keyframes(estimate):
+        return estimate
+    sentences = [f"{what}: {', '.join(names)}." for what, names in rungs.items() if names]
+    message = " ".join([estimate.verdict.message, *sentences])
+    return replace(estimate, verdict=replace(estimate.verdict, message=message)) if sentences else estimate

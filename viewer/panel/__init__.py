@@ -1,1 +1,0 @@
-"""The panel beside the picture: buttons, four tabs, and a line about what was done last."""
