@@ -56,7 +56,13 @@ class BoundModel:
         product *= max(inlier_ratio, MIN_INLIER_RATIO) ** self.inlier_ratio * max(link, MIN_INLIER_RATIO) ** self.link
         for name, value in sources.items():
             product *= math.hypot(value, self.floor) ** getattr(self, name)
-        parts = (product, OF_SIGMA * errors.sigma, errors.regions, OF_PROFILE * errors.profile, OF_LENSES * errors.lenses)
+        parts = (
+            product,
+            OF_SIGMA * errors.sigma,
+            errors.regions,
+            OF_PROFILE * errors.profile,
+            OF_LENSES * errors.lenses,
+        )
         return math.nan if any(math.isnan(part) for part in parts) else max(parts)
 
 
@@ -157,7 +163,6 @@ def compute_measures(evidence: Evidence, model: ErrorModel) -> dict[str, float]:
         "link_inlier_ratio": _clip(link.inlier_ratio, 0.0, 1.0),
         "coverage": _clip_log(min(camera.coverage for camera in cameras), 0.05, 0.5),
         "flat_patch": max(_measure_flat_patch(camera) for camera in cameras),
-        "mirrored_cost": _clip_log(evidence.mirrored_cost, 0.8, 10.0),
         "reflection": _clip(evidence.reflection.gain, 0.1, 1.0),
         "directions": _clip_log(evidence.cycles.direction_sigmas, 1.0, 30.0),
         "own_lens": float(any(camera.own_lens for camera in cameras)),
