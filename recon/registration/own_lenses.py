@@ -92,7 +92,7 @@ def free_lenses(
     least = _least_common(partial.prior, groups, sides, config)
     common = np.maximum(least, _sigmas(0.0, config.widest_shift, 0.0, sides, config.widest_aspect))
     common[~shared[groups]] = least[~shared[groups]]
-    estimate, kept = _expand_lenses(partial.estimate), 2.0 / config.refuted_at
+    estimate, kept = expand_lenses(partial.estimate), 2.0 / config.refuted_at
     quick = msgspec.structs.replace(loss, max_iterations=_ITERATIONS, tolerance=_DECREASE)
     middles, sizes = np.zeros_like(own), np.zeros_like(own)
     prior = _prior(partial.prior, groups, own, common)
@@ -218,10 +218,11 @@ def widen_lens_priors(
     alone = ~shared[groups][:, None] | ((tied == 0) & (common > 0))
     own = np.where(alone, common, tied)
     common = np.where(alone, 0.0, prior.own_sigmas[groups])
-    return _expand_lenses(problem), _prior(prior, groups, own, common)
+    return expand_lenses(problem), _prior(prior, groups, own, common)
 
 
-def _expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Problem:
+def expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Problem:
+    """The same map with as many lenses as views, in their order; those of a group are alike."""
     groups = estimate.lens_of_camera
     return replace(
         estimate,

@@ -275,6 +275,13 @@ def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
     return refuse(rejections.MIRRORED_PHOTOGRAPHS, found.frames, count=len(found.frames))
 
 
+def check_mirrored_scene(case: EvidenceCase) -> Verdict | None:
+    """The scene mirrored in depth fits nearly as well."""
+    if case.evidence.mirrored_cost >= case.config.min_mirrored_cost:
+        return None
+    return refuse(rejections.MIRRORED_IN_DEPTH, case.names)
+
+
 def check_required_precision(case: EvidenceCase) -> Verdict | None:
     """The centres are known less well than the user requires."""
     needed = case.config.max_position_error_percent
@@ -534,8 +541,6 @@ def _refuse_wrong_frames(case: VerificationCase) -> Verdict | None:
 def _refuse_wrong_poses(case: VerificationCase, against: str) -> Verdict:
     """Refuses for the reason that speaks most against the poses."""
     cameras = case.evidence.cameras
-    if against == "mirrored_cost":
-        return refuse(rejections.MIRRORED_IN_DEPTH, case.names)
     if against == "reflection":
         mirrored = case.evidence.reflection.frames
         return refuse(rejections.MIRRORED_PHOTOGRAPHS, mirrored, count=len(mirrored))
@@ -668,6 +673,7 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
     check_weakest_link,
     check_connectivity,
     check_mirrored_images,
+    check_mirrored_scene,
 )
 CHECKS = (  # what is surer about the reason comes first; those after the first may take all numbers for finite
     check_finite,

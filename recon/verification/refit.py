@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -500,6 +501,44 @@ def free_principal_points(fit: BundleFit) -> CameraShifts | None:
     return compute_camera_shifts(whole, adjust(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas))))
 
 
+# What lenses may differ in without showing it: focal lengths of images, principal points of groups, all adjusted anew.
+#
+# A zoom of a few percent, an autofocus that breathes or a second camera shows only where a scene has depth: what lies
+# at one distance looks the same from farther away through a longer lens. Crops and keystone corrections displace the
+# principal points of all images alike, which looks nearly like a turn. `own_lenses` gives images other lenses only
+# where the observations refute the common one. Where they leave it open, the cameras may be as far off as they would
+# move with such lenses.
+
+DOUBTED_FOCAL = 0.1  # sigma of log focal by which an image's lens may differ from the common one
+DOUBTED_SHIFT = 0.1  # sigma of the common principal point, of the longer side
+
+
+def doubt_common_lenses(fit: BundleFit) -> CameraShifts:
+    """How far off cameras may be if their lenses are not what they were taken for: RMS over such cameras.
+
+    The mean of these cameras is where an adjustment finds them, their spread is its covariance. The focal lengths are
+    those of the cameras (C,), and not of their lenses. A camera that shares its lens with no other keeps its prior.
+    """
+    whole = adjust(fit)
+    count, side = len(whole.problem.rotations), REFERENCE_SIDE * fit.scale
+    config = msgspec.structs.replace(own_lenses.OwnLensesConfig(), focal_sigma=DOUBTED_FOCAL)
+    shared = np.bincount(whole.problem.lens_of_camera, minlength=len(whole.prior.sigmas)) > 1
+    shifts = np.where(shared, np.maximum(whole.prior.shift_sigmas, DOUBTED_SHIFT * side), whole.prior.shift_sigmas)
+    prior = replace(whole.prior, shift_sigmas=shifts)
+    apart, prior = own_lenses.widen_lens_priors(whole.problem, prior, np.full(count, side), config)
+    apart = bundle_adjustment.adjust(apart, prior, fit.loss)
+    mean = compute_camera_shifts(
+        replace(whole, problem=own_lenses.expand_lenses(whole.problem)), replace(whole, problem=apart)
+    )
+    covariance = bundle_adjustment.covariance(apart, prior, fit.loss, 0)
+    rotations, centres = bundle_adjustment.camera_sigmas(apart, covariance, range(count))
+    return CameraShifts(
+        rotation_deg=np.hypot(mean.rotation_deg, rotations),
+        centre=np.hypot(mean.centre, compute_rms_radius(whole.Ts_world_camera[:, :3, 3]) * centres),
+        focals_rel=np.hypot(mean.focals_rel, bundle_adjustment.sigmas(covariance.log_focals)),
+    )
+
+
 # The mirrored answer: seen from afar, a scene and its mirror image in depth look the same from mirrored cameras.
 
 # Shifts below which the mirrored start has found its way back to the same answer:
@@ -554,6 +593,7 @@ class Errors:
     sigma: float  # the covariance of the bundle adjustment, which takes errors for independent
     regions: float  # what leaving out regions of the pictures changes (a jackknife, above)
     profile: float  # what unknown lenses leave open (focal profile and principal point, above)
+    lenses: float = 0.0  # what focal lengths that differ from image to image leave open (own lenses, above)
 
 
 @dataclass(frozen=True)
@@ -577,31 +617,37 @@ class AllErrors:
 
 def combine_worst(errors: Iterable[Errors]) -> Errors:
     """The largest of each source; NaN where one is."""
-    found = np.array([(of.sigma, of.regions, of.profile) for of in errors])
+    found = np.array([astuple(of) for of in errors])
     return Errors(*found.max(0).tolist())
 
 
 def measure_errors(fit: BundleFit, registration: Registration) -> AllErrors:
     """Measures the errors of the cameras of `registration`; `fit` has a part of its points."""
-    regions, profile, freed = (
-        estimate_spread(fit),
-        profile_focal(fit),
-        free_principal_points(fit),
-    )
+    regions, profile, lenses = estimate_spread(fit), profile_focal(fit), doubt_common_lenses(fit)
+    freed = free_principal_points(fit)
     turned, shifted = (profile.rotation_deg, profile.centre)
     if freed is not None:
         turned, shifted = np.maximum(turned, freed.rotation_deg), np.maximum(shifted, freed.centre)
     unit = compute_travel(registration)
     cameras = {
         camera.index: PoseErrors(
-            rotation=Errors(camera.rotation_sigma_deg, regions.rotation_deg[i], float(turned[i])),
-            centre=Errors(unit * camera.centre_sigma_rel, regions.centre[i], float(shifted[i])),
+            rotation=Errors(
+                camera.rotation_sigma_deg, regions.rotation_deg[i], float(turned[i]), float(lenses.rotation_deg[i])
+            ),
+            centre=Errors(
+                unit * camera.centre_sigma_rel, regions.centre[i], float(shifted[i]), float(lenses.centre[i])
+            ),
         )
         for i, camera in enumerate(registration.cameras)
     }
     lens_of = fit.problem.lens_of_camera
     focals = {
-        camera.index: Errors(camera.focal_sigma, regions.focal_rel[lens_of[i]], profile.focal_rel[lens_of[i]])
+        camera.index: Errors(
+            camera.focal_sigma,
+            regions.focal_rel[lens_of[i]],
+            profile.focal_rel[lens_of[i]],
+            float(lenses.focals_rel[i]),
+        )
         for i, camera in enumerate(registration.cameras)
     }
     return AllErrors(cameras, focals)
@@ -644,10 +690,11 @@ def extrapolate_focal_errors(registration: Registration, known: Mapping[int, Err
 def _extrapolate_errors(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:
     ratios = [of.sigma / max(sigmas[index], MIN_SIGMA) for index, of in known.items()]
     sharper = float(np.clip(np.median(ratios), LEAST_SHARPER, 1.0))
-    largest = Errors(*(max(getattr(of, part) for of in known.values()) for part in ("sigma", "regions", "profile")))
+    largest = Errors(*np.array([astuple(of) for of in known.values()]).max(0).tolist())
     found = {}
     for index, sigma in sigmas.items():
         worse = max(1.0, sharper * sigma / max(largest.sigma, MIN_SIGMA))
-        was = known.get(index) or Errors(sharper * sigma, worse * largest.regions, worse * largest.profile)
+        further = (worse * largest.regions, worse * largest.profile, worse * largest.lenses)
+        was = known.get(index) or Errors(sharper * sigma, *further)
         found[index] = replace(was, sigma=sharper * sigma)
     return found

@@ -319,7 +319,6 @@ FOR = (
     "camera_inlier_ratio",
     "link_inlier_ratio",
     "coverage",
-    "mirrored_cost",
 )
 AGAINST = ("flat_patch", "reflection", "directions", "rotation_bound", "travel_bound")
 SIGNS = {**dict.fromkeys(FOR, 1), **dict.fromkeys(AGAINST, -1)}

@@ -150,7 +150,7 @@ def test_what_is_not_finite_is_none_in_the_report(path, value):
     for step in path:
         found = found[step]
     assert found is None
-    if path == ("mirrored_cost",):
+    if path == ("inlier_ratio",):
         assert written["log_odds"]["total"] is None and written["rms_px"] == GOOD.rms_px
 
 

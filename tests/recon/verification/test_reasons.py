@@ -141,14 +141,6 @@ def doubting(measure: str) -> VerdictModels:
             "The smaller part has 1 of them",
         ),
         ("coverage", {2: {"coverage": 0.06}}, {}, Code.AMBIGUOUS, (2,), "fills only 6 % of its picture"),
-        (
-            "mirrored_cost",
-            {},
-            {"mirrored_cost": 0.9},
-            Code.AMBIGUOUS,
-            (0, 1, 2, 3),
-            "mirror image of the other in depth",
-        ),
         ("reflection", {}, {"reflection": Reflection(("1.png",), 0.3)}, Code.AMBIGUOUS, (1,), "the wrong way round"),
         ("flat_patch", {2: {"coverage": 0.04, "flat_share": 0.99}}, {}, Code.MOVING_SCENE, (2,), "4 % of its picture"),
         ("travel_bound", {2: {"errors": unsure(centre=0.05)}}, {}, Code.AMBIGUOUS, (2,), "disagree about 2.png"),
@@ -187,3 +179,12 @@ def test_most_images_that_refute_a_given_lens_refute_its_calibration():
         given = verdict(4, lenses)
         assert given.code == code
         assert ("3 of 4 photographs contradict the lens" in given.message) == (code == Code.FOCAL_SUSPECT)
+
+
+@pytest.mark.parametrize(("cost", "code"), [(1.05, Code.AMBIGUOUS), (1.2, Code.OK)])
+def test_a_scene_that_fits_as_well_mirrored_in_depth_is_ambiguous(cost, code):
+    given = decide(
+        graph(3, all_pairs(3)), registration((0, 1, 2)), evidence((0, 1, 2), mirrored_cost=cost), DecisionConfig()
+    )
+    assert given.code == code
+    assert ("mirror image of the other in depth" in given.message) == (code == Code.AMBIGUOUS)

@@ -140,3 +140,41 @@ def test_distortion_that_the_observations_ask_for():
     assert bent.cost_ratio < 0.6
     straight = refit.measure_distortion(made_up())
     assert straight.corner_shift < 0.01 and straight.cost_ratio > 0.97
+
+
+def zoom(fit: refit.BundleFit, camera: int, factor: float) -> refit.BundleFit:
+    """The same fit, of which one image was zoomed and nothing tells it."""
+    pixels = fit.problem.pixels.copy()
+    pixels[fit.problem.camera_of == camera] *= factor
+    return replace(fit, problem=replace(fit.problem, pixels=pixels))
+
+
+def test_a_zoom_that_a_flat_scene_hides_moves_its_camera_no_farther_than_is_doubted():
+    """All at one distance: a zoom of 6 % looks like a step of 6 % of the distance, 4."""
+    flat = given(made_up(depth=0.02))
+    truth = flat.Ts_world_camera[:, :3, 3]
+    zoomed = zoom(flat, 1, 1.06)
+    doubted = refit.doubt_common_lenses(zoomed)
+    found = refit.umeyama(refit.adjust(zoomed).Ts_world_camera[:, :3, 3], truth)
+    error = np.linalg.norm(found(refit.adjust(zoomed).Ts_world_camera[:, :3, 3]) - truth, axis=1)
+    assert error.max() > 0.04  # the lens that is held is believed, and the camera is off
+    assert (error < 2.5 * 0.6 * doubted.centre).all()
+
+
+def test_where_depth_tells_the_lenses_little_is_doubted():
+    deep, flat = (refit.doubt_common_lenses(given(made_up(depth=depth))) for depth in (3.0, 0.02))
+    assert deep.centre.max() < 0.2 * flat.centre.max() and deep.focals_rel.max() < 0.3 * flat.focals_rel.max()
+
+
+def test_a_lens_that_no_other_camera_shares_keeps_its_prior():
+    """Four calibrated lenses, one a camera: nothing is doubted but what noise leaves open."""
+    fit = made_up(depth=0.02)
+    four = {"log_focals": np.full(4, np.log(FOCAL)), "radials": np.zeros((4, 2)), "shifts": np.zeros((4, 2))}
+    problem = replace(fit.problem, lens_of_camera=np.arange(4), **four)
+    prior = bundle_adjustment.LensPrior(problem.log_focals, np.zeros(4), np.zeros((4, 2)), np.zeros(4))
+    alone = replace(
+        fit, problem=problem, prior=prior, told=np.full(4, FOCAL), nominal_sigmas=np.full(4, np.inf),
+        own=np.zeros(4, bool), units=np.ones(4),
+    )  # fmt: skip
+    assert refit.doubt_common_lenses(alone).focals_rel.max() < 1e-6
+    assert refit.doubt_common_lenses(alone).centre.max() < 0.2 * refit.doubt_common_lenses(given(fit)).centre.max()
