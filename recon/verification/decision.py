@@ -267,6 +267,15 @@ def _refuse_split(frames: Sequence[str]) -> Verdict:
     return refuse(rejections.APART, frames, count=len(frames))
 
 
+def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
+    """A camera hangs on the others by points of one pair, which tell its direction and not how far it is away."""
+    cameras = case.evidence.cameras
+    weakest = min(cameras, key=lambda camera: camera.confirmed)
+    if len(cameras) == 2 or weakest.confirmed >= case.config.min_confirmed:
+        return None
+    return refuse(rejections.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
+
+
 def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
     """Some photographs match the others better when they are turned left to right."""
     found = case.evidence.reflection
@@ -672,6 +681,7 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
     check_moving_plane,
     check_weakest_link,
     check_connectivity,
+    check_confirmed_points,
     check_mirrored_images,
     check_mirrored_scene,
 )

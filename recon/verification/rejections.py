@@ -167,6 +167,11 @@ FEW_SHARED_POINTS = Refusal(
     "distance to the scene, its direction to {rotation:.0f} degrees.",
     "Add a photograph between {name} and {partner}.",
 )
+UNCONFIRMED = Refusal(
+    Code.NO_OVERLAP,
+    "Only {points} points of {name} are seen by two others at once: nothing confirms its position.",
+    "Add a photograph between {name} and the one nearest to it.",
+)
 SCATTERED = Refusal(
     Code.AMBIGUOUS,
     "Parts of the photographs disagree about {name}: its position is open to {centre:.0f} % of the distance to the "

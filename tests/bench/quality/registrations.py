@@ -77,6 +77,7 @@ def of_scene(scene: Path, out: Path) -> list[dict[str, Any]]:
             answer, found = campaign.reconstruct_window(place, window, ReconstructionConfig(), False, told, known)
             cache.update(found)
             rows.append({"told": told, "row": asdict(judge_window(window, OURS, answer, place.scene.cameras))})
+    (out / f"{scene.name}.json").write_text(json.dumps(rows))  # should a later scene fail
     return rows
 
 
@@ -119,6 +120,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     jobs = [(index, seed) for index, row in enumerate(ROWS) if asks_for_cameras(row) for seed in range(SEEDS)]
     with ProcessPoolExecutor(arguments.processes) as pool:
+        load_trial_scenes(arguments.scenes, out)  # a folder that is no scene ends the run now, not after an hour
         rows = [row for found in pool.map(partial(of_scene, out=out), arguments.scenes) for row in found]
         trials = list(pool.map(partial(of_row, scenes=arguments.scenes, out=out), jobs))
     for told, name in (("nothing", "fit_windows"), ("exif", "fit_windows_exif"), ("given", "fit_windows_given")):
