@@ -27,7 +27,9 @@ def test_a_camera_is_mounted_as_its_configuration_says():
     config = parse_config({"camera": CAMERA, "T_base_camera": ROWS}, CaptureConfig)
     frames = list(mount_camera(camera_opener(config.camera), config.T_base_camera)())
     assert [frame.T_base_camera for frame in frames if isinstance(frame, Frame)] == [NUMBERS, NUMBERS]
-    np.testing.assert_array_equal(frames[0].mount, ROWS)
+    first = frames[0]
+    assert isinstance(first, Frame)
+    np.testing.assert_array_equal(first.mount, ROWS)
     opened = camera_opener(config.camera)
     assert mount_camera(opened, None) is opened
 

@@ -4,7 +4,7 @@ Registrations of each scene's windows of 2, 3, 6 and 12 photographs: nothing tol
 within 3 %, and the lens given (all windows of three, one of each stride of 6 and 12); and of the rows of the stability
 matrix, cameras alone, four seeds each. They go into fit_windows.json.gz, fit_windows_exif.json.gz,
 fit_windows_given.json.gz, fit_pairs.json.gz and fit_matrix.json.gz, which `python -m tests.bench fit` reads beside
-fit_lenses.json.gz, the trials of `python -m tests.bench lens_assumptions`.
+lens_assumptions.json.gz, the trials of `python -m tests.bench lens_assumptions`.
 """
 
 from __future__ import annotations

@@ -11,7 +11,13 @@ from tests.reference.measured.raw import bullets, part, raw, require, table
 
 FILE = ROOT / "tests" / "bench" / "roles.json"
 USES = "tuned on", "looked at", "unseen"
-FITS = "fit_windows", "fit_windows_exif", "fit_windows_given", "fit_pairs", "fit_lenses"  # raw files of the verdict
+FITS = (
+    "fit_windows",
+    "fit_windows_exif",
+    "fit_windows_given",
+    "fit_pairs",
+    "lens_assumptions",
+)  # raw files of the verdict
 TUNED_SETS = "bench_7sets"  # raw file of the sets on which presets were chosen
 
 
