@@ -54,6 +54,7 @@ class Sample:
     evidence: Evidence
     errors: Mapping[str, CameraError]  # by camera; of those that have a true one
     broken: bool = False  # its images break what is assumed of lenses, on purpose: a trial of lens assumptions
+    lens_trial: bool = False  # of `lens_assumptions`; else, without a window, of the matrix
     told: bool = False  # what EXIF or a calibration says of the lens came with the photographs of a window
 
     @property
@@ -122,7 +123,8 @@ def make_trial_samples(trials: list[dict]) -> Iterator[Sample]:
             evidence = _parse_evidence(trial["evidence"])
             scene = trial["note"].split(",")[0].split(" and ")[0]
             still, errors = _is_still(trial["published"], trial["verdict"]), _parse_errors(trial["errors"])
-            yield Sample(scene, len(evidence.cameras), False, True, still, evidence, errors, broken=_is_broken(trial))
+            kind = {"broken": _is_broken(trial), "lens_trial": "kind" in trial}
+            yield Sample(scene, len(evidence.cameras), False, True, still, evidence, errors, **kind)
 
 
 def _is_broken(trial: dict) -> bool:
@@ -439,7 +441,7 @@ def make_report(pairs: Sequence[Judgement]) -> dict[str, object]:
         "windows_by_count": by_count,
         "windows_by_scene": by_scene,
         "windows_told": asdict(count_judgements([pair for pair in pairs if pair[0].window and pair[0].told])),
-        "matrix": asdict(count_judgements([pair for pair in pairs if not pair[0].window])),
+        "matrix": asdict(count_judgements([each for each in pairs if not each[0].window and not each[0].lens_trial])),
         "beyond": [identify_sample(sample) for sample, numbers in pairs if _exceeds_published_bounds(sample, numbers)],
         "right_refused": [identify_sample(s) for s, numbers in right if not is_published(s, numbers)],
     }
