@@ -8,7 +8,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.messaging.wire import Finite
+from splatnode.capture.messaging.wire import LARGEST, Finite
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 
 _LONGEST_SENTENCE = 10_000  # characters, of a report; in a message LONGEST_TEXT
@@ -55,7 +55,7 @@ class StoredDepthCheck(msgspec.Struct, frozen=True):
     code: DepthCode
     message: Annotated[str, msgspec.Meta(max_length=_LONGEST_SENTENCE)]
     camera: Annotated[str, msgspec.Meta(max_length=LONGEST_NAME)] = ""
-    points: Annotated[int, msgspec.Meta(ge=0, lt=1 << 53)] = 0
+    points: Annotated[int, msgspec.Meta(ge=0, le=LARGEST)] = 0
     shift_px: tuple[Finite, Finite] | None = None
     shift_is_least: bool = False
     scale_error: Finite | None = None

@@ -66,18 +66,12 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.verbs",
         "splatnode.command_line",
         "splatnode.extras.verbs",
-        "splatnode.extras.verbs",
-        "splatnode.extras.verbs",
-        "splatnode.extras.verbs",
-        "splatnode.extras.verbs",
         "splatnode.extras.viewers.flags",
         "splatnode.recon.former_names",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.replay_verb",
-        "splatnode.recon.replay_verb",
         "splatnode.recon.verbs",
         "splatnode.viewer.former_names",
-        "splatnode.viewer.verbs",
         "splatnode.viewer.verbs",
     ]
     assert heavy == "[]"

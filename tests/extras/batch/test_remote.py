@@ -106,5 +106,5 @@ def test_options_that_do_not_go_together_are_told(tmp_path, given, said):
 
 _OF_REPLAY = (
     "config", "preset", "prior", "device", "size", "budget_s", "max_position_error", "max_gaussians", "max_mb", "seed",
-    "views", "marker",
+    "views", "marker", "frame", "gravity",
 )  # fmt: skip

@@ -61,10 +61,16 @@ def test_bounds_that_are_too_wide_are_refused_for_their_cause(graph, what, code,
 
 def test_a_camera_that_hangs_on_few_points_is_named_with_its_neighbour():
     pairs = {**all_pairs(4), (1, 2): pair(300)}
-    seen = evidence((0, 1, 2, 3), {2: {"errors": unsure(centre=0.3), "confirmed": 8}})
+    seen = evidence((0, 1, 2, 3), {2: {"errors": unsure(centre=0.3), "confirmed": 18}})
     given = refused(decide(graph(4, pairs), registration((0, 1, 2, 3)), seen, DecisionConfig()), Code.NO_OVERLAP)
-    assert given.frames == names(2, 1) and "2.png shares only 8 points" in given.message
+    assert given.frames == names(2, 1) and "2.png shares only 18 points" in given.message
     assert given.advice == "Add a photograph between 2.png and 1.png."
+
+
+def test_a_camera_that_no_third_one_confirms_is_refused_however_sure_it_seems():
+    given = refused(verdict(4, {2: {"confirmed": 14}}), Code.NO_OVERLAP)
+    assert given.frames == names(2) and "Only 14 points of 2.png are seen by two others at once" in given.message
+    assert verdict(4, {2: {"confirmed": 15}}).code == Code.OK
 
 
 @pytest.mark.parametrize("errors", [unsure(rotation=20.0), unsure(centre=0.3)])
