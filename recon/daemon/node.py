@@ -108,7 +108,7 @@ class DiskSpace:
 
 # Commands to the running daemon, and the verb `retract` that sends one.
 
-EXIT_GOOD, EXIT_UNKNOWN_NAME, EXIT_UNFINISHED = 0, 2, 75
+EXIT_GOOD, EXIT_UNKNOWN_NAME, EXIT_NO_SCENE, EXIT_UNFINISHED = 0, 2, 65, 75
 
 
 class RemoveKeyframe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):
@@ -163,11 +163,30 @@ def recon(args: argparse.Namespace) -> int:
     except AlreadyRunning:
         if not args.finish:
             raise
+        if given := _list_own_flags(args):
+            raise ValueError(
+                f"{', '.join(given)}: a node runs already, with its own settings. Give --finish alone, or stop it"
+            ) from None
         return _wait_for_running_node(config, stopping)
     if daemon.left:
         say(f"not finished: {daemon.left}", error=True)
         return EXIT_UNFINISHED
+    if daemon.finished and not is_map_set(config.out):
+        checkpoint = config.checkpoint or state_directory() / "recon"
+        say(
+            f"no scene lies in {config.out}: {checkpoint} has no keyframes, or its scenes were written elsewhere. To "
+            "make them anew, replay the recording",
+            error=True,
+        )
+        return EXIT_NO_SCENE
     return 0
+
+
+def _list_own_flags(args: argparse.Namespace) -> list[str]:
+    """The flags that say how a node of its own would work."""
+    changes = {**collect_marker_changes(args), **collect_frame_changes(args)}
+    flags = {"--checkpoint": args.checkpoint, "--out": args.out, "--marker": args.marker}
+    return [name for name, value in flags.items() if value] + [f"--{name}" for name in changes if name in vars(args)]
 
 
 def _wait_for_running_node(config: DaemonConfig, stopping: threading.Event) -> int:
@@ -229,6 +248,7 @@ class Daemon:
         self._finish = _Finish() if finish else None
         self._merged: threading.Thread | None = None  # once all is final
         self._merged_s = -math.inf  # monotonic: when it was last seen at work
+        self.finished = False  # as it was asked to, and not stopped
         self.left = ""  # what a node that finishes could not do
         self._heart, self._told = Unfailing("the heartbeat"), ReconState.LOADING.value  # the service manager's
 
@@ -280,6 +300,7 @@ class Daemon:
             if self._merged.is_alive():
                 self._merged_s = time.monotonic()
             elif time.monotonic() - self._merged_s >= QUIET_S:  # whoever asked hears what came of it
+                self.finished = True
                 self._stopping.set()
             return
         waiting = self._worker.count_waiting()

@@ -27,6 +27,8 @@ Array = npt.NDArray[np.float64]
 MOST_DEG = 10.0  # standard deviation of up by gravity, beyond which it tells no upright frame
 # Standard deviation of a floor's normal against gravity: how level floors are, and how well their plane is found
 FLOOR_SIGMA_DEG = 1.0
+FARTHEST_MOUNT_M = 20.0  # of a camera from its base; beyond, the mount is probably in millimetres, which is told
+CONTRADICTED_DEG = 20.0  # between gravity and the floor, from which on this is told: a sign is wrong, or it is no floor
 _STRAIGHT = 1e-3  # length of a camera's forward axis in the level plane, below which it looks straight up or down
 
 USE_FIRST = "Or ask for frame: first_camera."
@@ -132,7 +134,11 @@ def _find_base(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) ->
             f"the scene has no metres, in which T_base_camera is{why}",
             f"Give something that tells metres: a marker, a distance, poses, wheels, stereo or depth. {USE_FIRST}",
         )
-    return _Found(evidence.mounts[first.name] @ _invert(first.T_world_camera), f"T_base_camera of {first.name}")
+    mount = evidence.mounts[first.name]
+    source, away_m = f"T_base_camera of {first.name}", float(np.linalg.norm(mount[:3, 3]))
+    if away_m > FARTHEST_MOUNT_M:
+        source += f", which is {away_m:.0f} m from the base: T_base_camera is in metres, not in millimetres"
+    return _Found(mount @ _invert(first.T_world_camera), source)
 
 
 def _find_odometry(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> _Found | _Missing:
@@ -181,9 +187,11 @@ def _chain_motions(snapshot: Snapshot, evidence: Evidence) -> dict[str, Array] |
 
 def _find_upright(snapshot: Snapshot, _config: MetricConfig, _evidence: Evidence) -> _Found | _Missing:
     """At the first camera, z against gravity or away from the floor; gravity counts where it is known well."""
-    up = snapshot.up
+    up, floor = snapshot.up, _find_floor_up(snapshot)
     if up is None or up.sigma_deg > UNSURE_DEG:
-        up = _find_floor_up(snapshot) or up
+        up = floor or up
+    elif floor is not None and (apart := measure_angle_deg(up, floor)) > CONTRADICTED_DEG:
+        up = replace(up, source=f"{up.source}, which {floor.source} contradicts by {apart:.0f} degrees: check its sign")
     if up is None or up.sigma_deg > MOST_DEG:
         known = "no image has gravity" if up is None else f"gravity is known to {up.sigma_deg:.2g} degrees alone"
         return _Missing(
@@ -194,6 +202,11 @@ def _find_upright(snapshot: Snapshot, _config: MetricConfig, _evidence: Evidence
     return _Found(
         make_upright_frame(snapshot.cameras[0].T_world_camera, np.array(up.direction)), up.source, up.sigma_deg
     )
+
+
+def measure_angle_deg(up: Up, other: Up) -> float:
+    """Degrees between two directions of up."""
+    return float(np.degrees(np.arccos(np.clip(np.dot(up.direction, other.direction), -1.0, 1.0))))
 
 
 def _find_floor_up(snapshot: Snapshot) -> Up | None:

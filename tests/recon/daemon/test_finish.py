@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import subprocess
+import sys
 import threading
 
 from msgspec.structs import replace
 
 from splatnode.recon.daemon import node
 from splatnode.recon.daemon.node import Daemon
+from tests.conftest import ROOT
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, index, peer, report  # noqa: F401  (fixtures)
 from tests.support.synthetic import photographs
 
@@ -78,3 +82,18 @@ def test_what_cannot_be_finished_is_told(config, peer, monkeypatch):  # noqa: F8
     thread, (daemon,) = run_in_thread(config, finish=True)
     serve_until(peer, thread)
     assert "No space left" in daemon.left
+
+
+def test_an_empty_checkpoint_is_no_scene(tmp_path):
+    (tmp_path / "run").mkdir(mode=0o700)
+    settings = f"network: {{directory: {tmp_path}/run}}\ncheckpoint: {tmp_path}/none\nout: {tmp_path}/out\n"
+    (tmp_path / "recon.yaml").write_text(settings)
+    command = [sys.executable, "-m", "splatnode", "recon", str(tmp_path / "recon.yaml"), "--finish"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert ended.returncode == 65 and "no scene lies in" in ended.stderr
+
+
+def test_flags_of_another_node_are_named():
+    args = argparse.Namespace(checkpoint=None, out="elsewhere", marker=None, frame="upright", gravity=None)
+    assert node._list_own_flags(args) == ["--out", "--frame"]
+    assert node._list_own_flags(argparse.Namespace(**{**vars(args), "out": None, "frame": None})) == []

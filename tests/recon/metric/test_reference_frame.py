@@ -74,6 +74,13 @@ def test_the_base_is_where_its_mount_says():
     np.testing.assert_allclose(ahead, [2.3, 0.0, 1.2, 1.0], atol=1e-12)
 
 
+def test_a_mount_in_millimetres_is_told():
+    far = AHEAD.copy()
+    far[:3, 3] *= 1000.0
+    known, odd = (apply_metric_scale(scene(), asked("base"), Evidence(mounts=mounts(T))) for T in (AHEAD, far))
+    assert "millimetres" in (odd.scale.frame.source or "") and "millimetres" not in (known.scale.frame.source or "")
+
+
 def test_names_of_ros_mean_the_same():
     assert parse_frame_name("base_link") is FrameName.BASE and parse_frame_name("odom") is FrameName.ODOMETRY
     with pytest.raises(ValueError, match="must be one of first_camera, base, odometry, upright"):
@@ -121,6 +128,9 @@ def test_a_floor_tells_where_up_is_however_the_world_is_turned(turn):
     off = np.degrees(np.arccos((first[:3, :3].T @ UP) @ (Ts[0][:3, :3].T @ UP)))
     assert off < 0.3 and moved.scale.frame.sigma_deg == 1.0 and "the floor" in (moved.scale.frame.source or "")
     assert moved.up is not None and moved.up.direction == (0.0, 0.0, 1.0)
+    down = tuple((first[:3, :3].T @ UP).tolist())  # what an accelerometer at rest says: up, taken for down
+    turned = apply_metric_scale(known, asked("upright", metric=False, gravity=down))
+    assert "contradicts by 180 degrees: check its sign" in (turned.scale.frame.source or "")
     unconfirmed = replace(known, gaussians=replace(seen, source_frame=np.full(count, -1)))
     assert apply_metric_scale(unconfirmed, asked("upright", metric=False)).verdict.code is Code.FRAME_UNKNOWN
 
