@@ -16,6 +16,8 @@ _IDENTITY = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.
 _USUAL: dict[str, tuple[Any, ...]] = {
     "T_world_camera": (_IDENTITY,),
     "T_world_map": (_IDENTITY,),
+    "T_frame_first_camera": (_IDENTITY,),
+    "T_base_camera": (_IDENTITY,),
     "T_previous_current": (_IDENTITY,),
     "T_start_current": (_IDENTITY,),
     "T_camera_depth": (_IDENTITY,),
