@@ -31,7 +31,7 @@ from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match
-from splatnode.recon.metric.depth_units import describe_doubtful_units
+from splatnode.recon.metric.depth_fit import describe_doubtful_units
 from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.metric.reference_frame import check_frame

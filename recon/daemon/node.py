@@ -184,9 +184,7 @@ def recon(args: argparse.Namespace) -> int:
 
 def _list_own_flags(args: argparse.Namespace) -> list[str]:
     """The flags that say how a node of its own would work."""
-    changes = {**collect_marker_changes(args), **collect_frame_changes(args)}
-    flags = {"--checkpoint": args.checkpoint, "--out": args.out, "--marker": args.marker}
-    return [name for name, value in flags.items() if value] + [f"--{name}" for name in changes if name in vars(args)]
+    return [f"--{name}" for name in ("checkpoint", "out", "marker", "frame", "gravity") if getattr(args, name)]
 
 
 def _wait_for_running_node(config: DaemonConfig, stopping: threading.Event) -> int:

@@ -7,7 +7,7 @@ better at another pixel: the images test it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit
-from splatnode.capture.frame import Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lenses import project
+from splatnode.capture.process.text import sanitize_name
 from splatnode.recon.metric.depth_smoothing import smooth_depth
 from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.threads import map_parallel
@@ -256,3 +257,13 @@ def _explain_few(views: Sequence[DepthView], count: int) -> DepthFit:
 def group_by_name(fits: Sequence[DepthFit]) -> Mapping[str, DepthFit]:
     """The fit of each image by its name, of those that may be used."""
     return {name: fit for fit in fits if fit.is_usable for name in fit.names}
+
+
+def describe_doubtful_units(frames: Iterable[Frame | DroppedFrame]) -> str:
+    """Describes what speaks against the units of depth images, by the first that it is about; empty: nothing does."""
+    depths = {each.name: each.depth for each in frames if isinstance(each, Frame) and each.depth is not None}
+    doubts = {name: doubt for name, depth in depths.items() if (doubt := describe_doubtful_unit(depth))}
+    if not doubts:
+        return ""
+    name, doubt = next(iter(doubts.items()))
+    return f"the depth image of {sanitize_name(name)}: {doubt} ({len(doubts)} of {len(depths)} depth images)"

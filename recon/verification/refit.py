@@ -593,7 +593,7 @@ class Errors:
     sigma: float  # the covariance of the bundle adjustment, which takes errors for independent
     regions: float  # what leaving out regions of the pictures changes (a jackknife, above)
     profile: float  # what unknown lenses leave open (focal profile and principal point, above)
-    lenses: float = 0.0  # what focal lengths that differ from image to image leave open (own lenses, above)
+    lenses: float = 0.0  # what other lenses than those taken for granted leave open (above)
 
 
 @dataclass(frozen=True)

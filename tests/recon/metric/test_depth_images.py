@@ -12,10 +12,9 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.depth_image import DepthImage, make_depth_image
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.metric.depth_fill import MeasuredDepth, fuse_depth, warp_depth
-from splatnode.recon.metric.depth_fit import DepthFit, DepthView, fit_depth_images
+from splatnode.recon.metric.depth_fit import DepthFit, DepthView, describe_doubtful_units, fit_depth_images
 from splatnode.recon.metric.depth_scale import estimate_scale_from_depth
 from splatnode.recon.metric.depth_smoothing import smooth_depth
-from splatnode.recon.metric.depth_units import describe_doubtful_units
 from splatnode.recon.metric.evidence import CameraDepth, Evidence, gather_evidence
 from splatnode.recon.metric.measurement import Measurement, MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale
