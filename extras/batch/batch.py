@@ -34,9 +34,9 @@ from splatnode.capture.process.records import record_in, record_of
 from splatnode.capture.process.system import SHORT_OF_MEMORY, outlast, raise_shortage
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.extras.cameras import mcap
+from splatnode.extras.cameras.mcap import image_topics
 from splatnode.extras.jobs.child import Child, End, Limits, run_processes
 from splatnode.extras.lerobot import data_set
-from splatnode.extras.logged.image_topics import image_topics
 from splatnode.recon.former_names import FLAGS
 from splatnode.recon.result.export.limits import read_json_file
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Frame
 from splatnode.extras.cameras.mcap import Config, stream
 from splatnode.extras.logged.messages import UnusableMessage
-from splatnode.extras.logged.robot_motion import parse_imu, parse_odometry, read_robot_motion
+from splatnode.extras.logged.transforms import parse_imu, parse_odometry, read_robot_motion
 from splatnode.recon.metric.evidence import gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.extras.logged.depth_messages import decode_depth
 from splatnode.extras.logged.messages import (
     Layout,
     Picture,
     UnusableMessage,
+    decode_depth,
     is_colour_image,
     is_depth_image,
     parse_compressed_image,

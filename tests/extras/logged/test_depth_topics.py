@@ -13,10 +13,16 @@ from mcap.writer import CompressionType
 from splatnode.capture import film
 from splatnode.capture.depth_image import ALIGNED, NOISES
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.extras.cameras.mcap import Config, configure_part, image_topics, list_cameras, stream
-from splatnode.extras.logged import image_topics as image_topics_module
-from splatnode.extras.logged.depth_topics import pair_times
-from splatnode.extras.logged.image_topics import survey_images
+from splatnode.extras.cameras import mcap as image_topics_module
+from splatnode.extras.cameras.mcap import (
+    Config,
+    configure_part,
+    image_topics,
+    list_cameras,
+    pair_times,
+    stream,
+    survey_images,
+)
 from splatnode.extras.logged.messages import MessageTime
 from tests.support.mcap_files import (
     START_NS,

@@ -9,7 +9,7 @@ import pytest
 
 from splatnode.capture.multi_camera import select_cameras
 from splatnode.extras.logged.messages import UnusableMessage
-from splatnode.extras.logged.static_rig import (
+from splatnode.extras.logged.transforms import (
     parse_frame_transforms_protobuf,
     parse_tf_message,
     read_static_transforms,

@@ -20,12 +20,12 @@ from splatnode.capture.pose_files import PosesFileError, read_poses
 from splatnode.capture.process.text import guard_untrusted
 from splatnode.extras.cameras import mcap
 from splatnode.extras.lerobot import data_set
-from splatnode.extras.logged.depth_messages import decode_depth
 from splatnode.extras.logged.messages import (
     CALIBRATIONS,
     PICTURES,
     Calibration,
     UnusableMessage,
+    decode_depth,
     is_depth_image,
     lens,
     rgb,
