@@ -1,9 +1,11 @@
-"""The verbs of extras on the command line: their arguments, what of them each replay gets, and what runs them."""
+"""The verbs and viewers of extras on the command line: their arguments, and what runs them."""
 
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from splatnode.capture.process.arguments import (
     Verb,
@@ -17,8 +19,13 @@ from splatnode.capture.process.arguments import (
     positive,
     seconds,
 )
+from splatnode.capture.process.terminal import say
 from splatnode.capture.process.text import metres_argument
 from splatnode.recon.replay_verb import add_device, add_lens, add_reconstruction_options, add_selection_options
+from splatnode.viewer.verbs import FurtherViewer
+
+if TYPE_CHECKING:
+    from splatnode.viewer.sources import Source
 
 
 def add_ray(parser: argparse.ArgumentParser) -> None:
@@ -56,7 +63,7 @@ AUDIT = Verb(
     "audit",
     "tell which camera of a station moved, when and by how much",
     _audit_arguments,
-    import_lazily("splatnode.extras.auditing.command", "audit"),
+    import_lazily("splatnode.extras.audit_command", "audit"),
 )
 
 
@@ -289,14 +296,14 @@ DEMO = Verb(
     "demo",
     "reconstruct the built-in capture",
     _demo_arguments,
-    import_lazily("splatnode.extras.evaluate.command", "demo"),
+    import_lazily("splatnode.extras.evaluate.runner", "demo"),
 )
 
 BENCH = Verb(
     "bench",
     "measure held-out quality, poses and seconds",
     _bench_arguments,
-    import_lazily("splatnode.extras.evaluate.command", "bench"),
+    import_lazily("splatnode.extras.evaluate.runner", "bench"),
 )
 
 STABILITY = Verb(
@@ -304,4 +311,46 @@ STABILITY = Verb(
     "measure how often the answer is wrong",
     _stability_arguments,
     import_lazily("splatnode.extras.evaluate.stability.campaign", "stability"),
+)
+
+
+# `splatnode view --rerun` and `--viser`: their flags, and what runs them.
+
+
+def _add_rerun_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--rerun-url", metavar="URL", help="of --rerun, where the viewer is elsewhere")
+
+
+def _check_rerun_arguments(args: argparse.Namespace) -> None:
+    if args.rerun_url is not None and not args.rerun:
+        raise ValueError("--rerun-url needs --rerun")
+
+
+def _show_rerun(source: Source, args: argparse.Namespace) -> None:
+    rerun_stream = import_module("splatnode.extras.viewers.rerun_stream")
+    rerun_stream.stream(source, args.rerun_url or rerun_stream.URL)
+
+
+RERUN = FurtherViewer(
+    "rerun",
+    "show it in the rerun viewer that runs on this machine, or that ssh -R leads to; of a node each update, until "
+    "Ctrl-C",
+    "shows it in the rerun viewer",
+    _show_rerun,
+    _add_rerun_arguments,
+    _check_rerun_arguments,
+)
+
+
+def _show_viser(source: Source, args: argparse.Namespace) -> None:
+    viser = import_module("splatnode.extras.viewers.viser")  # an extra
+    viser.show(source, args.listen, viser.PORT if args.port is None else args.port, say)
+
+
+VISER = FurtherViewer(
+    "viser",
+    "show it in a browser by viser, with the means of that (needs the extra viser); --web lets in fewer",
+    "shows it in a browser",
+    _show_viser,
+    is_server=True,
 )

@@ -49,12 +49,11 @@ def reconstruct_dataset(
     Each row takes one core. Like all of Ray Data this is lazy: the work begins when the rows are read. What fails is a
     row with the verdict FAILED. Raises ModuleNotFoundError without ray.
     """
-    from splatnode.extras.batch import remote
+    from splatnode.extras.batch import batch
+    from splatnode.extras.batch.batch import Job
     from splatnode.extras.batch.command import replay
-    from splatnode.extras.batch.remote import Job
-    from splatnode.extras.jobs.calls import own_version
-    from splatnode.extras.jobs.child import Limits
+    from splatnode.extras.jobs.calls import Limits, own_version
 
     where = str(results) if "://" in str(results) else str(Path(results).resolve())
     job = Job(partial(replay, tuple(options)), where, Limits(max_memory_mb, timeout_s), own_version())
-    return ds.map(partial(remote.run_row, job=job), num_cpus=1)
+    return ds.map(partial(batch.run_row, job=job), num_cpus=1)

@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
-from splatnode.extras.formats.foxglove import Message, add_messages, encode_mcap
+from splatnode.extras.formats.mcap import Message, add_messages, encode_mcap
 from splatnode.extras.logged.mcap import UnusableLog, unpack_chunks
 
 

@@ -16,8 +16,8 @@ import pyarrow.parquet as pq
 
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.extras.batch.batch import Outcome
-from splatnode.extras.lerobot.data_set import UnusableDataSet, check_whole
-from splatnode.extras.lerobot.pyarrow import open_bounded_table
+from splatnode.extras.lerobot import UnusableDataSet, check_whole
+from splatnode.extras.pyarrow import open_bounded_table
 
 _ROWS, _AT_A_TIME = 10_000, 500  # in memory at a time: of a batch, and of cameras
 _KINDS = {"str": pa.string(), "bool": pa.bool_(), "int": pa.int64(), "float": pa.float64()}

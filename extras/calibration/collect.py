@@ -34,7 +34,7 @@ from splatnode.extras.calibration.board import (
     pdf_of,
 )
 from splatnode.extras.calibration.estimate import MODELS, Choice, Estimate, Model, choose, pixel_sigmas
-from splatnode.extras.lerobot.data_set import is_data_set
+from splatnode.extras.lerobot import is_data_set
 
 # Where in the picture the board was seen, on a grid of cells that are nearly square.
 

@@ -17,7 +17,7 @@ from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_name, sanitize_text
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
-from splatnode.extras.lerobot.data_set import Film, episode_name, film, is_data_set, list_parts, read_info
+from splatnode.extras.lerobot import Film, episode_name, film, is_data_set, list_parts, read_info
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
 _EARLY = 0.25  # of a frame: what comes earlier by less than the table says is an episode's first frame nevertheless

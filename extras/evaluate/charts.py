@@ -1,19 +1,23 @@
-"""Charts of a benchmark, drawn from its rows alone: `splatnode bench --redraw bench.json --out DIR`.
+"""Charts of a benchmark and of a stability campaign, drawn from their numbers alone: never an image of a scene.
 
-Needs matplotlib (pip install 'splatnode[bench]'). Only numbers are drawn, never an image of a scene.
+Needs matplotlib (pip install 'splatnode[bench]').
 """
 
 from __future__ import annotations
 
+import argparse
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from splatnode.extras.evaluate.dataset import read_json
 from splatnode.extras.evaluate.methods import is_variant, list_variants
 from splatnode.extras.evaluate.protocol import Row, compute_mean
 from splatnode.extras.evaluate.report import (
@@ -31,6 +35,10 @@ from splatnode.extras.evaluate.report import (
     select_lpips,
     select_shared_runs,
 )
+from splatnode.extras.evaluate.stability.trial import Demand, Outcome
+from splatnode.recon.result.export.staged import write_files
+
+# A benchmark, from its rows: `splatnode bench --redraw bench.json --out DIR`.
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")
@@ -297,3 +305,131 @@ def draw_cases(ends: Sequence[Row]) -> Figure:
 
 def _format_name(margin: Margin) -> str:
     return f"{margin.scene}, {margin.views} views"
+
+
+# Draws stability.json: `python -m splatnode.extras.evaluate.stability.campaign stability.json --out DIR`.
+#
+# Needs matplotlib (pip install 'splatnode[bench]').
+
+# Blue is right and vermilion is dangerous, as in the charts of the benchmark: told apart with any colour vision.
+_OUTCOME_COLOURS = {
+    Outcome.ACCEPTED: "#9CC9E8",
+    Outcome.REFUSED: "#DCE9F2",
+    Outcome.REFUSED_OTHERWISE: "#F2EBC2",
+    Outcome.FALSE_REFUSE: "#E69F00",
+    Outcome.FALSE_ACCEPT: "#D55E00",
+    Outcome.FAILED: "#7F7F7F",
+}
+_OUTCOME_LABELS = {
+    Outcome.ACCEPTED: "published,\nnot wrong",
+    Outcome.FALSE_ACCEPT: "published,\nwrong",
+    Outcome.REFUSED: "refused,\nfitting code",
+    Outcome.REFUSED_OTHERWISE: "refused,\nother code",
+    Outcome.FALSE_REFUSE: "refused,\nwas enough",
+    Outcome.FAILED: "no\nanswer",
+}
+_DEMAND_LABELS = {Demand.ACCEPT: "should accept", Demand.REFUSE: "should refuse", Demand.EITHER: "either"}
+_CELL, _LINE, _NAMES, _TABLE = 0.86, 0.17, 2.3, 2.1  # inches
+
+
+def draw_stability(stability_json: Path, out: Path) -> Path:
+    """Writes stability.png to `out`. Raises ValueError where there is no trial to draw."""
+    content = read_json(stability_json, dict, "the stability.json of a campaign")
+    if not content.get("trials"):
+        raise ValueError(f"{stability_json} must have a trial to draw, it has none")
+    buffer = io.BytesIO()
+    make_stability_figure(content).savefig(buffer, format="png", facecolor="white")
+    write_files(out, {"stability.png": buffer.getvalue()})
+    return out / "stability.png"
+
+
+def make_stability_figure(content: Mapping) -> Figure:
+    """Above, for each method what it did against what was asked, and its rates; below, every trial's verdict."""
+    trials, summaries = content["trials"], content["methods"]
+    rows = list(dict.fromkeys((trial["row"], trial["name"]) for trial in trials))
+    seeds = sorted({trial["seed"] for trial in trials})
+    width = _NAMES + len(summaries) * max(_CELL * len(seeds) + 0.2, 4.4)
+    height = 1.0 + _TABLE + _LINE * (len(rows) + 2) + 0.7
+    figure = Figure(figsize=(width, height), dpi=150)
+    share = (width - _NAMES - 0.1) / len(summaries) / width
+    for number, summary in enumerate(summaries):
+        left = _NAMES / width + number * share
+        mine = [trial for trial in trials if trial["method"] == summary["method"]]
+        top = 1.0 - (0.75 + _TABLE) / height
+        _draw_table(figure.add_axes((left, top, share - 0.1 / width, (_TABLE - 0.65) / height)), summary)
+        strip = figure.add_axes((left, 0.65 / height, share - 0.1 / width, _LINE * len(rows) / height))
+        _draw_strip(strip, mine, rows, seeds, with_names=number == 0)
+    figure.text(
+        0.1 / width, 1.0 - 0.28 / height, "How often the answer is wrong: the stability matrix", color=INK, fontsize=12
+    )
+    handles = [
+        Patch(color=_OUTCOME_COLOURS[found], label=text.replace("\n", " ")) for found, text in _OUTCOME_LABELS.items()
+    ]
+    figure.legend(handles=handles, loc="lower left", ncols=3 if width < 10 else 6, frameon=False, fontsize=7.5)
+    return figure
+
+
+def _draw_table(axes: Axes, summary: Mapping) -> None:
+    """Counts of outcomes by what was asked, and the rates with their 95 % intervals."""
+    columns = list(_OUTCOME_LABELS)
+    axes.set_xlim(-1.2, len(columns))
+    axes.set_ylim(len(_DEMAND_LABELS), -1.0)
+    axes.axis("off")
+    for x, found in enumerate(columns):
+        axes.text(x + 0.5, -0.12, _OUTCOME_LABELS[found], ha="center", va="bottom", fontsize=6.5, color=_MUTED)
+    for y, (demand, text) in enumerate(_DEMAND_LABELS.items()):
+        axes.text(-0.08, y + 0.5, text, ha="right", va="center", fontsize=7.5, color=INK)
+        for x, found in enumerate(columns):
+            count = summary["confusion"][demand.value][found.value]
+            colour = _OUTCOME_COLOURS[found] if count else "#FAFAFA"
+            axes.add_patch(Rectangle((x, y), 1, 1, facecolor=colour, edgecolor="white", linewidth=1.5))
+            axes.text(x + 0.5, y + 0.5, str(count) if count else "·", ha="center", va="center", color=INK, fontsize=9)
+    lines = [
+        f"{summary['method']}: {summary['trials']} trials",
+        f"false accepts {_format_rate(summary['false_accept'])}",
+        f"false refusals {_format_rate(summary['false_refuse'])}",
+    ]
+    axes.set_title("\n".join(lines), loc="left", fontsize=9, color=INK, pad=14)
+
+
+def _draw_strip(
+    axes: Axes, trials: Sequence[Mapping], rows: Sequence[tuple[int, str]], seeds: Sequence[int], *, with_names: bool
+) -> None:
+    """A line a row, a cell a seed: the colour tells the outcome, the text the verdict."""
+    axes.set_xlim(0, len(seeds))
+    axes.set_ylim(len(rows), 0)
+    for trial in trials:
+        x, y = seeds.index(trial["seed"]), rows.index((trial["row"], trial["name"]))
+        colour = _OUTCOME_COLOURS[Outcome(trial["outcome"])]
+        axes.add_patch(Rectangle((x, y), 1, 1, facecolor=colour, edgecolor="white", linewidth=1.0))
+        mark = " *" if trial["held"] is False else ""
+        axes.text(x + 0.5, y + 0.53, trial["verdict"] + mark, ha="center", va="center", fontsize=5.6, color=INK)
+    axes.set_xticks([i + 0.5 for i in range(len(seeds))], [f"seed {seed}" for seed in seeds])
+    axes.xaxis.tick_top()
+    names = [f"{name}  {number:>2}" for number, name in rows] if with_names else [""] * len(rows)
+    axes.set_yticks([i + 0.5 for i in range(len(rows))], names)
+    axes.tick_params(length=0, labelsize=6.5, colors=INK)
+    axes.spines[:].set_visible(False)
+    for y in range(1, len(rows)):
+        if rows[y][0] != rows[y - 1][0]:
+            axes.axhline(y, color=_GRID, linewidth=0.8, zorder=0)
+    if any(trial["held"] is False for trial in trials):
+        axes.set_xlabel("*: what the row measures besides is outside its limits", fontsize=6.5, color=_MUTED)
+
+
+def _format_rate(rate: Mapping) -> str:
+    if rate["rate"] is None:
+        return "not tried"
+    return f"{rate['count']}/{rate['of']} = {rate['rate']:.1%} (95 %: {rate['low']:.1%} to {rate['high']:.1%})"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Draws the chart of a stability campaign from its stability.json.")
+    parser.add_argument("stability_json", type=Path)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    arguments = parser.parse_args()
+    draw_stability(arguments.stability_json, arguments.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,21 +1,28 @@
-"""Scores by region: of the pixels that two training photographs show, or one, or none.
+"""Scores by region: of the pixels that two training photographs show, or one, or none; and which ones they are.
 
 What no photograph shows can only be guessed, and a mean over whole photographs mixes the guess with what was seen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal, Protocol
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
+from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.geometry import project, transform_to_camera
 from splatnode.recon.networks.lpips import Lpips
 from splatnode.recon.optimize import photometric_losses
+from splatnode.recon.priors import stereo
+from splatnode.recon.priors.stereo import DepthMap
 from splatnode.recon.rasterize.reference import Render
 from splatnode.recon.result.export import sanitize_gaussians
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
@@ -173,3 +180,169 @@ class GaussianAppearance:
 
     def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
         return torch.from_numpy(render_arrays(self._gaussians, T_world_camera, K, width, height).rgb)
+
+
+# Which pixels of a held-out photograph the training photographs show: by no method that is measured.
+#
+# The depth of every photograph of the scene, those held out included, is that of stereo with the true cameras. A
+# pixel's surface is shown by a training photograph where it lies within it and nothing that this photograph sees
+# stands before it. Made once for each scene; it is read by nothing but the scores.
+
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.intp]
+
+_AGREEING = 1  # further photographs that see a pixel's depth as well
+_OFF = 0.1  # of a surface's depth: what is nearer by more stands before it
+_REACH_PX = 16.0  # a pixel without depth takes that of the nearest that has one, if it is so near
+_NEIGHBOURS = 4  # photographs that each is matched with, to know how far stereo has to search
+_RATIO = 0.8  # of a match's distance to the second best (Lowe 2004)
+_EPIPOLAR_PX = 2.0
+_RANGE_MARGIN = 2.0  # times what matched points reach, nearer and farther, is searched
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The surface that an image sees, by its true camera."""
+
+    T_world_camera: Array  # (4, 4)
+    K: Array  # (3, 3), of a photograph of this size
+    depth: npt.NDArray[np.float32]  # (h, w) z, 0 where unknown
+    used: Mask | None = None  # (h, w) False where a mask hides the photograph; None: nowhere
+
+    def pixels(self, points: Array) -> tuple[Mask, Indices, Indices, Array]:
+        """(M,) which points (M, 3) lie within the photograph; the row and column of each, 0 beyond it; its depth z."""
+        height, width = self.depth.shape
+        in_camera = transform_to_camera(points, self.T_world_camera)
+        z = in_camera[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = np.nan_to_num(project(in_camera, self.K), nan=-1.0, posinf=-1.0, neginf=-1.0).T
+        inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        return inside, np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), z
+
+
+def compute_surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
+    """The surfaces that the photographs with a true camera see, at `longer_side` pixels, by name."""
+    given = {name: scene.load_masked_image(name) for name in scene.cameras}
+    images = {name: resize_image(image, longer_side) for name, (image, _) in given.items()}
+    used = {
+        name: None if mask.all() else resize_mask(mask, *images[name].shape[:2]) for name, (_, mask) in given.items()
+    }
+    ranges = _estimate_depth_ranges(images, scene.cameras)
+    views = {
+        name: stereo.StereoView(image, _K(scene.cameras[name], image), scene.cameras[name].T_world_camera, ranges[name])
+        for name, image in images.items()
+        if name in ranges
+    }
+    maps = stereo.estimate_depth_maps(list(views.values()), stereo.StereoConfig())
+    return {
+        name: Surface(
+            view.T_world_camera, view.K, _fill_small_holes(_select_consistent_depth(each, used[name])), used[name]
+        )
+        for (name, view), each in zip(views.items(), maps, strict=True)
+    }
+
+
+def _select_consistent_depth(found: DepthMap, used: Mask | None) -> npt.NDArray[np.float32]:
+    """(h, w) the depth that another photograph confirms, of what is used; 0 elsewhere."""
+    sure = found.num_consistent >= _AGREEING
+    return found.depth * (sure if used is None else sure & used)
+
+
+def count_visibility(view: Surface, training: Sequence[Surface]) -> Counts:
+    """(h, w) how many of the training photographs show each pixel of `view`: 0, 1, 2 for more; UNKNOWN."""
+    rows, columns = np.nonzero(view.depth > 0)
+    z = np.asarray(view.depth[rows, columns], np.float64)
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1) @ np.linalg.inv(view.K).T
+    points = (rays * z[:, None]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
+    shown = np.zeros(len(points), int)
+    for each in training:
+        shown += _compute_visibility(each, points)
+    counts = np.full(view.depth.shape, UNKNOWN, np.uint8)
+    counts[rows, columns] = np.minimum(shown, 2)
+    return counts
+
+
+def count_visibility_by_name(
+    names: Iterable[str], views: Mapping[str, Surface], training: Sequence[Surface]
+) -> dict[str, Counts]:
+    """`count_visibility` of those photographs whose surface is known, by name."""
+    return {name: count_visibility(views[name], training) for name in names if name in views}
+
+
+def _compute_visibility(camera: Surface, points: Array) -> Mask:
+    """(M,) which points (M, 3) lie within a photograph and are not hidden there, by what stands before or by a mask."""
+    inside, row, column, z = camera.pixels(points)
+    before = camera.depth[row, column]
+    shows = inside & ((before == 0) | (z <= (1 + _OFF) * before))
+    return shows if camera.used is None else shows & camera.used[row, column]
+
+
+def _fill_small_holes(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Fills small holes with the nearest depth."""
+    known = depth > 0
+    if not known.any():
+        return depth.astype(np.float32)
+    away, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(labels, np.int64)
+    by_label = np.zeros(int(nearest.max()) + 1, np.float32)
+    by_label[nearest[known]] = depth[known]
+    return np.where(away <= _REACH_PX, by_label[nearest], 0).astype(np.float32)
+
+
+def _estimate_depth_ranges(
+    images: Mapping[str, Image], cameras: Mapping[str, TrueCamera]
+) -> dict[str, tuple[float, float]]:
+    """Nearest and farthest depth to search in each photograph that shares enough points with others."""
+    sift, matcher = cv2.SIFT.create(4000), cv2.BFMatcher(cv2.NORM_L2)
+    found = {name: sift.detectAndCompute(image, None) for name, image in images.items()}
+    depths: dict[str, list[Array]] = {name: [] for name in images}
+    for first, second in _select_pairs(cameras, list(images)):
+        (points, codes), (others, other_codes) = found[first], found[second]
+        if min(len(points), len(others)) < 2:
+            continue
+        pairs = [best for best, next_best in matcher.knnMatch(codes, other_codes, k=2)
+                 if best.distance < _RATIO * next_best.distance]  # fmt: skip
+        a = np.array([points[match.queryIdx].pt for match in pairs]).reshape(-1, 2) + 0.5
+        b = np.array([others[match.trainIdx].pt for match in pairs]).reshape(-1, 2) + 0.5
+        world = _triangulate(a, b, *(_compute_projection(cameras[name], images[name]) for name in (first, second)))
+        fits = np.ones(len(world), bool)
+        for name, pixels in ((first, a), (second, b)):
+            in_camera = transform_to_camera(world, cameras[name].T_world_camera)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off = np.linalg.norm(project(in_camera, _K(cameras[name], images[name])) - pixels, axis=1)
+            fits &= (in_camera[:, 2] > 0) & (off < _EPIPOLAR_PX)
+        for name in (first, second):
+            depths[name].append(transform_to_camera(world[fits], cameras[name].T_world_camera)[:, 2])
+    known = {name: np.concatenate(each) for name, each in depths.items() if each}
+    return {name: stereo.estimate_depth_range(z, _RANGE_MARGIN) for name, z in known.items() if len(z) >= 20}
+
+
+def _select_pairs(cameras: Mapping[str, TrueCamera], names: Sequence[str]) -> list[tuple[str, str]]:
+    """Each photograph with those that look most alike in direction, of which the nearest."""
+    axes = np.stack([cameras[name].T_world_camera[:3, 2] for name in names])
+    centres = np.stack([cameras[name].T_world_camera[:3, 3] for name in names])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    cost = apart / max(float(np.median(apart)), 1e-12) + 2.0 * (1.0 - axes @ axes.T)
+    np.fill_diagonal(cost, np.inf)
+    chosen = {frozenset((i, int(j))) for i in range(len(names)) for j in np.argsort(cost[i])[:_NEIGHBOURS]}
+    return [(names[i], names[j]) for i, j in combinations(range(len(names)), 2) if frozenset((i, j)) in chosen]
+
+
+def _triangulate(a: Array, b: Array, P: Array, Q: Array) -> Array:
+    """(M, 3) the points of pixels (M, 2) in two photographs with projections (3, 4)."""
+    if not len(a):
+        return np.zeros((0, 3))
+    homogeneous = cv2.triangulatePoints(P, Q, a.T, b.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num((homogeneous[:3] / homogeneous[3]).T)
+
+
+def _compute_projection(camera: TrueCamera, image: Image) -> Array:
+    return _K(camera, image) @ np.linalg.inv(camera.T_world_camera)[:3]
+
+
+def _K(camera: TrueCamera, image: Image) -> Array:
+    return camera.K_for(image.shape[1], image.shape[0])

@@ -11,7 +11,7 @@ import math
 import os
 import platform
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import sqrt
 from pathlib import Path
 from statistics import stdev, variance
@@ -19,18 +19,62 @@ from typing import Any
 from urllib.parse import quote
 
 import msgspec
+import numpy as np
+from torch import Tensor
 
+from splatnode.capture.image_file import encode_jpeg
 from splatnode.capture.process.text import cell, escape_text
 from splatnode.extras.evaluate import methods as evaluate_methods
 from splatnode.extras.evaluate.dataset import Split, read_json
 from splatnode.extras.evaluate.methods import is_variant
 from splatnode.extras.evaluate.protocol import FAILED, Row, Settings, compute_mean
-from splatnode.extras.evaluate.shown import PHOTOGRAPH, find_renders
 from splatnode.extras.jobs.calls import ALONE, Moment, now, others_share
 from splatnode.recon.config import PRESETS
 from splatnode.recon.core import instruction_sets
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.report import collect_versions
+
+# Renders of test views beside their photographs, as files that report.html shows.
+
+FOLDER = "renders"
+PHOTOGRAPH = "photograph.jpg"
+_QUALITY = 90
+
+
+@dataclass(frozen=True)
+class Renders:
+    """The renders of one run. The test views in `shown` are files, by path in the benchmark's folder."""
+
+    scene: str
+    views: int
+    method: str
+    seed: int
+    shown: tuple[str, ...]
+    files: dict[str, bytes] = field(default_factory=dict)
+
+    def keep(self, name: str, truth: Tensor, image: Tensor) -> None:
+        """A `extras.evaluate.protocol.Show`."""
+        if name in self.shown:
+            folder = f"{FOLDER}/{self.scene}-{self.views}/{Path(name).stem}"
+            self.files[f"{folder}/{PHOTOGRAPH}"] = _encode_jpeg(truth)
+            self.files[f"{folder}/{self.method}-{self.seed}.jpg"] = _encode_jpeg(image)
+
+
+def find_renders(out_dir: Path, row: Row) -> dict[str, Path]:
+    """The render of each kept test view, by the view's name, for the run that `row` ends; none if nothing was kept.
+
+    Nor are there any of a run that was not scored: what lies there is of an earlier run.
+    """
+    if row.psnr is None:
+        return {}
+    found = (out_dir / FOLDER / f"{row.scene}-{row.views}").glob(f"*/{row.method}-{row.seed}.jpg")
+    return {path.parent.name: path for path in sorted(found)}
+
+
+def _encode_jpeg(image: Tensor) -> bytes:
+    pixels = np.rint(image.numpy() * 255).astype(np.uint8)
+    return encode_jpeg(pixels, _QUALITY)
+
 
 # Rows as means over scenes and seeds: what the report's tables and the charts show.
 

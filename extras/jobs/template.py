@@ -3,6 +3,8 @@
 What a call imports is imported here once, so that a copy has it at once; with torch that saves seconds. Each line of
 standard input is a folder with a call and the cores for it, in JSON. Each line of standard output is the number of a
 process that began, or that and its exit code, below 0 a signal, when it has ended.
+
+With a folder on its command line it is the process of one call: it makes the call that lies there, and answers.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import contextlib
 import importlib
 import json
 import os
+import pickle
 import selectors
 import signal
 import socket
@@ -20,9 +23,37 @@ from pathlib import Path
 from typing import IO, NoReturn
 
 from splatnode.capture.process.files import check_owner_only
-from splatnode.extras.jobs.called import RAISED, module_of, run_call
-from splatnode.extras.jobs.calls import CALL, LOG
+from splatnode.extras.jobs.calls import ANSWER, CALL, ERROR, LOG
 from splatnode.extras.jobs.launch import end_with
+
+RAISED = 1  # the exit code where the function raised
+
+
+def run_call(folder: Path) -> int:
+    """Makes the call and leaves the answer, or what was raised; returns the exit code.
+
+    Raises NotPrivate for a call that another user could have put there.
+    """
+    check_owner_only(folder)
+    with (folder / CALL).open("rb") as call:
+        module_of(call)
+        try:
+            answer = pickle.dumps(pickle.load(call)())
+        except Exception:
+            (folder / ERROR).write_text(traceback.format_exc(), errors="backslashreplace")
+            return RAISED
+    partial = folder / f"{ANSWER}.partial"
+    partial.write_bytes(answer)
+    os.replace(partial, folder / ANSWER)
+    return 0
+
+
+def module_of(call: IO[bytes]) -> str:
+    """The name of the module of a call, which is found from here on; the function comes next in the file."""
+    for place in pickle.load(call):
+        if place not in sys.path:
+            sys.path.append(place)
+    return pickle.load(call)
 
 
 def main() -> None:
@@ -100,4 +131,4 @@ def _tell(told: IO[str], *numbers: int) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_call(Path(sys.argv[1])) if sys.argv[1:] else main())

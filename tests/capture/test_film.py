@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from splatnode.capture import film
-from splatnode.extras.auditing.audit import Film, find_recordings
+from splatnode.extras.audit import Film, find_recordings
 from splatnode.extras.batch import batch
 from splatnode.extras.batch.batch import Outcome
-from splatnode.extras.batch.report import write_back
+from splatnode.extras.batch.command import write_back
 from tests.support.clips import level_images, write_clip
 
 TIMES_MS = [0, 40, 80, 1080, 2080, 2120]

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder as folder_camera
 from splatnode.capture.cameras import synthetic
-from splatnode.extras.evaluate.command import evaluate_held_out_views
 from splatnode.extras.evaluate.dataset import write_capture
+from splatnode.extras.evaluate.runner import evaluate_held_out_views
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice

@@ -360,7 +360,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "recipes",
-        "extras/evaluate/rivals/outcome.py",
+        "extras/evaluate/methods.py",
         ("a rival's model of two cameras is published", "MIN_CAMERAS = 3", "MIN_CAMERAS = 2"),
     ),
     *_list_mutants(
@@ -489,7 +489,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "extras/evaluate/stability/windows/windows.py",
+        "extras/evaluate/stability/windows.py",
         (
             "windows: wrong cameras of a rough answer do not count",
             "if not self.cameras or any(camera.is_wrong(self.verdict == ROUGH) for camera in self.cameras):",
@@ -498,7 +498,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "scoring",
-        "extras/evaluate/stability/windows/campaign.py",
+        "extras/evaluate/stability/window_campaign.py",
         (
             "windows: the coverage counts refused cameras",
             "cameras = [camera for row in rows if row.published for camera in row.cameras]",

@@ -8,9 +8,8 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-from splatnode.extras.jobs.called import module_of
-from splatnode.extras.jobs.calls import Answer, Engine, Take, usable_cores
-from splatnode.extras.jobs.child import NOT_RUN, Limits
+from splatnode.extras.jobs.calls import NOT_RUN, Answer, Engine, Limits, Take, usable_cores
+from splatnode.extras.jobs.template import module_of
 
 
 def in_this_process(cores_each: int | None = None) -> Engine:

@@ -10,7 +10,6 @@ import numpy as np
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.scene import PALETTES, Builder, cast, look_at, table
 from splatnode.capture.frame import Frame
-from splatnode.extras.building import walk
 from splatnode.extras.cameras import building
 from tests.support.synthetic import renumbered
 
@@ -66,7 +65,7 @@ def _panorama(config: building.Config, index: int, width: int) -> np.ndarray:
         T_camera_side = np.eye(4)
         T_camera_side[:3, :3] = R_camera_side
         with np.errstate(invalid="ignore"):  # a side that looks straight up or down has no azimuth
-            seen = walk.view(building.state(config, index), (T_world_camera @ T_camera_side, K), side, side)
+            seen = building.view(building.state(config, index), (T_world_camera @ T_camera_side, K), side, side)
         at = local[..., :2] / np.where(inside, local[..., 2], 1.0)[..., None] * focal + side / 2 - 0.5
         columns, rows = np.moveaxis(at.astype(np.float32), -1, 0)
         image[inside] = cv2.remap(seen, columns, rows, cv2.INTER_LINEAR)[inside]

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Clock, Frame, Intrinsics, Stamp
-from splatnode.extras.building import walk
 from splatnode.extras.cameras import building
 
 Array = npt.NDArray[np.float64]
@@ -86,7 +85,7 @@ def make_rig_walk(
 def _render(config: building.Config, at: float, camera: tuple[Array, Array], seed: int) -> npt.NDArray[np.uint8]:
     T, K = camera
     dense = T, np.diag([2.0, 2.0, 1.0]) @ K
-    colours = walk.view(building.state(config, at), dense, 2 * config.width, 2 * config.height)
+    colours = building.view(building.state(config, at), dense, 2 * config.width, 2 * config.height)
     image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
     grain = np.random.default_rng([config.seed, seed]).standard_normal(image.shape, dtype=np.float32)
     return np.clip(np.rint(image + config.noise * grain), 0, 255).astype(np.uint8)

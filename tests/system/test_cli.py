@@ -66,7 +66,6 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.verbs",
         "splatnode.command_line",
         "splatnode.extras.verbs",
-        "splatnode.extras.viewers.flags",
         "splatnode.recon.former_names",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.replay_verb",

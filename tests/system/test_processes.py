@@ -22,10 +22,10 @@ STARTS = {
 }
 UNPICKLES = {
     "extras/jobs/calls.py",  # from a folder of this user alone, or from Ray
-    "extras/jobs/called.py",  # from a folder of this user alone
+    "extras/jobs/template.py",  # from a folder of this user alone
     "extras/evaluate/runner.py",  # from a temporary folder of this user alone
-    "extras/evaluate/stability/windows/campaign.py",  # arguments of a call
-    "extras/evaluate/stability/windows/windows.py",  # arguments of a call
+    "extras/evaluate/stability/window_campaign.py",  # arguments of a call
+    "extras/evaluate/stability/windows.py",  # arguments of a call
     "recon/networks/lpips.py",  # arrays and nothing else
 }
 _STARTERS = {"system", "popen", "fork_exec", "posix_spawn", "posix_spawnp"}

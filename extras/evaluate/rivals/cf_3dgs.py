@@ -22,10 +22,11 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.frame import Frame
+from splatnode.extras.evaluate import methods
+from splatnode.extras.evaluate.methods import FrameWithDepth
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import GaussianAppearance
-from splatnode.extras.evaluate.rivals import colmap_3dgs, outcome
-from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
+from splatnode.extras.evaluate.rivals import colmap_3dgs
 from splatnode.recon.clock import Clock
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import adaptive
@@ -59,7 +60,7 @@ _TOGETHER = msgspec.structs.replace(
 def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None) -> Iterator[Snapshot]:
     """Snapshots of the scene while all frames refine it; one refusal where fewer than three have a depth."""
     settings = config or Config()
-    return outcome.optimize_with_depth(
+    return methods.optimize_with_depth(
         frames, seed, lambda known, clock: _reconstruct_frame_by_frame(frames, known, seed, settings, clock)
     )
 
@@ -75,7 +76,7 @@ def _reconstruct_frame_by_frame(
     clock.lap("poses")
     together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
     refined = training.refine(scene, colmap_3dgs.scale_rates_to_extent(together, scene), seed=seed)
-    yield from (outcome.make_snapshot(frames, each) for each in refined)
+    yield from (methods.make_snapshot(frames, each) for each in refined)
 
 
 def _estimate_next_pose(

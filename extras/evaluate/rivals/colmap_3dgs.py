@@ -17,7 +17,7 @@ import torch
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.lenses import undistort_frame
-from splatnode.extras.evaluate.rivals import outcome
+from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.rivals.colmap import RegisteredFrame, SparseModel, reconstruct_sparse_model
 from splatnode.recon.clock import Clock
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
@@ -79,13 +79,13 @@ def optimize_sparse_model(
     clock = Clock()
     model = reconstruct_sparse_model(frames, seed)
     clock.lap("poses")
-    if model is None or len(model.registered) < outcome.MIN_CAMERAS:
-        yield outcome.make_refusal(frames, clock)
+    if model is None or len(model.registered) < methods.MIN_CAMERAS:
+        yield methods.make_refusal(frames, clock)
         return
     scene = beginning(model, seed)
     clock.lap("points")
     refined = training.refine(scene, scale_rates_to_extent(config, scene), seed=seed)
-    yield from outcome.number_snapshots((outcome.make_snapshot(frames, each) for each in refined), clock)
+    yield from methods.number_snapshots((methods.make_snapshot(frames, each) for each in refined), clock)
 
 
 def initialize_scene(model: SparseModel, _seed: int) -> Scene:

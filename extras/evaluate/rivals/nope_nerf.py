@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.rivals import outcome, radiance_field
-from splatnode.extras.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
-from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
-from splatnode.extras.evaluate.rivals.radiance_field import Focal, make_field_snapshot, sample_pixels
+from splatnode.extras.evaluate import methods
+from splatnode.extras.evaluate.methods import FrameWithDepth
+from splatnode.extras.evaluate.rivals import nerfmm
+from splatnode.extras.evaluate.rivals.nerfmm import OPTIMIZE, SIZE, Focal, make_field_snapshot, sample_pixels
 from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -30,20 +30,20 @@ _PAIRS_UNTIL = 0.6  # of the run
 _POINTS = 384  # of each view's cloud
 
 
-def reconstruct(frames: Sequence[Frame], seed: int, config: radiance_field.FitConfig = OPTIMIZE) -> Iterator[Snapshot]:
+def reconstruct(frames: Sequence[Frame], seed: int, config: nerfmm.FitConfig = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the field while it is learnt; one refusal where fewer than three frames have a depth."""
-    return outcome.optimize_with_depth(frames, seed, lambda known, _clock: _fit_with_depth(frames, known, seed, config))
+    return methods.optimize_with_depth(frames, seed, lambda known, _clock: _fit_with_depth(frames, known, seed, config))
 
 
 def _fit_with_depth(
-    frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: radiance_field.FitConfig
+    frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: nerfmm.FitConfig
 ) -> Iterator[Snapshot]:
     by_name = {frame.name: frame for frame in frames}
     registered = [by_name[frame.name] for frame in known]
     views = [_make_view_with_depth(frame) for frame in known]
     focal = Focal(float(np.mean([frame.K[0, 0] / max(frame.image.shape) for frame in known]))).requires_grad_(False)
     terms = ExtraLosses(views, focal)
-    learnt = radiance_field.fit_field(
+    learnt = nerfmm.fit_field(
         [view.image for view in views],
         [view.used for view in views],
         focal,
@@ -78,7 +78,7 @@ class ExtraLosses:
         self.scales = nn.Parameter(torch.ones(len(views) - 1))
         self.offsets = nn.Parameter(torch.zeros(len(views) - 1))
 
-    def __call__(self, step: radiance_field.FitStep) -> Tensor:
+    def __call__(self, step: nerfmm.FitStep) -> Tensor:
         columns, rows = step.pixels.long().unbind(1)
         loss = _DEPTH * (step.rays.depth - self._depth(step.view)[rows, columns]).abs().mean()
         if step.progress >= _PAIRS_UNTIL:

@@ -2,5 +2,6 @@
 
 A row is a function that makes a case of a place and a seed (families in the files named after them, found by
 `campaign`); `trial` runs it through the public entry point, compares the answer with the truth, and judges it;
-`campaign` does so with many, each in a process of its own, and is the verb; `report` counts.
+`campaign` does so with many, each in a process of its own, counts, and is the verb. `windows` chooses windows of
+consecutive photographs from scenes with true cameras and judges answers; `window_campaign` runs what is missing.
 """

@@ -1,21 +1,18 @@
-"""All trials of a plan, some at a time; what is on the disk already is not run again; and its verb.
-
-The matrix has all rows, by number: every `MatrixRow` of the modules in `_FAMILIES`. A new row is one function in one of
-these files; a new file of rows is that file and its name in `_FAMILIES`. Those of `degradations.ROWS` are made from its
-kinds.
-"""
+"""The stability matrix: all trials of a plan, some at a time, their counts, and the verb."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import logging
+import math
 import shlex
 import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -25,22 +22,129 @@ from splatnode.extras.evaluate.report import check_same_cores, describe_machine,
 from splatnode.extras.evaluate.runner import Journal
 from splatnode.extras.evaluate.stability import cases, degradations
 from splatnode.extras.evaluate.stability.perturbations import Sampler, ScenesByMotion, load_scenes_by_motion
-from splatnode.extras.evaluate.stability.report import Rate, make_report, summarise
 from splatnode.extras.evaluate.stability.trial import (
     FAILED,
+    Demand,
     MatrixRow,
+    Outcome,
     Trial,
     TrialCase,
     find_method,
     judge_trial,
     run_trial,
 )
-from splatnode.extras.evaluate.stability.windows.campaign import run_windows_verb
-from splatnode.extras.jobs.calls import Engine, Task, pack_call, work_folder
+from splatnode.extras.evaluate.stability.window_campaign import run_windows_verb
+from splatnode.extras.jobs.calls import Engine, Limits, Task, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
-from splatnode.extras.jobs.child import Limits
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.folder import hold_result_folder
+
+# The trials counted: how often a wrong scene was published, how often a right one refused.
+
+_Z95 = 1.959963984540054  # normal quantile of a two-sided 95 % interval
+
+
+@dataclass(frozen=True)
+class Rate:
+    """`count` of `of`, with the 95 % interval of the rate after Wilson (1927); None where nothing was tried."""
+
+    count: int
+    of: int
+    rate: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The counts and rates of one method. `confusion` counts outcomes by what was asked."""
+
+    method: str
+    trials: int
+    confusion: Mapping[str, Mapping[str, int]]
+    false_accept: Rate  # wrong scenes that were published, of all trials
+    wrong_of_published: Rate  # the same, of the scenes that were published
+    false_refuse: Rate  # no scene, of the trials that are enough for one
+    other_code: Rate  # refusals for a reason that does not fit, of the refusals that were asked for or allowed
+    missed_limits: Rate  # rows that measure something: how often it was outside their limits
+    seconds_median: float | None
+    refusal_seconds_median: float | None
+    processor_seconds_mean: float | None
+
+
+def compute_rate(count: int, of: int) -> Rate:
+    """Wilson's interval: unlike the normal one it is right for rates near 0, which is where they should be."""
+    if of == 0:
+        return Rate(count, 0, None, None, None)
+    share, z2 = count / of, _Z95**2
+    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
+    half = _Z95 * math.sqrt(share * (1 - share) / of + z2 / (4 * of**2)) / (1 + z2 / of)
+    low = 0.0 if count == 0 else max(0.0, middle - half)
+    return Rate(count, of, share, low, 1.0 if count == of else min(1.0, middle + half))
+
+
+def summarise(trials: Sequence[Mapping], method: str) -> Summary:
+    """Summarises the records of stability.json that are of `method`."""
+    mine = [trial for trial in trials if trial["method"] == method]
+    confusion = {
+        demand.value: {
+            found.value: sum(t["demand"] == demand.value and t["outcome"] == found.value for t in mine)
+            for found in Outcome
+        }
+        for demand in Demand
+    }
+    outcomes = {found: sum(by[found.value] for by in confusion.values()) for found in Outcome}
+    asked = confusion[Demand.ACCEPT.value]
+    published = outcomes[Outcome.ACCEPTED] + outcomes[Outcome.FALSE_ACCEPT]
+    refused = outcomes[Outcome.REFUSED] + outcomes[Outcome.REFUSED_OTHERWISE]
+    held = [trial["held"] for trial in mine if trial["held"] is not None]
+    return Summary(
+        method=method,
+        trials=len(mine),
+        confusion=confusion,
+        false_accept=compute_rate(outcomes[Outcome.FALSE_ACCEPT], len(mine)),
+        wrong_of_published=compute_rate(outcomes[Outcome.FALSE_ACCEPT], published),
+        false_refuse=compute_rate(asked[Outcome.FALSE_REFUSE.value] + asked[Outcome.FAILED.value], sum(asked.values())),
+        other_code=compute_rate(outcomes[Outcome.REFUSED_OTHERWISE], refused),
+        missed_limits=compute_rate(held.count(False), len(held)),
+        seconds_median=_median([t["seconds"] for t in mine]),
+        refusal_seconds_median=_median([t["seconds"] for t in mine if not t["published"]]),
+        processor_seconds_mean=_mean([t["processor_seconds"] for t in mine]),
+    )
+
+
+def make_report(trials: Sequence[Mapping]) -> dict[str, Any]:
+    """Returns what stability.json holds besides its trials; the top rates are the first method's."""
+    methods = list(dict.fromkeys(trial["method"] for trial in trials))
+    summaries = [summarise(trials, method) for method in methods]
+    first = summaries[0] if summaries else summarise(trials, "")
+    return {
+        "false_accept_rate": first.false_accept.rate,
+        "false_accept_interval": [first.false_accept.low, first.false_accept.high],
+        "false_refuse_rate": first.false_refuse.rate,
+        "false_refuse_interval": [first.false_refuse.low, first.false_refuse.high],
+        "methods": [asdict(summary) for summary in summaries],
+    }
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = sorted(value for value in values if value is not None)
+    middle = len(known) // 2
+    if not known:
+        return None
+    return known[middle] if len(known) % 2 else 0.5 * (known[middle - 1] + known[middle])
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+# All trials of a plan, some at a time; what is on the disk already is not run again; and its verb.
+#
+# The matrix has all rows, by number: every `MatrixRow` of the modules in `_FAMILIES`. A new row is one function in one
+# of these files; a new file of rows is that file and its name in `_FAMILIES`. Those of `degradations.ROWS` are made
+# from its kinds.
 
 _FAMILIES = (cases, degradations)
 
@@ -197,11 +301,11 @@ def stability(args: argparse.Namespace) -> int:
     with opened(args.cores, args.ray) as engine:
         trials = run_campaign(plan, load_scenes_by_motion(args.scenes, args.out), args.out, command, engine)
     try:
-        from splatnode.extras.evaluate.stability import report
+        from splatnode.extras.evaluate.charts import draw_stability
     except ImportError:
         logger.warning("no chart: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
     else:
-        report.draw(args.out / "stability.json", args.out)
+        draw_stability(args.out / "stability.json", args.out)
     for trial in trials:
         if trial["outcome"] in ("false_accept", "false_refuse", "failed"):
             which = f"row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}"

@@ -19,8 +19,8 @@ from scipy.optimize import lsq_linear, minimize
 
 from splatnode.capture.process.records import record_of
 from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError, has_only_right_cameras, make_finite_bounds
-from splatnode.extras.evaluate.stability.windows.campaign import KINDS, compute_share_within
-from splatnode.extras.evaluate.stability.windows.windows import OURS, WindowRow
+from splatnode.extras.evaluate.stability.window_campaign import KINDS, compute_share_within
+from splatnode.extras.evaluate.stability.windows import OURS, WindowRow
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.decision import LIMITS, EvidenceCase

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split, TrueCamera
+from splatnode.extras.evaluate.methods import make_verdict
 from splatnode.extras.evaluate.protocol import (
     CameraErrors,
     PerceptualNetworks,
@@ -34,7 +35,6 @@ from splatnode.extras.evaluate.rivals.colmap import (
     RegisteredFrame,
     reconstruct_sparse_model,
 )
-from splatnode.extras.evaluate.rivals.outcome import make_verdict
 from splatnode.extras.evaluate.stability.perturbations import Sampler, TrialImage
 from splatnode.extras.jobs import calls
 from splatnode.extras.jobs.calls import now

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.extras.batch.batch import FAILED, LEDGER
-from splatnode.extras.batch.command import EXIT_SOME_FAILED
-from splatnode.extras.batch.report import CSV
+from splatnode.extras.batch.command import CSV, EXIT_SOME_FAILED
 from tests.bench.node.simulated_batch import OUT, TALLY, end_of, recordings
 from tests.bench.node.trial import expect
 from tests.conftest import ROOT

@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.process.terminal import say
-from splatnode.extras.auditing.audit import MeasuredMotion, measure_motion, twist
+from splatnode.extras.audit import MeasuredMotion, measure_motion, twist
 from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads

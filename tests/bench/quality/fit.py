@@ -16,6 +16,7 @@ from pathlib import Path
 
 import msgspec
 
+from splatnode.extras.evaluate.stability import window_campaign
 from splatnode.extras.evaluate.stability.fitting import (
     fit_models,
     fit_without_each_scene,
@@ -26,9 +27,8 @@ from splatnode.extras.evaluate.stability.fitting import (
     read_samples,
     rejudge_rows,
 )
-from splatnode.extras.evaluate.stability.windows import campaign
-from splatnode.extras.evaluate.stability.windows.campaign import format_report, summarise
-from splatnode.extras.evaluate.stability.windows.windows import COUNTS, WindowRow
+from splatnode.extras.evaluate.stability.window_campaign import format_report, summarise
+from splatnode.extras.evaluate.stability.windows import COUNTS, WindowRow
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.verification.error_model import VerdictModel, VerdictModels
 
@@ -68,7 +68,7 @@ def _windows(results: list[Path], numbers: Mapping[str, VerdictModel], out: Path
     judged = rejudge_rows([row for row in rows if row.count in COUNTS], numbers)
     records = [{**{name: getattr(row, name) for name in KEPT}, "found": row.outcome.value} for row in judged]
     write_file(out / "windows.json", json_bytes({"summary": summarise(judged), "rows": records}))
-    campaign.draw(judged, out)
+    window_campaign.draw(judged, out)
     print("\n".join(format_report(judged)))
 
 

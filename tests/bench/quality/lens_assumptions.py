@@ -51,7 +51,7 @@ from splatnode.extras.evaluate.stability.trial import (
     make_world,
     score_cameras,
 )
-from splatnode.extras.evaluate.stability.windows.windows import (
+from splatnode.extras.evaluate.stability.windows import (
     OURS,
     PieceKey,
     load_plain_features,

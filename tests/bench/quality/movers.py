@@ -19,8 +19,7 @@ from pathlib import Path
 from splatnode.capture.frame import Frame
 from splatnode.capture.masks import apply_mask
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
-from splatnode.extras.evaluate.regions import Counts
-from splatnode.extras.evaluate.shown import compute_surfaces, count_visibility_by_name
+from splatnode.extras.evaluate.regions import Counts, compute_surfaces, count_visibility_by_name
 from splatnode.recon.config import preset
 from splatnode.recon.frames.keyframe import resize_mask
 from splatnode.recon.pipeline import run

@@ -32,8 +32,7 @@ from scipy.ndimage import binary_dilation
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.scene import Camera, Solid
 from splatnode.capture.frame import Frame
-from splatnode.extras.building import walk
-from splatnode.extras.building.building import CHAIR_ROOM, MIRROR_ROOM, ZONES, interior
+from splatnode.extras.building import CHAIR_ROOM, MIRROR_ROOM, ZONES, interior
 from splatnode.extras.cameras import building
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset
@@ -134,12 +133,12 @@ def room(name: str, keyframes: Sequence[int], mirror: bool = False, config: buil
     )
 
 
-def _building(state: walk.BuildingState) -> list[Solid]:
+def _building(state: building.BuildingState) -> list[Solid]:
     zones = [interior(state.seed, building.BARE, zone.number) for zone in ZONES]
     return [solid for zone in zones for solid in zone.solids] + list(zones[CHAIR_ROOM].chairs[state.chair])
 
 
-def _mirror(state: walk.BuildingState) -> Solid:
+def _mirror(state: building.BuildingState) -> Solid:
     zone = interior(state.seed, building.BARE, MIRROR_ROOM)
     assert zone.mirror is not None
     return zone.solids[zone.mirror]

@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from splatnode.extras.evaluate.stability import window_campaign
 from splatnode.extras.evaluate.stability.campaign import ROWS
 from splatnode.extras.evaluate.stability.perturbations import Sampler, load_scenes_by_motion, load_trial_scenes
 from splatnode.extras.evaluate.stability.trial import (
@@ -30,8 +31,7 @@ from splatnode.extras.evaluate.stability.trial import (
     list_registered_cameras,
     score_cameras,
 )
-from splatnode.extras.evaluate.stability.windows import campaign
-from splatnode.extras.evaluate.stability.windows.windows import (
+from splatnode.extras.evaluate.stability.windows import (
     OURS,
     PieceKey,
     Window,
@@ -55,10 +55,10 @@ OTHERS = (
 )  # fmt: skip
 
 
-def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, campaign.Told]]:
+def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, window_campaign.Told]]:
     """The windows of a place and what is told, in an order in which they share most of what was found."""
-    something: tuple[campaign.Told, ...] = ("exif", "given")
-    asked: list[tuple[Window, campaign.Told]] = [
+    something: tuple[window_campaign.Told, ...] = ("exif", "given")
+    asked: list[tuple[Window, window_campaign.Told]] = [
         (window, "nothing") for window in place_windows(2, counts=(2, 3, 6, 12))
     ]
     for window in [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]:
@@ -74,7 +74,9 @@ def of_scene(scene: Path, out: Path) -> list[dict[str, Any]]:
         for window, told in plan(partial(draw_windows, place, seed=0)):
             cache = caches["given" if told == "given" else "centred"]
             known = {key: cache[key] for key in select_keys(cache.keys(), window.names)}
-            answer, found = campaign.reconstruct_window(place, window, ReconstructionConfig(), False, told, known)
+            answer, found = window_campaign.reconstruct_window(
+                place, window, ReconstructionConfig(), False, told, known
+            )
             cache.update(found)
             rows.append({"told": told, "row": asdict(judge_window(window, OURS, answer, place.scene.cameras))})
     (out / f"{scene.name}.json").write_text(json.dumps(rows))  # should a later scene fail

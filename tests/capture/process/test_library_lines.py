@@ -236,7 +236,7 @@ def test_every_decoder_of_a_strangers_picture_is_listened_to():
         if calls:
             found[str(file.relative_to(ROOT))] = all(each in caught for each in calls)
     assert {name for name, is_caught in found.items() if not is_caught} == ELSEWHERE
-    assert found["capture/image_file.py"] and found["extras/batch/report.py"]
+    assert found["capture/image_file.py"] and found["extras/batch/command.py"]
 
 
 def _catches(node: ast.AST) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.extras.auditing.audit import (
+from splatnode.extras.audit import (
     MIN_COMMON,
     CameraSighting,
     Move,

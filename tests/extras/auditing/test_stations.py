@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.extras.auditing.audit import Film, ImageFiles, StationRecording, find_recordings, load_sample_frames
+from splatnode.extras.audit import Film, ImageFiles, StationRecording, find_recordings, load_sample_frames
 from tests.support import lerobot_sets
 from tests.support.mcap_files import as_json, compressed, write
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from xml.etree import ElementTree
 
-from splatnode.extras.auditing.audit import MOVING, Audit, ImageFiles, SightingFailure, StationRecording
-from splatnode.extras.auditing.command import draw_audit, format_heading, format_lines, format_summary, make_values
+from splatnode.extras.audit import MOVING, Audit, ImageFiles, SightingFailure, StationRecording
+from splatnode.extras.audit_command import draw_audit, format_heading, format_lines, format_summary, make_values
 
 NAMES = tuple(f"episode_{number:06d}" for number in range(100))
 WRIST = {number: SightingFailure(f"{number}.png", MOVING, f"it turned by {number} degrees") for number in range(1, 99)}

@@ -20,7 +20,7 @@ from typing import Any
 
 from splatnode.extras.batch import command
 from splatnode.extras.batch.batch import BatchRecording, recordings
-from splatnode.extras.batch.report import WriteBackOutcome, write_back
+from splatnode.extras.batch.command import WriteBackOutcome, write_back
 from tests.support.recordings import options
 
 NEVER, BEFORE, AFTER = 0, -1, -2  # moments; any other is the number of a call

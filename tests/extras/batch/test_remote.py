@@ -12,10 +12,8 @@ from pathlib import Path
 import pytest
 
 from splatnode.extras.batch import command
-from splatnode.extras.batch.batch import BatchRecording
-from splatnode.extras.batch.remote import Job, run_recording
-from splatnode.extras.jobs.calls import free_core, own_version
-from splatnode.extras.jobs.child import Limits
+from splatnode.extras.batch.batch import BatchRecording, Job, run_recording
+from splatnode.extras.jobs.calls import Limits, free_core, own_version
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 
 

@@ -9,8 +9,7 @@ from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.diorama.scene import look_at
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.process.config import parse_config
-from splatnode.extras.building import walk
-from splatnode.extras.building.building import CHAIR_ROOM, CORRIDOR, LOOK_ALIKES, MIRROR_ROOM, ZONES, interior, zones_at
+from splatnode.extras.building import CHAIR_ROOM, CORRIDOR, LOOK_ALIKES, MIRROR_ROOM, ZONES, interior, zones_at
 from splatnode.extras.cameras import building
 
 TINY = building.Config(width=96, height=72, samples=1)
@@ -108,7 +107,7 @@ def test_the_chair_stands_elsewhere_when_the_robot_comes_again():
     before, after = building.state(TINY, first + 10), building.state(TINY, again + 10)
     assert (before.chair, building.state(TINY, last + 3).chair, after.chair) == (0, 1, 1)
     camera = building.scene_camera(TINY, 12)
-    depths = [walk.depth(state, camera, 96, 72) for state in (before, after)]
+    depths = [building.render_depth(state, camera, 96, 72) for state in (before, after)]
     assert 0.01 < (np.abs(depths[0] - depths[1]) > 0.1).mean() < 0.3
 
 
@@ -123,7 +122,7 @@ def test_the_mirror_shows_what_a_camera_at_its_glass_sees():
     face = glass.centre + glass.axes[:, 1]
     stand = np.array([0.6 * x + 0.4 * face[0], 0.6 * y + 0.4 * face[1], 1.3])
     camera = look_at(stand, face), building.intrinsic_matrix(TINY)
-    colours, z = walk.view(state, camera, 96, 72), walk.depth(state, camera, 96, 72)
+    colours, z = building.view(state, camera, 96, 72), building.render_depth(state, camera, 96, 72)
     agree = []
     for row, column in itertools.product((24, 36, 44), (36, 44, 52, 60)):
         ray = camera[0][:3, :3] @ np.linalg.inv(camera[1]) @ [column + 0.5, row + 0.5, 1.0]
@@ -135,8 +134,8 @@ def test_the_mirror_shows_what_a_camera_at_its_glass_sees():
             look_at(point + 0.001 * normal, point + turned),
             np.array([[400.0, 0, 0.5], [0, 400, 0.5], [0, 0, 1]]),
         )
-        seen = walk.view(state, at_glass, 1, 1)[0, 0]
-        agree.append(np.abs(colours[row, column] - walk.SILVER * seen).max() < 8)
+        seen = building.view(state, at_glass, 1, 1)[0, 0]
+        agree.append(np.abs(colours[row, column] - building.SILVER * seen).max() < 8)
     assert len(agree) >= 6 and np.mean(agree) > 0.8
 
 
@@ -144,9 +143,9 @@ def test_a_mirrored_camera_mirrored_again_is_itself():
     zone = interior(0, building.state(TINY, 0).density, MIRROR_ROOM)
     assert zone.mirror is not None
     camera = building.scene_camera(TINY, 3)
-    once = walk.mirror_camera(zone.solids[zone.mirror], camera)
+    once = building.mirror_camera(zone.solids[zone.mirror], camera)
     assert np.linalg.det(once[0][:3, :3]) == pytest.approx(-1)
-    assert np.allclose(walk.mirror_camera(zone.solids[zone.mirror], once)[0], camera[0])
+    assert np.allclose(building.mirror_camera(zone.solids[zone.mirror], once)[0], camera[0])
 
 
 def test_some_keyframes_in_a_row_show_a_blank_wall_and_few():

@@ -11,8 +11,15 @@ import torch
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
-from splatnode.extras.evaluate.regions import REGIONS, UNKNOWN, compute_error_maps, compute_region_scores
-from splatnode.extras.evaluate.shown import Surface, compute_surfaces, count_visibility
+from splatnode.extras.evaluate.regions import (
+    REGIONS,
+    UNKNOWN,
+    Surface,
+    compute_error_maps,
+    compute_region_scores,
+    compute_surfaces,
+    count_visibility,
+)
 from tests.support.synthetic import SMALL, photographs
 
 K = np.array([[40.0, 0.0, 20.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]])

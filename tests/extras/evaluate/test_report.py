@@ -9,8 +9,7 @@ from urllib.parse import unquote_to_bytes
 import pytest
 
 from splatnode.extras.evaluate.protocol import Row, Settings
-from splatnode.extras.evaluate.report import Bench, make_report_files
-from splatnode.extras.evaluate.shown import FOLDER, PHOTOGRAPH
+from splatnode.extras.evaluate.report import FOLDER, PHOTOGRAPH, Bench, make_report_files
 from tests.support.hostile import TEXTS, unprintable
 
 NAMES = {what: text.replace("\x00", "").replace("/", "_")[:100] for what, text in TEXTS.items()}

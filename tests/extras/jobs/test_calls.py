@@ -17,8 +17,11 @@ from splatnode.capture.process import python
 from splatnode.extras.jobs.calls import (
     ANSWER,
     CALL,
+    NOT_RUN,
     Answer,
+    Child,
     Engine,
+    Limits,
     Task,
     engine,
     make_serial_engine,
@@ -27,10 +30,10 @@ from splatnode.extras.jobs.calls import (
     run_here,
     start_call,
     usable_cores,
+    wait_for_end,
     work_folder,
     write_call,
 )
-from splatnode.extras.jobs.child import NOT_RUN, Child, Limits, wait_for_end
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 
 
@@ -162,7 +165,7 @@ def test_a_call_of_another_user_is_not_made(shared_tmp):  # noqa: F811
     plants = "os.mkdir(sys.argv[1], 0o755); open(sys.argv[1] + '/call', 'wb').write(bytes.fromhex(sys.argv[2]))"
     assert as_other(plants, folder, evil(trace).hex()).returncode == 0
     end = wait_for_end(
-        Child.start(python.command("splatnode.extras.jobs.called", str(folder)), shared_tmp / "log", usable_cores()),
+        Child.start(python.command("splatnode.extras.jobs.template", str(folder)), shared_tmp / "log", usable_cores()),
         Limits(),
     )
     assert end.exit_code != 0 and f"of user {OTHER}" in end.reason and not trace.exists()

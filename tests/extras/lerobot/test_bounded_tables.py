@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatnode.extras.lerobot import data_set
-from splatnode.extras.lerobot.data_set import UnusableDataSet, film, list_parts
+from splatnode.extras import lerobot
+from splatnode.extras.lerobot import UnusableDataSet, film, list_parts
 from tests.support.lerobot_sets import write
 
 pa = pytest.importorskip("pyarrow", reason="needs pyarrow")
@@ -95,7 +95,7 @@ def test_texts_that_unfold_to_gigabytes_end_the_process_that_reads_them_and_no_o
     assert len(list_parts(folder)) == 1000, "what is not needed is not read"
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(UnusableDataSet, match="the table: .*(memory|cannot be read|ended)"):
-        data_set.check_whole(file, UnusableDataSet, "the table")
+        lerobot.check_whole(file, UnusableDataSet, "the table")
     assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 < MOST_OWN
 
 

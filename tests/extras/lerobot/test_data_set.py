@@ -16,9 +16,9 @@ from splatnode.capture import film
 from splatnode.capture.process import apart
 from splatnode.capture.video_process import VideoFrame
 from splatnode.command_line import main
+from splatnode.extras import lerobot as data_set
 from splatnode.extras.cameras import lerobot
-from splatnode.extras.lerobot import data_set
-from splatnode.extras.lerobot.data_set import UnusableDataSet, list_parts
+from splatnode.extras.lerobot import UnusableDataSet, list_parts
 from splatnode.recon.replay_source import Request, load_source
 from tests.support.lerobot_sets import write
 
@@ -152,8 +152,8 @@ def test_a_data_set_without_episodes_says_what_is_missing(copy):
 
 def test_without_pyarrow_it_says_what_pyarrow_is_needed_for(copy, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    monkeypatch.delitem(sys.modules, "splatnode.extras.lerobot.pyarrow", raising=False)
-    monkeypatch.delattr("splatnode.extras.lerobot.pyarrow", raising=False)
+    monkeypatch.delitem(sys.modules, "splatnode.extras.pyarrow", raising=False)
+    monkeypatch.delattr("splatnode.extras.pyarrow", raising=False)
     assert main(["replay", str(copy), "--out", str(copy / "out")]) == 69
     said = "copy' is a LeRobot data set, and its tables are read with pyarrow, which is not installed. Run: pip install"
     assert f"{said} 'splatnode[batch]'" in capsys.readouterr().err

@@ -28,7 +28,7 @@ from splatnode.capture.process.text import is_printable, sanitize_name
 from splatnode.command_line import build_parser
 from splatnode.extras.batch import batch
 from splatnode.extras.batch.batch import BatchRecording, read_list
-from splatnode.extras.jobs.child import End
+from splatnode.extras.jobs.calls import End
 from splatnode.recon.result import submap_index
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.export.result import read_digests

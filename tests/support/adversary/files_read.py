@@ -18,8 +18,8 @@ from splatnode.capture.lens_file import UnusableLens, read_lens
 from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
 from splatnode.capture.pose_files import PosesFileError, read_poses
 from splatnode.capture.process.text import guard_untrusted
+from splatnode.extras import lerobot
 from splatnode.extras.cameras import mcap
-from splatnode.extras.lerobot import data_set
 from splatnode.extras.logged.messages import (
     CALIBRATIONS,
     PICTURES,
@@ -122,9 +122,9 @@ def _read_mcap(path: Path) -> object:
 
 def _read_data_set(files: stored.Files, folder: Path) -> object:
     (folder / "meta" / "episodes" / "chunk-000").mkdir(parents=True, exist_ok=True)
-    (folder / data_set.INFO).write_bytes(files["info.json"] or b"")
-    (folder / data_set.EPISODES / "chunk-000" / "file-000.parquet").write_bytes(files["file-000.parquet"] or b"")
-    found = [data_set.film(folder, part) for part in data_set.list_parts(folder)[:2]]
+    (folder / lerobot.INFO).write_bytes(files["info.json"] or b"")
+    (folder / lerobot.EPISODES / "chunk-000" / "file-000.parquet").write_bytes(files["file-000.parquet"] or b"")
+    found = [lerobot.film(folder, part) for part in lerobot.list_parts(folder)[:2]]
     if any(folder not in film.video.parents for film in found):
         raise AssertionError(f"leads out of the folder: {[film.video for film in found]}")
     return found
@@ -162,7 +162,7 @@ _MCAP = Reader(
     (ValueError,),
     ("splatnode.extras.cameras.mcap", *(f"splatnode.extras.logged.{name}" for name in ("mcap", "depth_topics"))),
 )
-_DATA_SETS = Reader((data_set.UnusableDataSet,), ("splatnode.extras.lerobot.data_set",))
+_DATA_SETS = Reader((lerobot.UnusableDataSet,), ("splatnode.extras.lerobot",))
 _MASKS = Reader((UnusableMask,), _modules("masks"))
 _LANDMARKS = Reader((SceneFileError,), (f"{_RESULT}.landmarks_file", f"{_RESULT}.npz_file"))
 _DEPTHS = Reader((SceneFileError,), (f"{_RESULT}.depth_file",))

@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import nn
 
+from splatnode.extras.evaluate.methods import FrameWithDepth
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import FieldSnapshot
-from splatnode.extras.evaluate.rivals import nerfmm, nope_nerf, radiance_field
-from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
-from splatnode.extras.evaluate.rivals.radiance_field import (
+from splatnode.extras.evaluate.rivals import nerfmm, nope_nerf
+from splatnode.extras.evaluate.rivals.nerfmm import (
     FAR,
     NEAR,
     SAMPLES,
@@ -128,10 +128,10 @@ def test_colours_that_are_not_used_do_not_count():
     for image in spoilt:
         image[:, 8:] = 1.0
     used = (torch.arange(16) < 8).expand(12, 16)
-    config = radiance_field.FitConfig(iterations=60, checkpoints=(), rays=64)
+    config = nerfmm.FitConfig(iterations=60, checkpoints=(), rays=64)
     looks = []
     for masks in ([used, used], [None, None]):
-        (learnt,) = radiance_field.fit_field(spoilt, masks, Focal(1.0), config, seed=0)
+        (learnt,) = nerfmm.fit_field(spoilt, masks, Focal(1.0), config, seed=0)
         looks.append(
             FieldAppearance(learnt.field).render(np.eye(4), np.array([[16.0, 0, 8], [0, 16, 6], [0, 0, 1]]), 16, 12)
         )
@@ -142,9 +142,7 @@ def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
     frames = list(photographs()[:3])
     half = np.tile(np.arange(frames[0].width) < frames[0].width // 2, (frames[0].height, 1))
     frames[1], given = replace(frames[1], mask=half), []
-    monkeypatch.setattr(
-        radiance_field, "fit_field", lambda images, used, *rest, **named: given.extend(used) or iter(())
-    )
+    monkeypatch.setattr(nerfmm, "fit_field", lambda images, used, *rest, **named: given.extend(used) or iter(()))
     with pytest.raises(AssertionError):  # without an end there is no last snapshot
         list(nerfmm.reconstruct(frames, 0))
     assert [used is None for used in given] == [True, False, True] and 0.4 < given[1].float().mean() < 0.6
@@ -154,7 +152,7 @@ def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
 
 
 def test_nerfmm_learns_a_place_and_its_cameras():
-    config = radiance_field.FitConfig(iterations=80, checkpoints=(10,), rays=128)
+    config = nerfmm.FitConfig(iterations=80, checkpoints=(10,), rays=128)
     snapshots = list(nerfmm.reconstruct(list(photographs()[:3]), 0, config))
     assert [snapshot.iterations for snapshot in snapshots] == [10, 80, 80]
     assert [snapshot.final for snapshot in snapshots] == [False, False, True]
@@ -201,7 +199,7 @@ def test_the_next_view_shows_the_same_colours_from_where_it_stands():
 def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
     terms = nope_nerf.ExtraLosses([wall(0.0), wall(0.1)], Focal(40 / 32))
     seen = RenderedRays(torch.zeros(1, 3), torch.tensor([3.0]))
-    late = radiance_field.FitStep(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
+    late = nerfmm.FitStep(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
     loss = terms(late)
     assert float(loss.detach()) == pytest.approx(0.04 * 2.0)
     loss.backward()
@@ -209,7 +207,7 @@ def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
 
 
 def test_nope_nerf_learns_a_place_from_its_depths():
-    config = radiance_field.FitConfig(iterations=20, checkpoints=(), rays=64)
+    config = nerfmm.FitConfig(iterations=20, checkpoints=(), rays=64)
     frames = list(photographs()[:3])
     once, final = nope_nerf.reconstruct(frames, 0, config)
     assert not once.final and final.final and final.verdict.publishable

@@ -12,16 +12,8 @@ import pytest
 pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install 'splatnode[bench]')")
 
 from splatnode.capture.frame import Frame
-from splatnode.extras.evaluate.rivals import (
-    cf_3dgs,
-    colmap,
-    colmap_3dgs,
-    colmap_fsgs,
-    nerfmm,
-    nope_nerf,
-    outcome,
-    radiance_field,
-)
+from splatnode.extras.evaluate import methods
+from splatnode.extras.evaluate.rivals import cf_3dgs, colmap, colmap_3dgs, colmap_fsgs, nerfmm, nope_nerf
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.result.verdict import Code
 
@@ -91,7 +83,7 @@ def test_cf_3dgs_has_the_iterations_that_its_module_tells():
 def test_nerf_starts_with_a_focal_length_of_the_image_s_size_and_learns_it(monkeypatch):
     asked = []
     monkeypatch.setattr(
-        radiance_field, "fit_field", lambda images, used, focal, *rest, **named: asked.append((images, focal)) or []
+        nerfmm, "fit_field", lambda images, used, focal, *rest, **named: asked.append((images, focal)) or []
     )
     with pytest.raises(AssertionError):  # without an end there is no last snapshot
         list(nerfmm.reconstruct(make_frames(3, (512, 384)), 0))
@@ -109,7 +101,7 @@ def test_nope_nerf_has_the_weights_of_its_publication():
 
 def test_two_cameras_are_no_answer_of_a_rival():
     frames = make_frames(4)
-    assert [outcome.make_verdict(frames, [f"{i}.png" for i in range(n)]).code for n in (2, 3, 4)] == [
+    assert [methods.make_verdict(frames, [f"{i}.png" for i in range(n)]).code for n in (2, 3, 4)] == [
         Code.NO_OVERLAP,
         Code.OK_PARTIAL,
         Code.OK,

@@ -14,8 +14,9 @@ pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
+from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.protocol import psnr
-from splatnode.extras.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, outcome
+from splatnode.extras.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs
 from splatnode.extras.evaluate.rivals.colmap import reconstruct_sparse_model
 from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.optimize import training
@@ -112,7 +113,7 @@ def test_what_a_mask_hides_is_not_fitted_by_colmap_s_rivals(model):
 
 def test_what_a_mask_hides_is_neither_a_start_nor_fitted_by_cf_3dgs(frames):
     masked = [replace(frame, mask=half_of(frame)) if i == 1 else frame for i, frame in enumerate(frames)]
-    known = outcome.estimate_frame_depths(masked, 0)
+    known = methods.estimate_frame_depths(masked, 0)
     assert [each.mask is None for each in known] == [True, False, True]
     frame, T = known[1], np.eye(4)
     assert cf_3dgs._make_training_view(frame, T).mask is frame.mask

@@ -18,7 +18,7 @@ from splatnode.extras.evaluate.stability.fitting import (
     passes_limits,
 )
 from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError
-from splatnode.extras.evaluate.stability.windows.windows import OURS, WindowOutcome, WindowRow
+from splatnode.extras.evaluate.stability.windows import OURS, WindowOutcome, WindowRow
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.error_model import ErrorModel, OddsModel, VerdictModel, compute_measures
 from splatnode.recon.verification.fitted import FITTED

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.extras.evaluate.dataset import TrueCamera
-from splatnode.extras.evaluate.stability.report import compute_rate, make_report, summarise
+from splatnode.extras.evaluate.stability.campaign import compute_rate, make_report, summarise
 from splatnode.extras.evaluate.stability.trial import Demand, Outcome, classify_outcome, score_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Bounds, make_ball
@@ -158,15 +158,15 @@ def test_the_report_s_rates_are_those_of_the_first_method():
 
 def test_the_chart_has_a_cell_for_every_trial(tmp_path):
     pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
-    from splatnode.extras.evaluate.stability.report import draw, make_figure
+    from splatnode.extras.evaluate.charts import draw_stability, make_stability_figure
 
     trials = [{**trial, "seed": number % 3, "verdict": f"CODE_{number}"} for number, trial in enumerate(TRIALS)]
-    figure = make_figure({"trials": trials, **make_report(trials)})
+    figure = make_stability_figure({"trials": trials, **make_report(trials)})
     shown = [text.get_text() for axes in figure.axes for text in axes.texts]
     assert {f"CODE_{number}" for number in range(len(trials))} <= {text.rstrip(" *") for text in shown}
     assert "CODE_1 *" in shown, "a limit that was missed is marked"
     (tmp_path / "stability.json").write_text(json.dumps({"trials": trials, **make_report(trials)}))
-    assert draw(tmp_path / "stability.json", tmp_path).stat().st_size > 10_000
+    assert draw_stability(tmp_path / "stability.json", tmp_path).stat().st_size > 10_000
     (tmp_path / "stability.json").write_text(json.dumps({"trials": [], **make_report([])}))
     with pytest.raises(ValueError, match="must have a trial to draw, it has none"):
-        draw(tmp_path / "stability.json", tmp_path)
+        draw_stability(tmp_path / "stability.json", tmp_path)

@@ -13,11 +13,11 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
 from splatnode.extras.evaluate.dataset import load_scene, write_capture
 from splatnode.extras.evaluate.report import Timing
+from splatnode.extras.evaluate.stability import window_campaign
+from splatnode.extras.evaluate.stability import windows as windows_windows
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras
-from splatnode.extras.evaluate.stability.windows import campaign
-from splatnode.extras.evaluate.stability.windows import windows as windows_windows
-from splatnode.extras.evaluate.stability.windows.windows import (
+from splatnode.extras.evaluate.stability.windows import (
     PieceKey,
     Window,
     WindowAnswer,
@@ -53,7 +53,7 @@ def answered(
     place: TrialScene, each: Window, known: dict[PieceKey, bytes], config: ReconstructionConfig, **asked
 ) -> WindowAnswer:
     """What splatnode answers; what it finds is known from then on."""
-    answer, found = campaign.reconstruct_window(place, each, config, asked.get("fresh", False), "nothing", known)
+    answer, found = window_campaign.reconstruct_window(place, each, config, asked.get("fresh", False), "nothing", known)
     known |= found
     return answer
 
@@ -64,7 +64,7 @@ def test_what_is_known_of_a_scene_changes_no_answer(place):
     known: dict[PieceKey, bytes] = {}
     found = [answered(place, each, known, config) for each in windows]
     for each, answer in zip(windows, found, strict=True):
-        estimate = campaign.estimate_without_store(campaign.load_window_frames(place, each), config)
+        estimate = window_campaign.estimate_without_store(window_campaign.load_window_frames(place, each), config)
         assert answer.verdict == estimate.verdict
         cameras = list_registered_cameras(estimate)
         assert [camera.name for camera in answer.cameras] == [camera.name for camera in cameras]
@@ -82,8 +82,8 @@ def test_masks_hide_what_they_hide_in_windows_too(place, tmp_path):
     (tmp_path / f"{each.names[1]}.png").write_bytes(encode_png(hidden))
     scene = dataclasses.replace(place.scene, masks=tmp_path)
     plain, frames = (
-        campaign.load_window_frames(place, each, True),
-        campaign.load_window_frames(TrialScene(scene, place.names), each, True),
+        window_campaign.load_window_frames(place, each, True),
+        window_campaign.load_window_frames(TrialScene(scene, place.names), each, True),
     )
     assert [(frame.frame_id, frame.stamp_ns, frame.intrinsics is None) for frame in frames] == [
         (1, 1, False),
@@ -107,7 +107,7 @@ def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkey
     few = replace(config.matching.features, max_num_features=1000)
     matching = replace(config.matching, features=few, tilting=replace(config.matching.tilting, firm_matches=100))
     config = replace(config, matching=matching)
-    keyframes = [prepare(frame, config) for frame in campaign.load_window_frames(place, window(place, 0, 1, 6))]
+    keyframes = [prepare(frame, config) for frame in window_campaign.load_window_frames(place, window(place, 0, 1, 6))]
     known: dict[PieceKey, bytes] = {}
     for some in (keyframes[:4], keyframes[2:], keyframes[1::2], keyframes):
         graph, found = windows_windows.match_keyframes(
@@ -152,19 +152,19 @@ def test_seconds_are_those_of_a_window_that_had_its_cores_alone(place):
 
 def test_rivals_map_what_is_known_of_the_scene(place):
     pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install 'splatnode[bench]')")
-    from splatnode.extras.evaluate.stability.windows import campaign
+    from splatnode.extras.evaluate.stability import window_campaign
 
     jobs = [("colmap", window(place, 0, 1, 4)), ("glomap", window(place, 1, 1)), ("colmap", window(place, 2, 1, 4))]
     known: dict[PieceKey, bytes] = {}
     for number, (method, each) in enumerate(jobs):
-        answer, found = campaign.run_rival_on_window(place, each, method, 0, number == 0, known)
+        answer, found = window_campaign.run_rival_on_window(place, each, method, 0, number == 0, known)
         assert len(found) == (10, 0, 7)[number], "what is known is not found again"
         known |= found
         row = judge_window(each, method, answer, place.scene.cameras)
         assert row.outcome is WindowOutcome.RIGHT and {camera.name for camera in row.cameras} == set(each.names)
         assert all(camera.bounds is None for camera in row.cameras)
         assert answer.seconds > 0 and (answer.fresh_seconds is not None) == (number == 0)
-        _, found = campaign.run_rival_on_window(place, each, method, 0, False, {})
+        _, found = window_campaign.run_rival_on_window(place, each, method, 0, False, {})
         for key in (key for key in found if len(key) == 3):
             one, other = (pickle.loads(pieces[key]) for pieces in (known, found))
             np.testing.assert_array_equal(one.matches, other.matches)

@@ -17,10 +17,10 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.command_line import build_parser
 from splatnode.extras.evaluate.dataset import load_scene, write_capture
+from splatnode.extras.evaluate.stability import window_campaign
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
 from splatnode.extras.evaluate.stability.trial import CameraError, FiniteBounds
-from splatnode.extras.evaluate.stability.windows import campaign
-from splatnode.extras.evaluate.stability.windows.campaign import (
+from splatnode.extras.evaluate.stability.window_campaign import (
     Plan,
     format_report,
     measure_coverage,
@@ -30,7 +30,7 @@ from splatnode.extras.evaluate.stability.windows.campaign import (
     summarise,
     tally_rows,
 )
-from splatnode.extras.evaluate.stability.windows.windows import Window, WindowAnswer, WindowOutcome, WindowRow
+from splatnode.extras.evaluate.stability.windows import Window, WindowAnswer, WindowOutcome, WindowRow
 from splatnode.extras.jobs.calls import engine, usable_cores
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.calls import in_this_process
@@ -120,7 +120,7 @@ def first_broken(place, window, config, fresh, told, known):
 
 def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
     places, on = three_places(tmp_path).walked[:1], in_this_process()
-    monkeypatch.setattr(campaign, "reconstruct_window", first_broken)
+    monkeypatch.setattr(window_campaign, "reconstruct_window", first_broken)
     plan = Plan(("splatnode",), counts=(3,))
 
     def asked() -> int:
@@ -146,7 +146,7 @@ def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
 
 def test_windows_with_a_given_lens_and_without_are_not_mixed(tmp_path, monkeypatch):
     places, on = three_places(tmp_path).walked[:1], in_this_process()
-    monkeypatch.setattr(campaign, "reconstruct_window", first_broken)
+    monkeypatch.setattr(window_campaign, "reconstruct_window", first_broken)
     plan, as_it_works = Plan(("splatnode",), per_kind=1, counts=(3,)), []
 
     def noted(take, limits, folder):
@@ -178,7 +178,7 @@ def befallen(place, window, config, fresh, told, known):
 
 
 def test_a_window_that_fails_costs_only_itself(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(campaign, "reconstruct_window", befallen)
+    monkeypatch.setattr(window_campaign, "reconstruct_window", befallen)
     plan = Plan(("splatnode",), per_kind=1, counts=(3,), timeout_s=1.5)
     with engine(1, None) as on:
         rows = run_windows(plan, three_places(tmp_path).walked[:1], tmp_path, "command", on)
@@ -208,7 +208,7 @@ def slow(place, window, config, fresh, told, known):
 
 def third_slow_at_first(out: Path, on) -> list[WindowRow]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(campaign, "reconstruct_window", slow)
+        patch.setattr(window_campaign, "reconstruct_window", slow)
         plan = Plan(("splatnode",), per_kind=1, counts=(3,))
         return run_windows(plan, three_places(out).walked[:1], out, "command", on)
 
@@ -254,15 +254,17 @@ def test_one_core_and_two_give_the_same(tmp_path):
 
 def test_charts(tmp_path):
     pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
-    from splatnode.extras.evaluate.stability.windows import campaign
+    from splatnode.extras.evaluate.stability import window_campaign
 
-    assert campaign.draw(ROWS, tmp_path) == ["windows.png", "calibration.png"]
+    assert window_campaign.draw(ROWS, tmp_path) == ["windows.png", "calibration.png"]
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("windows.png", "calibration.png"))
-    assert campaign.draw(ROWS[7:], tmp_path) == ["windows.png"], "who claims nothing has no calibration"
-    titles = [axes.get_title(loc="left") for axes in campaign.make_shares_figure(ROWS).axes]
+    assert window_campaign.draw(ROWS[7:], tmp_path) == ["windows.png"], "who claims nothing has no calibration"
+    titles = [axes.get_title(loc="left") for axes in window_campaign.make_shares_figure(ROWS).axes]
     assert titles == ["splatnode: 2 of 7 right, 1 wrong", "COLMAP: 0 of 2 right, 1 wrong"]
     labels = [
-        text.get_text() for axes in campaign.make_bounds_figure(ROWS).axes for text in axes.get_legend().get_texts()
+        text.get_text()
+        for axes in window_campaign.make_bounds_figure(ROWS).axes
+        for text in axes.get_legend().get_texts()
     ]
     assert labels == ["3 views: 82% of 11 cameras within", "3 views: 100% of 11 cameras within"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from splatnode.extras.evaluate.dataset import EvaluationScene
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
-from splatnode.extras.evaluate.stability.windows.campaign import Job, WindowScheduler
-from splatnode.extras.evaluate.stability.windows.windows import Window
+from splatnode.extras.evaluate.stability.window_campaign import Job, WindowScheduler
+from splatnode.extras.evaluate.stability.windows import Window
 
 EAST, WEST = (TrialScene(EvaluationScene("pole", {}, {}), ("a", "b", "c", "d")) for _ in range(2))  # of one name, even
 

@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
 from splatnode.extras.evaluate.stability.perturbations import TrialScene
-from splatnode.extras.evaluate.stability.windows.windows import compute_angle_deg, draw_windows, select_moving_scenes
+from splatnode.extras.evaluate.stability.windows import compute_angle_deg, draw_windows, select_moving_scenes
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc, three_places
 
 

@@ -1,6 +1,7 @@
-"""All that is known of a station's cameras over its recordings.
+"""Which camera of a station has moved, when and by how much: recordings placed in a scene that was made before.
 
-Which camera took what in which recording: by folders, by episodes of data sets, by MCAP files.
+`audit` finds the cameras of each recording, places the few photographs of them that are looked at, measures how a
+camera moved between two photographs of the same place, and makes periods and rigs of it.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from splatnode.capture.process.system import raise_shortage, remedy
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.recording import is_recording
+from splatnode.extras import lerobot
 from splatnode.extras.batch import batch
 from splatnode.extras.cameras.mcap import SUFFIX as MCAP
-from splatnode.extras.lerobot import data_set
 from splatnode.recon.geometry import angles_deg, cross_matrix
 from splatnode.recon.locating.localize import (
     Localization,
@@ -148,7 +149,7 @@ def _find_cameras(folder: Path) -> dict[str, ImageFiles | Film]:
     """
     if is_recording(folder):
         return {_ONE_CAMERA: Film(folder)}
-    if data_set.is_data_set(folder):
+    if lerobot.is_data_set(folder):
         return {}
     below, photographs = _folders_of_photographs(folder), image_paths(folder)
     if photographs and below:
@@ -202,10 +203,10 @@ def _make_shot(path: Path, named: Path) -> _Shot | _Unreadable:
     """Makes the shot of one recording of a batch; `named` is the path that led to it."""
     file, part = film.file_and_part(path)
     try:
-        if part and data_set.is_data_set(file):
-            number, key = data_set.episode_and_camera(file, data_set.read_info(file), part)
-            return _Shot((*file.parts, data_set.episode_name(number)), sanitize_name(key), Film(path))
-        if not part and (data_set.is_data_set(file) or file.suffix.lower() == MCAP):
+        if part and lerobot.is_data_set(file):
+            number, key = lerobot.episode_and_camera(file, lerobot.read_info(file), part)
+            return _Shot((*file.parts, lerobot.episode_name(number)), sanitize_name(key), Film(path))
+        if not part and (lerobot.is_data_set(file) or file.suffix.lower() == MCAP):
             batch.list_parts(file)  # which has found none; one of both tells why
             film.stream(file)
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Parquet files within bounds, and the process that reads columns of them for `tables.py`. Needs pyarrow."""
+"""Parquet files within bounds, and the process that reads columns of them for `lerobot.py`. Needs pyarrow."""
 
 from __future__ import annotations
 
@@ -18,16 +18,7 @@ import pyarrow.parquet as pq
 from splatnode.capture.process import apart
 from splatnode.capture.process.files import open_regular
 from splatnode.capture.process.records import decoder_of
-from splatnode.extras.lerobot.data_set import (
-    LOST,
-    MOST_ROWS,
-    REFUSED,
-    Columns,
-    Lost,
-    Request,
-    encode_columns,
-    encode_refusal,
-)
+from splatnode.extras.lerobot import LOST, MOST_ROWS, REFUSED, Columns, Lost, Request, encode_columns, encode_refusal
 
 MEMORY_BYTES = 1_000_000_000  # of the process that reads, whatever the files say of themselves
 _READING_S = 120  # of processor time at most

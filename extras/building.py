@@ -1,8 +1,9 @@
-"""The building: its floor plan, its furniture, and what stands and hangs in each zone.
+"""The building that the building camera walks through: its floor plan, and what stands and hangs in each zone.
 
 A corridor lies along x, three rooms on each side of it, a door between each of them and the corridor. World axes: z up,
 the floor at z = 0, the corridor's middle line in y = 0; metres. Rooms 1 and 2 are look-alikes: the same paper and kinds
-of things, dealt anew."""
+of things, dealt anew.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,10 @@
-"""The episodes of a data set, and where in which file the video of each camera is.
+"""LeRobot's data sets of version 3.0: episodes whose videos lie one behind the other in shared files.
 
 Columns of its Parquet files are read in a process of its own: `pyarrow.py` is that process. A file of some megabytes
 may hold a column of billions of values, or a page that is unpacked to gigabytes. What is read is bounded by what the
-files say of themselves and, where they lie, by the limits of that process."""
+files say of themselves and, where they lie, by the limits of that process.
+Source: LeRobot, `dataset_metadata.py` and `utils.py` of its datasets, codebase version v3.0.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +111,7 @@ def _answer(written: tuple[_Written, ...], names: tuple[str, ...]) -> tuple[byte
     """The kind of an answer, and what comes with it."""
     request = msgspec.msgpack.encode(Request(tuple(file for file, *_ in written), names))
     most = _HEAD.size + max(_MOST_SAID, MOST_ROWS * len(names) * 8)
-    answer, code = apart.answer("splatnode.extras.lerobot.pyarrow", request, most)
+    answer, code = apart.answer("splatnode.extras.pyarrow", request, most)
     if len(answer) >= _HEAD.size:
         kind, count = _HEAD.unpack_from(answer)
         if len(answer) == _HEAD.size + count * (len(names) * 8 if kind == COLUMNS else 1):

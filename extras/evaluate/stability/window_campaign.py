@@ -31,6 +31,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.process.records import record_of
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import read_json
+from splatnode.extras.evaluate.methods import make_verdict
 from splatnode.extras.evaluate.report import (
     Timing,
     check_same_cores,
@@ -39,7 +40,6 @@ from splatnode.extras.evaluate.report import (
     measure_timing,
 )
 from splatnode.extras.evaluate.rivals import colmap
-from splatnode.extras.evaluate.rivals.outcome import make_verdict
 from splatnode.extras.evaluate.runner import Journal
 from splatnode.extras.evaluate.stability.perturbations import TrialScene, load_trial_scenes
 from splatnode.extras.evaluate.stability.trial import (
@@ -49,7 +49,7 @@ from splatnode.extras.evaluate.stability.trial import (
     list_registered_cameras,
     make_camera_estimate,
 )
-from splatnode.extras.evaluate.stability.windows.windows import (
+from splatnode.extras.evaluate.stability.windows import (
     COUNTS,
     OURS,
     PieceKey,
@@ -67,9 +67,8 @@ from splatnode.extras.evaluate.stability.windows.windows import (
     select_keys,
     select_moving_scenes,
 )
-from splatnode.extras.jobs.calls import Engine, Task, Work, now, pack_call, work_folder
+from splatnode.extras.jobs.calls import Engine, Limits, Task, Work, now, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
-from splatnode.extras.jobs.child import Limits
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.fallbacks import run_fallbacks
@@ -484,7 +483,7 @@ def _time_fresh_rival(frames: Sequence[Frame], seed: int, mapper: colmap.Mapper)
     return time.perf_counter() - started, measure_timing(since)
 
 
-# Draws windows.json: `python -m splatnode.extras.evaluate.stability.windows.campaign windows.json --out DIR`.
+# Draws windows.json: `python -m splatnode.extras.evaluate.stability.window_campaign windows.json --out DIR`.
 #
 # Needs matplotlib (pip install 'splatnode[bench]').
 

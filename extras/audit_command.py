@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say, show_progress
-from splatnode.extras.auditing.audit import (
+from splatnode.extras.audit import (
     Audit,
     MeasuredMotion,
     Period,
@@ -18,7 +18,7 @@ from splatnode.extras.auditing.audit import (
     find_recordings,
     load_first_frames,
 )
-from splatnode.extras.auditing.audit import audit as audited
+from splatnode.extras.audit import audit as audited
 from splatnode.recon.locating.localize import check_lens
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.npz_files import read_landmarks
