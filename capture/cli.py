@@ -23,11 +23,9 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import network as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import parse_changes, parse_config, parse_layers, read_yaml
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, parse_changes, parse_config, parse_layers, read_yaml
 from splatnode.capture.process.files import make_folder, sync_folder
-from splatnode.capture.process.logs import use_structured_lines
-from splatnode.capture.process.terminal import report_items, say, show_progress, show_waiting
+from splatnode.capture.process.terminal import report_items, say, show_progress, show_waiting, use_structured_lines
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder

@@ -30,9 +30,8 @@ from splatnode.capture.messaging.network import (
 from splatnode.capture.messaging.pubsub import Answer, CommandServer, MarkProblemsSeen, Publisher
 from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import StrayFile, create_own, read_own
-from splatnode.capture.process.logs import Problems, event, is_logged
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import (
     SHORT_OF_MEMORY,
     ServiceManager,
@@ -44,8 +43,8 @@ from splatnode.capture.process.system import (
     resident_mb,
     wrap_late_errors,
 )
+from splatnode.capture.process.terminal import Problems, Unfailing, event, is_logged
 from splatnode.capture.process.text import sanitize_text
-from splatnode.capture.process.unfailing import Unfailing
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.status import HEARTBEAT_S, NAMED, CaptureStatus
 

@@ -18,7 +18,7 @@ from splatnode.capture.depth_image import MOST_PIXELS, DepthImage, DepthNoise, m
 from splatnode.capture.frame import LARGEST_SIDE, Intrinsics
 from splatnode.capture.image_file import UnusableImage, decode_values, read_image_file
 from splatnode.capture.process.library_lines import ignore_file_warnings
-from splatnode.capture.process.notices import notify
+from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 log = logging.getLogger(__name__)

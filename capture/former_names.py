@@ -1,7 +1,7 @@
 """What capture's configuration keys, verbs and flags were called in the release before; they are read in this one.
 
 The tables go with the next release. A key stands as "section.former" or, of one kind of camera alone, as
-"section[kind].former", and its present name stands in the same section (capture/process/config_keys.py).
+"section[kind].former", and its present name stands in the same section (capture/process/config.py).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, reduce_image
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 

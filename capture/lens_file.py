@@ -16,9 +16,8 @@ import msgspec
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.pose_files import binary_images, text_images
-from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
+from splatnode.capture.process.config import MAX_BYTES, ConfigError, parse_yaml, record_of
 from splatnode.capture.process.files import read_bounded, read_text
-from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 
 # Lenses that are given: of which images each of them can be, and what is said where it is of none.

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame
 from splatnode.capture.odometry import LARGEST_M, are_rigid, rigid_problem
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 # The photographs of a COLMAP model: images.txt and images.bin. Their points are passed over.

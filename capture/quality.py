@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 
 Image = npt.NDArray[np.uint8]  # (H, W, 3) RGB
 Plane = npt.NDArray  # (H, W) grey levels, uint8, or sums of at most BOX of them, uint16

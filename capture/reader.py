@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, KeepAlive
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 
 log = logging.getLogger(__name__)
 

@@ -32,8 +32,8 @@ from splatnode.capture.frame import (
 )
 from splatnode.capture.frame_meta import FrameMeta, describe_frame, read_frame_fields
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, decode_values, read_image_file
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded, sync_folder
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast
 from splatnode.capture.process.text import LONGEST_NAME, digest_name, guard_untrusted, is_printable, sanitize_text
 

@@ -17,10 +17,10 @@ from splatnode.capture.depth_files import describe_few_pairs, is_few, read_depth
 from splatnode.capture.depth_image import DepthImage, check_unit
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import UnusableImage
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded
-from splatnode.capture.process.notices import notify
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import outlast, raise_shortage
+from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import guard_untrusted, sanitize_name, sanitize_text
 
 log = logging.getLogger(__name__)

@@ -24,9 +24,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.lens_file import UnusableLens, read_lenses
-from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
+from splatnode.capture.process.config import MAX_BYTES, ConfigError, parse_yaml, record_of
 from splatnode.capture.process.files import read_text
-from splatnode.capture.process.records import record_of
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 from splatnode.capture.rig import SIGMA_DEG, SIGMA_M, Rig, RigCamera
 

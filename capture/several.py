@@ -12,8 +12,8 @@ from typing import Any
 
 from splatnode.capture.messaging.network import CAMERA_ID
 from splatnode.capture.process import python
-from splatnode.capture.process.config_text import ConfigError
-from splatnode.capture.process.logs import event
+from splatnode.capture.process.config import ConfigError
+from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import sanitize_text
 
 log = logging.getLogger(__name__)

@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process import apart
+from splatnode.capture.process.config import decoder_of, record_in
 from splatnode.capture.process.files import read_bounded
-from splatnode.capture.process.records import decoder_of, record_in
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 MOST_ROWS = 1_000_000  # of all files together: more episodes than any data set has

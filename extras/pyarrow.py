@@ -16,8 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from splatnode.capture.process import apart
+from splatnode.capture.process.config import decoder_of
 from splatnode.capture.process.files import open_regular
-from splatnode.capture.process.records import decoder_of
 from splatnode.extras.lerobot import LOST, MOST_ROWS, REFUSED, Columns, Lost, Request, encode_columns, encode_refusal
 
 MEMORY_BYTES = 1_000_000_000  # of the process that reads, whatever the files say of themselves

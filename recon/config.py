@@ -9,8 +9,7 @@ import msgspec
 from msgspec import Meta
 
 from splatnode.capture.process import plugins
-from splatnode.capture.process.config import Plugin, build_config, merge_config, replace_former_names
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal, Plugin, build_config, merge_config, replace_former_names
 from splatnode.capture.rig import TOLERANCE_S
 from splatnode.recon import former_names
 from splatnode.recon.frames import screening

@@ -1,7 +1,7 @@
 """What recon's configuration keys, verbs and flags were called in the release before; they are read in this one.
 
 The tables go with the next release. A key stands as "section.former", and its present name stands in the same section
-(capture/process/config_keys.py); sections above it are by their present names.
+(capture/process/config.py); sections above it are by their present names.
 """
 
 from __future__ import annotations

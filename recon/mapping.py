@@ -22,7 +22,7 @@ from typing import Any
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import is_shortage
 from splatnode.capture.process.terminal import ProgressStep, format_times, is_interactive, progress, say, show_progress
 from splatnode.recon.config import ReconstructionConfig

@@ -18,8 +18,7 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import is_resampled
-from splatnode.capture.process.notices import notify
-from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, report_items
+from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, notify, report_items
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import threads
 from splatnode.recon.budget import find_budget_hits

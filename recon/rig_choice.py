@@ -15,8 +15,7 @@ import numpy as np
 from splatnode.capture.frame import Frame
 from splatnode.capture.lens_file import Lenses, describe_image
 from splatnode.capture.multi_camera import CameraSet
-from splatnode.capture.process.notices import notify
-from splatnode.capture.process.terminal import Tell
+from splatnode.capture.process.terminal import Tell, notify
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import read_rig

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from splatnode.api.session import Session, Update
     from splatnode.capture.depth_image import DepthImage, DepthNoise, make_depth_image
     from splatnode.capture.frame import Intrinsics
-    from splatnode.capture.process.notices import InputWarning
+    from splatnode.capture.process.terminal import InputWarning
     from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.occupancy.grid import OccupancyMap
     from splatnode.recon.result.verdict import Verdict
@@ -53,7 +53,7 @@ _MODULES = {
     "Camera": "splatnode.api.result",
     "DepthImage": "splatnode.capture.depth_image",
     "DepthNoise": "splatnode.capture.depth_image",
-    "InputWarning": "splatnode.capture.process.notices",
+    "InputWarning": "splatnode.capture.process.terminal",
     "Intrinsics": "splatnode.capture.frame",
     "Located": "splatnode.recon.locating.outcome",
     "Marker": "splatnode.api.reconstruct",

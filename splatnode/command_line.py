@@ -32,9 +32,8 @@ from splatnode.capture.process import plugins
 from splatnode.capture.process.arguments import Verb, replace_former_words
 from splatnode.capture.process.files import default_runtime_directory
 from splatnode.capture.process.library_lines import keep_last_words, tell_last_words
-from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
-from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output, say
+from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output, say, use_plain_lines
 from splatnode.capture.process.text import sanitize_lines, sanitize_text
 from splatnode.recon import former_names as recon_names
 from splatnode.viewer import former_names as viewer_names

@@ -34,7 +34,7 @@ from splatnode.capture.frame import (
     wall_clock,
 )
 from splatnode.capture.pace import FramesPerSecond
-from splatnode.capture.process.logs import event
+from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import sanitize_text
 
 log = logging.getLogger(__name__)

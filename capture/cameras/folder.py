@@ -44,8 +44,8 @@ from splatnode.capture.odometry import LARGEST_M, make_given_pose
 from splatnode.capture.odometry import SIGMA_DEG as POSE_SIGMA_DEG
 from splatnode.capture.odometry import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
-from splatnode.capture.process.notices import notify
 from splatnode.capture.process.system import outlast
+from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.rgbd_folder import RgbdFolder, find_photographs, find_rgbd_folder
 

@@ -21,7 +21,7 @@ from splatnode.capture.diorama.scene import Config as Odometry
 from splatnode.capture.frame import Baseline, Clock, Frame, Intrinsics, RightImage, Stamp, grey
 from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.pace import FramesPerSecond
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 

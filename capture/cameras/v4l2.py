@@ -31,8 +31,8 @@ from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, Intr
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.lens_file import check_fits
 from splatnode.capture.pace import FramesPerSecond
-from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.terminal import event
 
 # The kernel's structs and request numbers, from linux/videodev2.h; ctypes lays them out as the C compiler does.
 

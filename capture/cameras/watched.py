@@ -38,9 +38,8 @@ from splatnode.capture.image_file import (
 from splatnode.capture.image_header import name_time
 from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
 from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal, record_in
 from splatnode.capture.process.files import read_bounded
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import is_shortage, outlast
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 

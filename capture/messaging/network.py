@@ -43,7 +43,6 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from splatnode.capture.messaging import wire
-from splatnode.capture.process.crowd import network_of, next_to_go
 from splatnode.capture.process.files import (
     LockHeld,
     NotOwnerOnly,
@@ -56,8 +55,8 @@ from splatnode.capture.process.files import (
     remove_leftovers,
     write_atomically,
 )
-from splatnode.capture.process.logs import is_logged
-from splatnode.capture.process.system import make_sure_of_room, outlast, raise_file_limit
+from splatnode.capture.process.system import make_sure_of_room, network_of, next_to_go, outlast, raise_file_limit
+from splatnode.capture.process.terminal import is_logged
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 
 log = logging.getLogger(__name__)

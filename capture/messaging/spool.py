@@ -20,7 +20,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from splatnode.capture.messaging.wire import MAGIC, VERSION, Name, Part, Text, check
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal, record_in
 from splatnode.capture.process.files import (
     StrayFile,
     exclusive,
@@ -32,7 +32,6 @@ from splatnode.capture.process.files import (
     state_directory,
     write_atomically,
 )
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, sanitize_text
 

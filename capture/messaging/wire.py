@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 import zmq
 
-from splatnode.capture.process.records import Decoder, decoder_of
+from splatnode.capture.process.config import Decoder, decoder_of
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
 
 # What a header may say: each kind of number and text with its range, and what all of them have in common.

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
-from splatnode.capture.process.config_text import MAX_NUMBER
 from splatnode.capture.process.terminal import show_waiting
-from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.process.text import MAX_NUMBER, sanitize_text
 
 _MAX_DIGITS = 20
 _LAST_PORT = 65535

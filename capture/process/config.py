@@ -3,14 +3,21 @@
 Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
 names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. Further
 kinds are installed beside the core (`plugins.py`). A field whose type is a Mapping of Plugins holds several by name,
-which is also their kind where they say no other. `config_keys` knows internal keys and former names.
+which is also their kind where they say no other.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
+import functools
+import logging
+import math
+import re
+import threading
 import typing
-from collections.abc import Mapping, Sequence
+import unicodedata
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,24 +26,265 @@ from types import ModuleType
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
+import yaml
 
-from splatnode.capture.process.config_keys import (
-    KeyPlace,
-    find_nearest_key,
-    has_fields,
-    is_internal,
-    join_keys,
-    list_documented_keys,
-    list_field_types,
-    replace_former_name,
-)
-from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.plugins import EntryPoint, entry_points
-from splatnode.capture.process.records import record_of
-from splatnode.capture.process.text import guard_untrusted, sanitize_text
+from splatnode.capture.process.terminal import gives_warnings, notify
+from splatnode.capture.process.text import MAX_NUMBER, guard_untrusted, sanitize_text
+
+# Records out of JSON and of plain values, in any thread.
+#
+# msgspec learns a type when it first meets it, and keeps what it has learnt with the type before it knows all of it.
+# Two threads that meet a type at once can end the process (segmentation fault, msgspec 0.22), so they take turns.
+
+Decoder = msgspec.msgpack.Decoder
+_TURN = threading.RLock()
+_TOO_DEEP = "values may not be nested as deeply as these"
+
+
+def record_of(value: Any, kind: Any, dec_hook: Callable[[type, Any], Any] | None = None) -> Any:
+    """`msgspec.convert`: the plain `value` as a `kind`. Raises msgspec.ValidationError, and nothing else."""
+    with _TURN:
+        try:
+            return msgspec.convert(value, kind, dec_hook=dec_hook)
+        except RecursionError as error:
+            raise msgspec.ValidationError(_TOO_DEEP) from error
+
+
+def record_in(data: bytes | str, kind: Any) -> Any:
+    """`msgspec.json.decode`: the `kind` in JSON.
+
+    Raises msgspec.DecodeError, msgspec.ValidationError, and nothing else: msgspec itself has further errors for a text
+    that is no UTF-8 and for one that is nested deeply.
+    """
+    with _TURN:
+        try:
+            return msgspec.json.decode(data, type=kind)
+        except RecursionError as error:
+            raise msgspec.DecodeError(_TOO_DEEP) from error
+        except UnicodeError as error:
+            raise msgspec.DecodeError(f"JSON is UTF-8: {error}") from error
+
+
+def decoder_of(kind: Any) -> Decoder:
+    """A decoder of MessagePack, which threads may share."""
+    with _TURN:
+        return Decoder(kind)
+
+
+# The text of a configuration -> values, of which there are not more, nor deeper or larger ones, than anybody writes.
+#
+# YAML can say much in few bytes: an alias repeats what it names, a number has as many digits as it likes. All limits
+# hold while the text is read, before anything is made of it.
+
+MAX_BYTES = 262_144  # of a file
+MAX_VALUES = 10_000  # keys count, too
+MAX_DEPTH = 32
+MAX_CHARACTERS = 4096  # of a text, such as a path
+_MAX_DIGITS = 64
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key, what was expected and what came."""
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """The value in `text`, one YAML document; None where there is none. Raises ConfigError, which names `source`.
+
+    It consists of mappings with different keys that are text, lists, finite numbers, text, truth values and None.
+    """
+    with guard_untrusted(ConfigError, source):
+        if len(text) > MAX_BYTES:
+            raise ConfigError(f"{source}: {len(text)} characters; at most {MAX_BYTES} are read")
+        try:
+            return yaml.load(text, Loader=_Loader)  # a SafeLoader
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source} is not YAML: {error}") from error
+        except _BoundsError as error:
+            raise ConfigError(f"{source}: {error}") from error
+
+
+class _BoundsError(Exception):
+    """A value that no configuration has."""
+
+    def __init__(self, expected: str, node: yaml.Node) -> None:
+        text = node.value if isinstance(node, yaml.ScalarNode) else type(node).__name__
+        super().__init__(f"line {node.start_mark.line + 1}: {expected}, got {sanitize_text(text, 100)}")
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 as PyYAML reads it, but 1e-3 is a number, as it is in YAML 1.2. Raises _Beyond, yaml.YAMLError."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = self._values = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError(f"line {event.start_mark.line + 1}: aliases (*) are not read; write the value out")
+        self._depth, self._values = self._depth + 1, self._values + 1
+        if self._depth > MAX_DEPTH or self._values > MAX_VALUES:
+            line = event.start_mark.line + 1
+            raise yaml.YAMLError(f"line {line}: more than {MAX_VALUES} values, or deeper than {MAX_DEPTH}")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def construct_text(self, node: yaml.ScalarNode) -> str:
+        # Control characters and halves of letters are in no path, and would end what opens it.
+        categories = {unicodedata.category(letter) for letter in node.value}
+        if len(node.value) > MAX_CHARACTERS or categories & {"Cc", "Cs"}:
+            raise _BoundsError(f"expected a text of one line, of at most {MAX_CHARACTERS} characters", node)
+        return node.value
+
+    def construct_number(self, node: yaml.ScalarNode) -> float:
+        construct = self.construct_yaml_int if node.tag.endswith(":int") else self.construct_yaml_float
+        number = construct(node) if len(node.value) <= _MAX_DIGITS else math.nan
+        if not abs(number) <= MAX_NUMBER:
+            raise _BoundsError(f"expected a number within ±{MAX_NUMBER}", node)
+        return number
+
+    def distinct_keys(self, node: yaml.MappingNode) -> dict[str, Any]:
+        keys = [key.value if key.tag == "tag:yaml.org,2002:str" else None for key, _ in node.value]
+        if None in keys or len({*keys}) < len(keys):
+            raise _BoundsError("expected keys that are text and differ", node)
+        return {self.construct_object(key): self.construct_object(value, deep=True) for key, value in node.value}
+
+
+_TAG = "tag:yaml.org,2002:"
+_Loader.add_implicit_resolver(
+    f"{_TAG}float", re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+_Loader.yaml_constructors = {
+    f"{_TAG}null": _Loader.construct_yaml_null,
+    f"{_TAG}bool": _Loader.construct_yaml_bool,
+    f"{_TAG}int": _Loader.construct_number,
+    f"{_TAG}float": _Loader.construct_number,
+    f"{_TAG}str": _Loader.construct_text,
+    f"{_TAG}timestamp": _Loader.construct_text,  # a folder may be called 2020-01-01
+    f"{_TAG}seq": lambda loader, node: loader.construct_sequence(node, deep=True),
+    f"{_TAG}map": _Loader.distinct_keys,
+    None: _Loader.construct_undefined,
+}
+
+
+# The keys of a configuration: which are internal, which have a former name, and which one was meant.
+#
+# A field that is marked `Internal[...]`, alone or with all that is nested in it, is a constant of its stage: code may
+# set it, a file should not, and no page lists it. For one release a file may still hold it; that is told once.
+#
+# A Struct at the top of a room's configuration may have `former_keys`, the room's table of names that its keys had in
+# the release before: "section.former" or, of one kind of plug-in alone, "section[kind].former" to the present name.
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+_NO_NAMES: Mapping[str, str] = {}
+
+
+class _InternalMark:
+    """Marks the type of a field that no file should set."""
+
+
+INTERNAL = _InternalMark()
+Internal = Annotated[T, INTERNAL]
+
+
+def list_field_types(schema: Any) -> dict[str, Any]:
+    """Returns the annotations of the fields of a Struct or dataclass by name, marks and limits included."""
+    return typing.get_type_hints(schema, include_extras=True)
+
+
+def is_internal(annotation: Any) -> bool:
+    """Returns whether a field of this type is one that no file should set."""
+    return typing.get_origin(annotation) is Annotated and INTERNAL in annotation.__metadata__
+
+
+def list_documented_keys(schema: Any) -> list[str]:
+    """Returns the names of the fields that files may set."""
+    return [name for name, annotation in list_field_types(schema).items() if not is_internal(annotation)]
+
+
+def find_nearest_key(key: str, keys: Iterable[str]) -> str | None:
+    """Returns the key that was probably meant by one that does not exist, or None."""
+    return next(iter(difflib.get_close_matches(key, [*keys], n=1)), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyPlace:
+    """The place of a Struct: its path in the file, for people, and in the room's table of former names."""
+
+    where: str = ""
+    section: str = ""
+    kind: str = ""  # of the plug-in that the Struct configures
+    former: Mapping[str, str] = dataclasses.field(default_factory=lambda: _NO_NAMES)
+    internal: bool = False  # something above is internal, which has been told
+
+    def enter(self, schema: Any) -> KeyPlace:
+        """Returns the place of a Struct in itself: its room's table holds from there on, if it has one."""
+        former = getattr(schema, "former_keys", None)
+        return self if former is None else dataclasses.replace(self, section="", kind="", former=former)
+
+    def descend(self, key: str, internal: bool) -> KeyPlace:
+        """Returns the place of what stands under `key`."""
+        return KeyPlace(
+            join_keys(self.where, key),
+            join_keys(self.section, key),
+            "",
+            self.former,
+            self.internal or internal,
+        )
+
+    def find_present_name(self, key: str) -> str | None:
+        """Returns the present name of a former key, or None where it never was one."""
+        of_kind = self.former.get(f"{self.section}[{self.kind}].{key}") if self.kind else None
+        return of_kind or self.former.get(join_keys(self.section, key))
+
+
+def replace_former_name(key: str, place: KeyPlace, schema: Any) -> str:
+    """Returns the present name of a key that somebody wrote; a former or an internal one is told once a process."""
+    types = list_field_types(schema)
+    present = key if key in types else place.find_present_name(key)
+    if present is None or present not in types:
+        return key  # an unknown key, which is refused where the whole is read
+    if present != key:
+        _tell_of_key(
+            f"{join_keys(place.where, key)} is called {present} now; write {join_keys(place.where, present)}: "
+            "the former name is read in this release only"
+        )
+    if is_internal(types[present]) and not place.internal:
+        _tell_of_key(
+            f"{join_keys(place.where, present)} is internal: it will be a constant in the next release; leave it out"
+        )
+    return present
+
+
+def has_fields(schema: Any) -> bool:
+    """Returns whether it is a Struct or a dataclass."""
+    return isinstance(schema, type) and (issubclass(schema, msgspec.Struct) or dataclasses.is_dataclass(schema))
+
+
+def join_keys(where: str, key: str) -> str:
+    """Returns the path of `key` under `where`, either of which may be empty."""
+    return f"{where}.{key}" if where and key and not key.startswith("[") else where + key
+
+
+def _tell_of_key(text: str) -> None:
+    """On the log once a process; a program's filters tell how often it hears a Python warning."""
+    if gives_warnings():
+        notify(log, text, DeprecationWarning)
+    else:
+        _warn_once(text)
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    log.warning(text)
+
+
+# A configuration: what a file and the changes to it say, as a Struct.
 
 OF_VERBS = {  # keys by which a file is known that was given to another verb
     "camera": "splatnode capture",

@@ -19,8 +19,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TextIO
 
-from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import sanitize_text
 
 log = logging.getLogger(__name__)

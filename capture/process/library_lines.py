@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from splatnode.capture.process.files import StrayFile, check_owner_only, create_own, make_owner_only_folder, read_own
-from splatnode.capture.process.logs import event, is_logged
+from splatnode.capture.process.terminal import event, is_logged
 from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
 
 log = logging.getLogger(__name__)

@@ -1,11 +1,13 @@
-"""systemd's notification protocol (sd_notify(3)): ready, alive, stopping. Without systemd nothing happens."""
+"""The system that a process runs on: the service manager, shortages, signals, limits, and strangers who wait."""
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import ctypes
 import errno
 import functools
+import ipaddress
 import logging
 import math
 import os
@@ -15,10 +17,12 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import TypeVar
 
 from splatnode.capture.process.text import sanitize_text
+
+# systemd's notification protocol (sd_notify(3)): ready, alive, stopping. Without systemd nothing happens.
 
 WATCHDOG_SHARE = 0.25  # of the watchdog's time between two signs of life; sd_watchdog_enabled(3) asks for half at most
 
@@ -326,3 +330,26 @@ def handle_first_signal(numbers: tuple[signal.Signals, ...], stop: Callable[[], 
 
     for number in numbers:
         signal.signal(number, handle)
+
+
+# Strangers who wait for a place: whose turn it is to go, so that one machine's crowd takes nothing from another's.
+
+_NETWORK_BITS = 64  # of an IPv6 address: one network has all that follow
+
+Place = TypeVar("Place")
+
+
+def network_of(host: str) -> str:
+    """The machine, or the IPv6 network, that a numeric address belongs to. Raises ValueError."""
+    address = ipaddress.ip_address(host.partition("%")[0])
+    if address.version == 4:
+        return str(address)
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(ipaddress.ip_network((int(address), _NETWORK_BITS), strict=False))
+
+
+def next_to_go(networks: Mapping[Place, str]) -> Place:
+    """The oldest place, which comes first, of the network that has the most. Raises ValueError where there is none."""
+    crowd = max(collections.Counter(networks.values()).items(), key=lambda each: each[1])[0]
+    return next(place for place, network in networks.items() if network == crowd)

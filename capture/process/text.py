@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 LONGEST_NAME = 255  # characters, as of a file
 LONGEST_TEXT = 1000  # characters of a message
+MAX_NUMBER = 2**31  # either side of 0: of a configuration or an argument
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")  # the last: as wide as a word
 LONGEST_LINE = 4000  # characters of one of several lines: a reason that names files and what was expected
 

@@ -26,10 +26,10 @@ from splatnode.capture import film
 from splatnode.capture import recording as capture_recording
 from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.process.arguments import replace_former_words
+from splatnode.capture.process.config import record_in, record_of
 from splatnode.capture.process.files import open_itself, read_bounded
-from splatnode.capture.process.logs import event
-from splatnode.capture.process.records import record_in, record_of
 from splatnode.capture.process.system import SHORT_OF_MEMORY, outlast, raise_shortage
+from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.extras import lerobot
 from splatnode.extras.cameras import mcap

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from splatnode.capture.diorama.scene import Camera, Matrix, Solid, colour_pixels, look_at, trace
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.extras.building import (
     CHAIR_ROOM,
     CORRIDOR,

@@ -20,7 +20,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
 from splatnode.capture.lens_file import same_aspect
 from splatnode.capture.pace import Pace, pace_frames
-from splatnode.capture.process.logs import event
+from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_name, sanitize_text
 from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.extras.logged import transforms

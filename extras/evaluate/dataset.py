@@ -32,8 +32,8 @@ from splatnode.capture.image_file import (
 )
 from splatnode.capture.masks import mask_frames, open_masks
 from splatnode.capture.pose_files import binary_images, content_lines, text_images
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import LONGEST_TEXT, guard_untrusted, sanitize_text
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.cameras import Number, Row3, Row4, encode_cameras

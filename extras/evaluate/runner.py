@@ -24,8 +24,8 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import Frame
+from splatnode.capture.process.config import record_of
 from splatnode.capture.process.files import open_itself, temporary_folder
-from splatnode.capture.process.records import record_of
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
 from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.dataset import (

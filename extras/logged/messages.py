@@ -19,7 +19,7 @@ import numpy.typing as npt
 from splatnode.capture.depth_image import MOST_PIXELS
 from splatnode.capture.frame import LARGEST_NS, Clock, Intrinsics, Stamp
 from splatnode.capture.image_file import UnusableImage, decode_image, decode_values
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.extras.logged.mcap import Message, Topic, UnusableLog, messages
 

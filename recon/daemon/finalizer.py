@@ -13,8 +13,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.terminal import event
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import submap, submap_index

@@ -11,8 +11,8 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.terminal import event
 from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.occupancy.grid import OccupancyMap, occupancy_map

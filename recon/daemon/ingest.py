@@ -23,8 +23,8 @@ from splatnode.capture.frame import Frame, Stamp
 from splatnode.capture.messaging.keyframe_queue import READY_EVERY_S, KeyframeClient
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network, NotAllowed, find_captures
-from splatnode.capture.process.logs import Problems, is_logged
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.process.terminal import Problems, is_logged
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint.records import StoredFrame

@@ -41,7 +41,6 @@ from splatnode.capture.messaging.pubsub import (
 from splatnode.capture.messaging.wire import Name, Numbering
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.files import shortage, state_directory
-from splatnode.capture.process.logs import Problems, event, is_logged, use_structured_lines
 from splatnode.capture.process.system import (
     ServiceManager,
     handle_first_signal,
@@ -52,9 +51,16 @@ from splatnode.capture.process.system import (
     resident_mb,
     wrap_late_errors,
 )
-from splatnode.capture.process.terminal import say, show_progress
+from splatnode.capture.process.terminal import (
+    Problems,
+    Unfailing,
+    event,
+    is_logged,
+    say,
+    show_progress,
+    use_structured_lines,
+)
 from splatnode.capture.process.text import sanitize_text
-from splatnode.capture.process.unfailing import Unfailing
 from splatnode.recon.config import apply_changes
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig

@@ -25,8 +25,8 @@ from splatnode.capture.lenses import undistort_image
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.messaging.wire import Message
-from splatnode.capture.process.config_keys import Internal
-from splatnode.capture.process.logs import Problems, event, is_logged
+from splatnode.capture.process.config import Internal
+from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe
 from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera

@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 
-from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import is_shortage
+from splatnode.capture.process.terminal import event
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import raise_shortage, resident_mb
 from splatnode.capture.process.text import guard_untrusted
 from splatnode.recon.daemon.atlas.pose_graph import (

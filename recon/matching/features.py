@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.core import library, pointer
 from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Features
 

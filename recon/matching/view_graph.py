@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.clock import is_over

@@ -17,7 +17,7 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import pseudo_views
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians

@@ -13,7 +13,7 @@ from msgspec import Meta
 from torch import Tensor
 from torch.nn import functional
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.core import library
 from splatnode.recon.networks.lpips import MIN_SIDE
 from splatnode.recon.optimize.losses.loss import Schedule

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.networks.depth_anything import load_relative
 from splatnode.recon.optimize.losses.loss import Evaluate, Loss, LossChoice, Schedule
 from splatnode.recon.optimize.pseudo_views import PseudoView, pseudo_views

@@ -20,7 +20,7 @@ import numpy.typing as npt
 import torch
 from msgspec import Meta
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize import ensemble as optimize_ensemble
 from splatnode.recon.optimize import photometric_losses, regularizers
 from splatnode.recon.optimize.control import prune

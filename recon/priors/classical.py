@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph
 from splatnode.recon.priors import stereo

@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.matching.view_graph import ViewGraph

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.networks.weights import WeightsError, find
 from splatnode.recon.priors import classical

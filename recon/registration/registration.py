@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.capture.rig import TOLERANCE_S, Rig
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays

@@ -23,9 +23,9 @@ from splatnode.capture.image_file import (
     find_common_range,
     read_image_file,
 )
-from splatnode.capture.process.notices import notify
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import outlast, raise_shortage
+from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import guard_untrusted, is_printable, sanitize_text
 from splatnode.recon.result.depth_check import StoredDepthCheck
 from splatnode.recon.result.export.cameras import decode_cameras

@@ -16,7 +16,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, is_printable
 from splatnode.recon.result.export.limits import SceneFileError, read_json_file
 from splatnode.recon.result.placement import IDENTITY, Placement

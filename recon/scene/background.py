@@ -14,7 +14,7 @@ import torch
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.geometry import project, quat_from_matrix, transform_to_camera
 from splatnode.recon.priors import pointmap as priors_pointmap
 from splatnode.recon.priors.pointmap import Pointmap

@@ -17,7 +17,7 @@ import torch
 from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.core import library
 from splatnode.recon.frames import screening
 from splatnode.recon.geometry import quat_from_matrix

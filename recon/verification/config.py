@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 
 
 class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -14,7 +14,7 @@ from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.depth_files import find_depth_files
 from splatnode.capture.depth_image import DepthImage
 from splatnode.capture.frame import Frame
-from splatnode.capture.process.notices import notify
+from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.replay_source import Source, attach_depths
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from splatnode.capture.process.notices import give_warnings
+from splatnode.capture.process.terminal import give_warnings
 from splatnode.capture.process.text import sanitize_lines
 
 

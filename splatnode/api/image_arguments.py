@@ -30,7 +30,7 @@ from splatnode.capture.odometry import (
     make_given_pose,
     rigid_problem,
 )
-from splatnode.capture.process.notices import notify
+from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import LONGEST_NAME, is_printable
 
 log = logging.getLogger(__name__)

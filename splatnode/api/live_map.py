@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from splatnode.capture.messaging.network import RECON_MAP, Network
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.messaging.wire import WireError
-from splatnode.capture.process.logs import Problems, is_logged
+from splatnode.capture.process.terminal import Problems, is_logged
 from splatnode.recon.occupancy.grid import OccupancyMap
 from splatnode.recon.occupancy.message import MapHeader, decode_map
 

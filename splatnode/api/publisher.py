@@ -48,8 +48,8 @@ from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.config import merge_config, parse_config, read_yaml
 from splatnode.capture.process.files import LockHeld
+from splatnode.capture.process.terminal import Unfailing
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
-from splatnode.capture.process.unfailing import Unfailing
 from splatnode.capture.reader import ReaderState
 
 SERVE_S = 0.05  # between looks at what recon asks for

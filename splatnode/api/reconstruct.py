@@ -34,8 +34,7 @@ from splatnode.capture.frame import Baseline as Apart
 from splatnode.capture.frame import DroppedFrame, Frame, Stamp
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.notices import notify
-from splatnode.capture.process.terminal import Tell, ignore_progress
+from splatnode.capture.process.terminal import Tell, ignore_progress, notify
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence

@@ -13,8 +13,8 @@ import pytest
 
 import splatnode
 from splatnode.api.entrance import sanitize_error
-from splatnode.capture.process import config_keys
-from splatnode.capture.process.notices import InputWarning, give_warnings, gives_warnings, notify
+from splatnode.capture.process import config
+from splatnode.capture.process.terminal import InputWarning, give_warnings, gives_warnings, notify
 from tests.api.test_publisher import changes, picture, publisher
 from tests.capture.test_depth_files import make_scannet
 from tests.conftest import ROOT
@@ -80,12 +80,12 @@ def test_python_shows_a_program_its_former_names():
 
 
 def test_a_key_is_told_to_a_program_though_the_log_had_it_before(caplog):
-    config_keys._warn_once.cache_clear()
-    config_keys._tell_of_key("a is called b now")
-    config_keys._tell_of_key("a is called b now")
+    config._warn_once.cache_clear()
+    config._tell_of_key("a is called b now")
+    config._tell_of_key("a is called b now")
     assert [record.message for record in caplog.records] == ["a is called b now"]
     with give_warnings(), pytest.warns(DeprecationWarning, match="a is called b now"):
-        config_keys._tell_of_key("a is called b now")
+        config._tell_of_key("a is called b now")
 
 
 HOSTILE = "x\x1b[31m\u202e"

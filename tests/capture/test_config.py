@@ -8,8 +8,7 @@ import pytest
 
 from splatnode import command_line
 from splatnode.capture.config import CaptureConfig
-from splatnode.capture.process.config import load_config, parse_config, read_yaml
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, load_config, parse_config, read_yaml
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.config import DaemonConfig as Daemon
 from tests.conftest import ROOT

@@ -13,8 +13,7 @@ from splatnode.capture.config import CaptureConfig, camera_opener, mount_camera
 from splatnode.capture.frame import DroppedFrame, Frame, make_frame
 from splatnode.capture.messaging.messages import FrameHeader, arrays_of, describe_stored_frame, frame_in
 from splatnode.capture.odometry import make_rigid
-from splatnode.capture.process.config import parse_config
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, parse_config
 from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import UnusableRig, read_rig
 

@@ -14,8 +14,7 @@ from splatnode.capture.config import CaptureConfig
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import parse_config
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, parse_config
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError
 from splatnode.capture.process.text import LONGEST_LINE, sanitize_lines
 from splatnode.command_line import exit_code, explain
 

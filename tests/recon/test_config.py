@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 

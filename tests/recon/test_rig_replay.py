@@ -17,8 +17,7 @@ from splatnode import command_line
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.multi_camera import select_cameras
-from splatnode.capture.process.notices import InputWarning, give_warnings
-from splatnode.capture.process.terminal import ignore_progress
+from splatnode.capture.process.terminal import InputWarning, give_warnings, ignore_progress
 from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import format_rig, read_rig
 from splatnode.recon.clock import Clock

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from splatnode.capture.process.config import Plugin
-from splatnode.capture.process.config_keys import has_fields, is_internal, list_field_types
+from splatnode.capture.process.config import Plugin, has_fields, is_internal, list_field_types
 from tests.reference.comments import field_comments, summary
 
 REQUIRED = object()  # in place of a default where there is none

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.config import CaptureConfig
-from splatnode.capture.process.config import Plugin
-from splatnode.capture.process.config_keys import has_fields
+from splatnode.capture.process.config import Plugin, has_fields
 from splatnode.recon.config import PRESETS
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.config import DaemonConfig as Daemon

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.logs import Problems
+from splatnode.capture.process.terminal import Problems
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import ingest
 from splatnode.recon.daemon.checkpoint.store import Store

@@ -53,10 +53,8 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     assert loaded.split() == [
         "splatnode.capture.former_names",
         "splatnode.capture.process.arguments",
-        "splatnode.capture.process.config_text",
         "splatnode.capture.process.files",
         "splatnode.capture.process.library_lines",
-        "splatnode.capture.process.logs",
         "splatnode.capture.process.plugins",
         "splatnode.capture.process.python",
         "splatnode.capture.process.start",

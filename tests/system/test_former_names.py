@@ -12,10 +12,9 @@ import pytest
 from splatnode import command_line
 from splatnode.capture import former_names as capture_names
 from splatnode.capture.config import Camera, CaptureConfig
-from splatnode.capture.process import config_keys
+from splatnode.capture.process import config as config_keys
 from splatnode.capture.process.arguments import replace_former_words
-from splatnode.capture.process.config import build_config, parse_config
-from splatnode.capture.process.config_keys import list_field_types
+from splatnode.capture.process.config import build_config, list_field_types, parse_config
 from splatnode.recon import former_names as recon_names
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.config import DaemonConfig

@@ -23,7 +23,7 @@ HARMLESS = {
         "capture/messaging/spool.py:_remove_acknowledged",
         "capture/messaging/pubsub.py:_reply",
         "capture/process/system.py:_notify",
-        "capture/process/unfailing.py:do",
+        "capture/process/terminal.py:do",
         "recon/daemon/checkpoint/checkpoint.py:_prepare_keyframes",
         "recon/daemon/checkpoint/records.py:ensure_identity",
         "recon/daemon/checkpoint/store.py:_remove",

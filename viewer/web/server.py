@@ -34,8 +34,8 @@ from urllib.parse import parse_qs
 import cv2
 import numpy as np
 
-from splatnode.capture.process.crowd import network_of, next_to_go
 from splatnode.capture.process.files import NotOwnerOnly, read_own, write_atomically
+from splatnode.capture.process.system import network_of, next_to_go
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.result.export.formats.splat import encode_splat
 from splatnode.recon.result.snapshot import CameraEstimate

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import lsq_linear, minimize
 
-from splatnode.capture.process.records import record_of
+from splatnode.capture.process.config import record_of
 from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError, has_only_right_cameras, make_finite_bounds
 from splatnode.extras.evaluate.stability.window_campaign import KINDS, compute_share_within
 from splatnode.extras.evaluate.stability.windows import OURS, WindowRow

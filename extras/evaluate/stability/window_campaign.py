@@ -28,7 +28,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator, PercentFormatter
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.process.records import record_of
+from splatnode.capture.process.config import record_of
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import read_json
 from splatnode.extras.evaluate.methods import make_verdict

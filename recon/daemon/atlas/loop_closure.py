@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.messaging.wire import Message
-from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.terminal import event
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.pose_graph import EdgeKind, PoseGraphEdge, make_loop_edge

@@ -35,6 +35,7 @@ import torch
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
+from splatnode.capture.process.config import record_of
 from splatnode.capture.process.files import (
     LockHeld,
     exclusive,
@@ -42,7 +43,6 @@ from splatnode.capture.process.files import (
     make_owner_only_folder,
     remove_leftovers,
 )
-from splatnode.capture.process.records import record_of
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.rig import form_frame_sets

@@ -14,7 +14,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.scene.scene import Gaussians, concatenate

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians

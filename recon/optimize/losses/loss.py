@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import msgspec
 from torch import Tensor
 
-from splatnode.capture.process.config import Plugin
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal, Plugin
 from splatnode.recon.rasterize.reference import Render
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatnode.capture.process.config_keys import Internal
+from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.losses.loss import Loss, Schedule
 from splatnode.recon.optimize.losses.perceptual import load_perceptual
 from splatnode.recon.optimize.regularizers import Supervision

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.frame import LARGEST_NS, Clock, Intrinsics, Stamp
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
 from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES, SceneFileError
 from splatnode.recon.result.export.staged import json_bytes

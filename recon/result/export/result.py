@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import msgspec
 
-from splatnode.capture.process.records import record_in
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import guard_untrusted, is_printable
 from splatnode.recon.result.export.cameras import encode_cameras

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import msgspec
 
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import make_folder, sync_folder
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import raise_shortage
 
 _MARK = "[0-9a-f]{12}"

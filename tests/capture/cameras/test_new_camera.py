@@ -7,8 +7,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.config import CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import Frame
-from splatnode.capture.process.config import load_config
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, load_config
 from tests.support.fake_camera import fake_camera
 
 CAMERA = '''

@@ -5,8 +5,7 @@ import pytest
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.process.config import load_config, merge_config, parse_changes
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, load_config, merge_config, parse_changes
 
 FOLDER = "camera: {kind: folder, folder: photos}"
 SYNTHETIC = "camera: {kind: synthetic}"

@@ -7,10 +7,8 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from splatnode.capture.process import config_keys
-from splatnode.capture.process.config import parse_config, parse_layers
-from splatnode.capture.process.config_keys import Internal
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process import config
+from splatnode.capture.process.config import ConfigError, Internal, parse_config, parse_layers
 
 
 class Depth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,7 +36,7 @@ class House(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @pytest.fixture(autouse=True)
 def _tell_anew():
-    config_keys._warn_once.cache_clear()
+    config._warn_once.cache_clear()
 
 
 def test_a_former_name_is_read_and_told_once(caplog):

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.process.arguments import counts, megabytes, natural, percent, positive, seconds, size
-from splatnode.capture.process.config import load_config
-from splatnode.capture.process.config_text import MAX_NUMBER, ConfigError, parse_yaml
+from splatnode.capture.process.config import ConfigError, load_config, parse_yaml
+from splatnode.capture.process.text import MAX_NUMBER
 from tests.support.crafted import Crafted
 from tests.support.crafted.bounded import MARGIN, readings
 

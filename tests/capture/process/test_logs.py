@@ -12,8 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.process.logs import PlainLines, StructuredLines, TimedLines, event, use_structured_lines
-from splatnode.capture.process.terminal import sanitize_output
+from splatnode.capture.process.terminal import (
+    PlainLines,
+    StructuredLines,
+    TimedLines,
+    event,
+    sanitize_output,
+    use_structured_lines,
+)
 from tests.capture.process.test_terminal import Terminal
 from tests.support.hostile import TEXTS, unprintable
 

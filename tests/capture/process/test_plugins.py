@@ -14,8 +14,7 @@ import pytest
 
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.process import plugins
-from splatnode.capture.process.config import load_config
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, load_config
 from tests.conftest import ROOT
 
 ALIEN = '''

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatnode.capture.process.logs import Problems, is_logged
+from splatnode.capture.process.terminal import Problems, is_logged
 
 
 def test_problems_are_told_until_seen_and_then_only_what_is_new():

@@ -9,13 +9,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from splatnode.capture.process.records import decoder_of, record_in, record_of
+from splatnode.capture.process.config import decoder_of, record_in, record_of
 from tests.conftest import ROOT
 
 MEETING = """
 import sys, threading
 import msgspec
-from splatnode.capture.process.records import record_of
+from splatnode.capture.process.config import record_of
 
 sys.setswitchinterval(1e-6)
 

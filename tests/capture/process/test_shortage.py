@@ -25,7 +25,7 @@ from splatnode.capture.messaging.network import AllowList, Network, allow, creat
 from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process import apart, system
 from splatnode.capture.process.system import is_shortage, may_be_shortage, outlast
-from splatnode.capture.process.unfailing import Unfailing
+from splatnode.capture.process.terminal import Unfailing
 from splatnode.capture.reader import ReaderState
 from splatnode.recon.daemon.checkpoint.records import read_ledger
 from splatnode.recon.daemon.checkpoint.store import Store

@@ -20,7 +20,7 @@ from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, Publisher, ask
 from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig
 from splatnode.capture.messaging.wire import Numbering, encode
-from splatnode.capture.process.logs import Problems
+from splatnode.capture.process.terminal import Problems
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import ingest, relocalization

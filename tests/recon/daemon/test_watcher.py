@@ -16,7 +16,7 @@ from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 from splatnode.capture.messaging.pubsub import Publisher, Subscriber
 from splatnode.capture.messaging.wire import Numbering
-from splatnode.capture.process.logs import Problems
+from splatnode.capture.process.terminal import Problems
 from splatnode.recon.daemon import relocalization
 from splatnode.recon.daemon.relocalization import FinalScene, Watcher
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking

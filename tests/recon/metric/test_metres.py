@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import ReconstructionConfig as ReconConfig
 from splatnode.recon.config import apply_changes
 from splatnode.recon.metric.evidence import Evidence

@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.process.config import parse_config
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, parse_config
 from splatnode.recon.config import PriorChoice, ReconstructionConfig, apply_changes, preset
 from splatnode.recon.registration import registration as registration_registration
 from tests.support.synthetic import SMALL, photographs, view_graph

@@ -25,8 +25,7 @@ from splatnode.capture.messaging.network import REQUEST_LIMITS
 from splatnode.capture.messaging.pubsub import Answer, Want
 from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, read_message
 from splatnode.capture.messaging.wire import Limits, WireError, decode
-from splatnode.capture.process.config import load_config
-from splatnode.capture.process.config_text import ConfigError
+from splatnode.capture.process.config import ConfigError, load_config
 from splatnode.capture.status import CaptureStatus, Heartbeat
 from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
 from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger

@@ -22,8 +22,8 @@ from splatnode.capture import film
 from splatnode.capture.daemon import LastRun
 from splatnode.capture.image_header import name_time
 from splatnode.capture.messaging.spool import Quarantine, QuarantineConfig
+from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import NotOwnerOnly
-from splatnode.capture.process.records import record_in
 from splatnode.capture.process.text import is_printable, sanitize_name
 from splatnode.command_line import build_parser
 from splatnode.extras.batch import batch
