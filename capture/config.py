@@ -14,16 +14,25 @@ import numpy.typing as npt
 
 from splatnode.capture import former_names, keyframe_selection, reader
 from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image
+from splatnode.capture.keyframe_selection import Limits
 from splatnode.capture.masks import mask_frames, open_single_mask
-from splatnode.capture.messaging import spool
-from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
+from splatnode.capture.messaging import keyframe_queue
+from splatnode.capture.messaging.messages import (
+    Header,
+    Message,
+    Name,
+    Numbering,
+    Sequential,
+    Text,
+    WireError,
+    decode_jpeg,
+    make_jpeg_array,
+)
 from splatnode.capture.messaging.network import CaptureId, Network
-from splatnode.capture.messaging.wire import Header, Message, Name, Numbering, Sequential, Text, WireError
 from splatnode.capture.odometry import rigid_problem
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
-from splatnode.capture.quality import Limits
 
 # Previews: small JPEG images of what the camera sees now. Some may be lost on the way.
 
@@ -116,7 +125,7 @@ class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     quality: Limits = Limits()
     selection: keyframe_selection.Config = keyframe_selection.Config()
     preview: Config = Config()
-    spool: spool.SpoolConfig = spool.SpoolConfig()
+    spool: keyframe_queue.SpoolConfig = keyframe_queue.SpoolConfig()
     network: Network = Network()
     camera_id: CaptureId = ""
     T_base_camera: Mount | None = None
@@ -135,7 +144,7 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     selection: keyframe_selection.Config = keyframe_selection.Config()
     reader: reader.Config = reader.Config()
     preview: Config = Config()
-    spool: spool.SpoolConfig = spool.SpoolConfig()
+    spool: keyframe_queue.SpoolConfig = keyframe_queue.SpoolConfig()
     network: Network = Network()  # how the processes reach each other
     # An image of the camera's size: black is never used, as where the camera sees the robot itself; white is used
     body_mask: Path | None = None

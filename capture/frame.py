@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import cv2
 import msgspec
@@ -15,11 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from splatnode.capture.odometry import GivenPose, Gravity, Motion, rigid_problem
+from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers, rigid_problem
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 
 if TYPE_CHECKING:
     from splatnode.capture.depth_image import DepthImage
+
 
 # What a stereo camera's right half saw at the moment of a frame: the source of metres that a robot carries with it.
 
@@ -401,3 +402,78 @@ class CameraUnavailable(RuntimeError):
     """No camera, or no longer: what was expected, what was found, what to do."""
 
     exit_code = 69
+
+
+# FrameMeta: the one schema of what a frame is beside its arrays.
+
+_Name = Annotated[str, msgspec.Meta(min_length=1, max_length=LONGEST_NAME)]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NUMBER)]
+
+
+class FrameMeta(msgspec.Struct, frozen=True, kw_only=True):
+    """Describes a frame beside its arrays, in messages, checkpoints and recordings alike.
+
+    A field with a default is left out where there is nothing to tell: a reader that does not know it takes every
+    frame without it.
+    """
+
+    name: _Name
+    stamp_ns: _Count
+    intrinsics: Intrinsics | None
+    captured_at: Stamp | None = None
+    given_pose: GivenPose | UnsetType = UNSET
+    motion: Motion | UnsetType = UNSET
+    gravity: Gravity | UnsetType = UNSET
+    exposure: ExposureSettings | UnsetType = UNSET
+    camera: _Name | UnsetType = UNSET
+    camera_id: _Name | UnsetType = UNSET
+    T_base_camera: MountNumbers | UnsetType = UNSET
+
+
+def describe_frame(frame: Frame) -> dict[str, Any]:
+    """Returns the fields of FrameMeta by name."""
+    return {
+        "name": frame.name,
+        "stamp_ns": frame.stamp_ns,
+        "intrinsics": frame.intrinsics,
+        "captured_at": frame.captured_at,
+        "given_pose": make_optional_field(frame.given_pose),
+        "motion": make_optional_field(frame.motion),
+        "gravity": make_optional_field(frame.gravity),
+        "exposure": make_optional_field(frame.exposure),
+        "camera": frame.camera or UNSET,
+        "camera_id": frame.camera_id or UNSET,
+        "T_base_camera": make_optional_field(frame.T_base_camera),
+    }
+
+
+def read_frame_fields(meta: FrameMeta) -> dict[str, Any]:
+    """Returns what `Frame` takes of `meta` by name, apart from `name` and `stamp_ns`."""
+    return {
+        "intrinsics": meta.intrinsics,
+        "captured_at": meta.captured_at,
+        "given_pose": read_optional_field(meta.given_pose),
+        "motion": read_optional_field(meta.motion),
+        "gravity": read_optional_field(meta.gravity),
+        "exposure": read_optional_field(meta.exposure),
+        "camera": read_optional_field(meta.camera) or "",
+        "camera_id": read_optional_field(meta.camera_id) or "",
+        "T_base_camera": read_optional_field(meta.T_base_camera),
+    }
+
+
+# A recording at the pace at which it was taken.
+
+FramesPerSecond = Annotated[float, msgspec.Meta(ge=0.001, le=1000)]
+Pace = Literal["recorded", "fastest"]  # by the stamps, or as fast as the consumer reads
+
+
+def pace_frames(items: Iterable[Frame | DroppedFrame], pace: Pace) -> Iterator[Frame | DroppedFrame]:
+    """The items, each frame not before its time after the first one's; the stamps stay as they are."""
+    start_s, first_ns = 0.0, None
+    for item in items:
+        if pace == "recorded" and isinstance(item, Frame):
+            if first_ns is None:
+                start_s, first_ns = time.monotonic(), item.stamp_ns
+            time.sleep(max(0.0, start_s + (item.stamp_ns - first_ns) / 1e9 - time.monotonic()))
+        yield item

@@ -8,7 +8,10 @@ before it allocates the memory.
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import math
+import struct
+import subprocess
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +22,98 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import heif_file, image_header
+from splatnode.capture import image_header
 from splatnode.capture.frame import ExposureSettings, Intrinsics, Stamp
-from splatnode.capture.image_header import ImageHeader, UnusableImage, exif_time, read_header
+from splatnode.capture.image_header import MAX_SIDE, ImageHeader, UnusableImage, exif_time, read_header
+from splatnode.capture.pi_heif import HEADER
+from splatnode.capture.process import apart, python
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.library_lines import catch_library_lines
-from splatnode.capture.process.system import outlast
+from splatnode.capture.process.system import outlast, remedy
 from splatnode.capture.process.text import guard_untrusted
+
+# Bytes of a HEIC or AVIF file -> upright RGB image and its EXIF, or the reason why not.
+#
+# Their decoders have had many faults that a crafted file uses. So each file is decoded in a process of its own, which
+# has a limit on its memory and its time, and which may end.
+
+HEIF_SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
+_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"mif1", b"mif2", b"miaf", b"avif"}  # of still images
+_MOST_EXIF = 10_000_000  # bytes
+_MOST_BOXES = 1000  # at the top level of a file
+
+
+class HeifImage(NamedTuple):
+    image: npt.NDArray[np.uint8]  # (H, W, 3) RGB, upright
+    exif: bytes  # a TIFF structure; empty where there is none
+
+
+def is_heif(data: bytes) -> bool:
+    """Whether the bytes begin as a HEIC or AVIF file does (ISO/IEC 23008-12): its first box names one of the brands."""
+    if data[4:8] != b"ftyp":
+        return False
+    first = data[8 : min(int.from_bytes(data[:4], "big"), 1024)]
+    return first[:4] in _BRANDS or any(first[i : i + 4] in _BRANDS for i in range(8, len(first), 4))
+
+
+def advise_heif_installation() -> str | None:
+    """Says what to install before such a file can be decoded; None where nothing is missing."""
+    there = all(importlib.util.find_spec(package) for package in ("pi_heif", "PIL"))
+    return None if there else f"{remedy('pi_heif')}, or convert it to JPEG"
+
+
+def check_whole_heif(data: bytes) -> None:
+    """Raises UnusableImage where the file ends within one of its boxes: somebody may still be writing it."""
+    position = 0
+    for _ in range(_MOST_BOXES):
+        if position == len(data):
+            return
+        try:
+            length, _kind = struct.unpack_from(">I4s", data, position)
+            if length == 1:
+                (length,) = struct.unpack_from(">Q", data, position + 8)
+        except struct.error:
+            break
+        if length == 0:  # up to the end of the file, wherever that is
+            return
+        if length < 8 or position + length > len(data):
+            break
+        position += length
+    raise UnusableImage("truncated: the file ends early")
+
+
+def decode_heif(data: bytes, max_pixels: int) -> HeifImage:
+    """The file's primary image, 8 bits a channel, without alpha. Raises UnusableImage."""
+    if (needed := advise_heif_installation()) is not None:
+        raise UnusableImage(f"HEIC and AVIF need a further package. {needed}")
+    check_whole_heif(data)
+    command = python.command("splatnode.capture.pi_heif", str(max_pixels))
+    with apart.start_process(command, subprocess.PIPE) as child:
+        return _receive_image(child, data, max_pixels)
+
+
+def _receive_image(child: subprocess.Popen[bytes], data: bytes, max_pixels: int) -> HeifImage:
+    assert child.stdin is not None and child.stdout is not None
+    try:
+        child.stdin.write(data)  # it reads all before it writes anything
+        child.stdin.close()
+    except BrokenPipeError:
+        raise UnusableImage("its decoder ended before it had read the file") from None
+    head = child.stdout.read(HEADER.size)
+    if len(head) < HEADER.size:
+        raise UnusableImage(f"damaged, or of an unknown kind: its decoder ended ({child.wait()})")
+    width, height, exif_bytes = HEADER.unpack(head)
+    if not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
+        raise UnusableImage(f"{width} x {height}: each side must have 1 to {MAX_SIDE} pixels; resize or cut it")
+    if width * height > max_pixels:
+        raise UnusableImage(f"{width} x {height}: more than {max_pixels} pixels; make it smaller")
+    if exif_bytes > _MOST_EXIF:
+        raise UnusableImage(f"damaged: its EXIF has {exif_bytes} bytes; at most {_MOST_EXIF} are read")
+    exif, pixels = child.stdout.read(exif_bytes), child.stdout.read(width * height * 3)
+    if len(pixels) < width * height * 3:
+        raise UnusableImage(f"damaged: its decoder ended ({child.wait()}) within the pixels")
+    return HeifImage(np.frombuffer(pixels, np.uint8).reshape(height, width, 3), exif.removeprefix(b"Exif\0\0"))
+
 
 # How a photograph was turned when it was taken, as EXIF tells, undone.
 
@@ -121,7 +209,7 @@ SUFFIXES = {
     ".dib",
     ".webp",
     *image_header.SUFFIXES,
-    *heif_file.SUFFIXES,
+    *HEIF_SUFFIXES,
 }
 _MAX_MEASURED = 30  # files of a set whose values are looked at before the first is decoded
 MAX_PIXELS = 100_000_000  # of an image, unless another limit is given
@@ -155,8 +243,8 @@ def decode_any_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange
 
     What another process sent goes to `decode_image`. Raises UnusableImage.
     """
-    if heif_file.is_heif(data):
-        return _attach_exif(*heif_file.decode(data, max_pixels))
+    if is_heif(data):
+        return _attach_exif(*decode_heif(data, max_pixels))
     if image_header.is_jpeg2000(data):
         return _attach_exif(image_header.decode(data, max_pixels), b"")
     return decode_image(data, max_pixels, used)
@@ -164,8 +252,8 @@ def decode_any_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange
 
 def check_whole(data: bytes) -> None:
     """Raises UnusableImage where an image file is not complete, or is none."""
-    if heif_file.is_heif(data):
-        heif_file.check_whole(data)
+    if is_heif(data):
+        check_whole_heif(data)
     elif image_header.is_jpeg2000(data):
         image_header.check_whole(data)
     else:
@@ -174,7 +262,7 @@ def check_whole(data: bytes) -> None:
 
 def upright_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that an image file is decoded to; None where only decoding it tells. Raises UnusableImage."""
-    if heif_file.is_heif(data) or image_header.is_jpeg2000(data):
+    if is_heif(data) or image_header.is_jpeg2000(data):
         return None
     header = read_header(data)
     turned = (image_header.first(image_header.read_tags(header.exif), ORIENTATION) or 1) in ON_ITS_SIDE

@@ -1,4 +1,4 @@
-"""HEIC and AVIF decoded with the packages pi_heif and Pillow, in a process of its own; heif_file.py is for all others.
+"""HEIC and AVIF decoded with the packages pi_heif and Pillow, in a process of its own; image_file.py is for all others.
 
 Nothing else is imported here: the process shall start soon, for each photograph anew.
 """

@@ -26,11 +26,13 @@ from splatnode.capture.frame import (
     Baseline,
     DroppedFrame,
     Frame,
+    FrameMeta,
     RightImage,
+    describe_frame,
     grey,
     make_frame,
+    read_frame_fields,
 )
-from splatnode.capture.frame_meta import FrameMeta, describe_frame, read_frame_fields
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, decode_values, read_image_file
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded, sync_folder

@@ -22,7 +22,7 @@ from splatnode.capture import film
 from splatnode.capture.cameras import folder as cameras_folder
 from splatnode.capture.cameras.folder import explain_unreadable_file, frame_name, image_paths
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.lens_file import assign_lens
+from splatnode.capture.lenses import assign_lens
 from splatnode.capture.process.system import raise_shortage, remedy
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import sanitize_name, sanitize_text

@@ -7,7 +7,7 @@ import html
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
-from splatnode.capture.lens_file import read_lens
+from splatnode.capture.lenses import read_lens
 from splatnode.capture.process.terminal import say, show_progress
 from splatnode.extras.audit import (
     Audit,

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama import textures
-from splatnode.capture.diorama.scene import (
+from splatnode.capture import textures
+from splatnode.capture.diorama import (
     CREAM,
     INK,
     PALETTES,

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.keyframe_selection import THINNED
-from splatnode.capture.lens_file import Lenses, read_lenses
+from splatnode.capture.lenses import Lenses, read_lenses
 from splatnode.capture.pose_files import Trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress

@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 from splatnode.capture.cameras import v4l2
-from splatnode.capture.messaging import spool
+from splatnode.capture.messaging import keyframe_queue
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.capture.process.system import EXTRAS, REQUIRED
 from splatnode.capture.process.terminal import say, show_progress, show_waiting
@@ -177,9 +177,9 @@ def _network() -> Finding:
 
 def _spool() -> Finding:
     """Room for keyframes that wait."""
-    config = spool.SpoolConfig()
+    config = keyframe_queue.SpoolConfig()
     try:
-        directory = spool.spool_directory(config)
+        directory = keyframe_queue.spool_directory(config)
     except ValueError as error:
         return Finding("spool", "missing", f"capture cannot keep keyframes: {error}")
     there = next(folder for folder in (directory, *directory.parents) if folder.exists())

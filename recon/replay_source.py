@@ -20,20 +20,18 @@ import numpy.typing as npt
 
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
-from splatnode.capture.depth_files import find_depth_files, read_depth_file
-from splatnode.capture.depth_image import DepthImage
+from splatnode.capture.cameras.folder import find_photographs
+from splatnode.capture.depth_image import DepthImage, find_depth_files, read_depth_file
+from splatnode.capture.film import ALL as EVERY_CAMERA
+from splatnode.capture.film import CameraSet, select_cameras
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import UnusableImage, encode_png
-from splatnode.capture.keyframe_selection import THINNED, Choice, Config, choose, group_frame_sets
-from splatnode.capture.lens_file import Lenses, describe_image
+from splatnode.capture.keyframe_selection import THINNED, Choice, Config, Limits, choose, group_frame_sets
+from splatnode.capture.lenses import Lenses, describe_image
 from splatnode.capture.masks import Find, mask_frames, open_masks
-from splatnode.capture.multi_camera import ALL as EVERY_CAMERA
-from splatnode.capture.multi_camera import CameraSet, select_cameras
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_name, sanitize_text
-from splatnode.capture.quality import Limits
-from splatnode.capture.rgbd_folder import find_photographs
 from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 

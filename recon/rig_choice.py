@@ -12,13 +12,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from splatnode.capture.film import CameraSet
 from splatnode.capture.frame import Frame
-from splatnode.capture.lens_file import Lenses, describe_image
-from splatnode.capture.multi_camera import CameraSet
+from splatnode.capture.lenses import Lenses, describe_image
 from splatnode.capture.process.terminal import Tell, notify
 from splatnode.capture.process.text import sanitize_text
-from splatnode.capture.rig import Rig, RigCamera
-from splatnode.capture.rig_file import read_rig
+from splatnode.capture.rig import Rig, RigCamera, read_rig
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.replay_source import Source
 

@@ -10,9 +10,9 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_DEPTH, RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process import python
 from splatnode.recon.result.message import encode_snapshot, make_depth_header
 from splatnode.recon.result.snapshot import Snapshot

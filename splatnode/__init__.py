@@ -8,12 +8,10 @@ from importlib import import_module
 TYPE_CHECKING = False  # to a type checker it is true; `typing` would take time
 
 if TYPE_CHECKING:
-    from splatnode.api.live_map import NodeMap
-    from splatnode.api.node import Node, NodeUpdate, connect
+    from splatnode.api.node import Node, NodeMap, NodeUpdate, connect
     from splatnode.api.publisher import Published, Publisher, RefusedImage
-    from splatnode.api.reconstruct import Marker, Stereo, reconstruct
+    from splatnode.api.reconstruct import Marker, Session, Stereo, Update, reconstruct
     from splatnode.api.result import Camera, Result, View, load
-    from splatnode.api.session import Session, Update
     from splatnode.capture.depth_image import DepthImage, DepthNoise, make_depth_image
     from splatnode.capture.frame import Intrinsics
     from splatnode.capture.process.terminal import InputWarning
@@ -58,7 +56,7 @@ _MODULES = {
     "Located": "splatnode.recon.locating.outcome",
     "Marker": "splatnode.api.reconstruct",
     "Node": "splatnode.api.node",
-    "NodeMap": "splatnode.api.live_map",
+    "NodeMap": "splatnode.api.node",
     "NodeUpdate": "splatnode.api.node",
     "NotLocated": "splatnode.recon.locating.outcome",
     "OccupancyMap": "splatnode.recon.occupancy.grid",
@@ -66,9 +64,9 @@ _MODULES = {
     "Publisher": "splatnode.api.publisher",
     "RefusedImage": "splatnode.api.publisher",
     "Result": "splatnode.api.result",
-    "Session": "splatnode.api.session",
+    "Session": "splatnode.api.reconstruct",
     "Stereo": "splatnode.api.reconstruct",
-    "Update": "splatnode.api.session",
+    "Update": "splatnode.api.reconstruct",
     "Verdict": "splatnode.recon.result.verdict",
     "View": "splatnode.api.result",
     "connect": "splatnode.api.node",

@@ -18,8 +18,7 @@ from splatnode.recon.result.export.prepare import SH_C0, select_gaussians
 from splatnode.recon.result.export.quaternions import matrices_from_quats
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, decode_frame_id
-from splatnode.viewer.state import Colouring, Moment
-from splatnode.viewer.viewpoint import look_at, scene_up, transform_to_camera
+from splatnode.viewer.state import Colouring, Moment, look_at, scene_up, transform_to_camera
 
 # Which cameras see which Gaussian: how well a surface is supported, and from where it was seen best.
 

@@ -42,15 +42,23 @@ from splatnode.recon.result.stored_snapshot import load_images
 from splatnode.recon.result.submap_index import is_map_set
 from splatnode.viewer import text
 from splatnode.viewer.analysis import Analysis, analyse
-from splatnode.viewer.paint import add_caption, blend_image, paint
-from splatnode.viewer.probe import open3d_installed, probe_window
+from splatnode.viewer.probe import open3d_installed, probe_window, splash
 from splatnode.viewer.session import Session
-from splatnode.viewer.shapes import Ground, Shapes, ground, ground_lines, legend, merge_shapes, shapes
+from splatnode.viewer.shapes import (
+    Ground,
+    Shapes,
+    add_caption,
+    blend_image,
+    ground,
+    ground_lines,
+    legend,
+    merge_shapes,
+    paint,
+    shapes,
+)
 from splatnode.viewer.sources import BUDGET, FixedSource, LiveSource, Maps, MapSource, Source, load_result, map_moment
-from splatnode.viewer.splash import splash
-from splatnode.viewer.state import Moment, ViewerState
+from splatnode.viewer.state import Moment, ViewerState, Viewpoint, look_at, move_to_camera, overview
 from splatnode.viewer.verbs import find_chosen, load_viewers
-from splatnode.viewer.viewpoint import Viewpoint, look_at, move_to_camera, overview
 from splatnode.viewer.web import server as web
 
 # A tour that swings around the scene, inside the arc from which it was photographed and above the ground.

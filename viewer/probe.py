@@ -1,19 +1,22 @@
-"""Whether a window can be opened here, found out in a child process, which opens a small one and says so.
-
-Open3D ends the whole process, without an exception, where it finds no Vulkan driver, and opens a window that nobody can
-see where it finds no display. So a child tries first, and what becomes of it is the answer.
-"""
+"""Processes beside a window: one finds out whether it can be opened here, one says meanwhile that it opens."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import re
 import subprocess
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.process import python
+
+# Whether a window can be opened here, found out in a child process, which opens a small one and says so.
+#
+# Open3D ends the whole process, without an exception, where it finds no Vulkan driver, and opens a window that nobody
+# can see where it finds no display. So a child tries first, and what becomes of it is the answer.
 
 TIMEOUT_S = 60.0
 _SOFTWARE = ("llvmpipe", "lavapipe", "swiftshader", "software")
@@ -88,5 +91,56 @@ def open_trial_window() -> None:
     os._exit(0)
 
 
+# The splash: a small window that is there at once, while the large one is being opened.
+#
+# It is a process of its own and needs nothing but Python's tkinter. Where that is missing there is no splash.
+
+SAYS = "splatnode is opening its window ..."
+_SIZE = 420, 120  # pixels
+_LOOKS_EVERY_MS = 200  # whether the viewer is still there
+
+
+@contextlib.contextmanager
+def splash() -> Iterator[Callable[[], None]]:
+    """Shows the splash until what it yields is called, or until the end."""
+    command = python.command("splatnode.viewer.probe", "splash")
+    child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def close() -> None:
+        child.terminate()
+        child.wait()
+
+    try:
+        yield close
+    finally:
+        close()
+
+
+def show_splash() -> None:
+    """Shows the splash until it is told to end, or until the process that asked for it has ended."""
+    import tkinter
+    from tkinter import ttk
+
+    parent = os.getppid()
+    root = tkinter.Tk(className="splatnode-splash")
+    root.title(SAYS)
+    root.configure(background="#181a1e")
+    left, top = (root.winfo_screenwidth() - _SIZE[0]) // 2, (root.winfo_screenheight() - _SIZE[1]) // 2
+    root.geometry(f"{_SIZE[0]}x{_SIZE[1]}+{left}+{top}")
+    tkinter.Label(root, text=SAYS, foreground="#e6e6e6", background="#181a1e").pack(expand=True)
+    bar = ttk.Progressbar(root, mode="indeterminate", length=_SIZE[0] - 80)
+    bar.pack(pady=(0, 30))
+    bar.start()
+
+    def look() -> None:
+        if os.getppid() != parent:
+            root.destroy()
+        else:
+            root.after(_LOOKS_EVERY_MS, look)
+
+    look()
+    root.mainloop()
+
+
 if __name__ == "__main__":
-    open_trial_window()
+    show_splash() if sys.argv[1:] == ["splash"] else open_trial_window()

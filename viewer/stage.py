@@ -19,11 +19,9 @@ from open3d.visualization import gui, rendering  # pyright: ignore[reportMissing
 
 from splatnode.recon.result.export.prepare import compute_base_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.viewer.paint import choose_first_divisor, choose_next_divisor
 from splatnode.viewer.session import Session
-from splatnode.viewer.shapes import ImageQuad, Label, Lines, Shapes
-from splatnode.viewer.state import ViewerState, open3d_draws
-from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint
+from splatnode.viewer.shapes import ImageQuad, Label, Lines, Shapes, choose_first_divisor, choose_next_divisor
+from splatnode.viewer.state import BACKGROUND, ViewerState, Viewpoint, open3d_draws
 
 _BOUNDS = o3d.geometry.AxisAlignedBoundingBox(np.full(3, -20.0), np.full(3, 20.0))  # for near and far planes
 _CLOUD = "gaussians"

@@ -23,8 +23,7 @@ from splatnode.recon.result.export import ResultWriteError, write_files
 from splatnode.recon.result.verdict import Code
 from splatnode.viewer import text
 from splatnode.viewer import text as viewer_text
-from splatnode.viewer.editing import EditError, edit_lines
-from splatnode.viewer.session import Session
+from splatnode.viewer.session import EditError, Session, edit_lines
 from splatnode.viewer.shapes import measurement_lines
 from splatnode.viewer.stage import Image, WindowStage
 from splatnode.viewer.state import (
@@ -37,8 +36,10 @@ from splatnode.viewer.state import (
     help_lines,
     moment_index,
     open3d_draws,
+    orbit,
+    pan,
+    zoom,
 )
-from splatnode.viewer.viewpoint import orbit, pan, zoom
 
 LINE = 46  # characters that fit into the panel's width
 Change = Callable[[ViewerState], None]

@@ -26,6 +26,7 @@ from splatnode.capture.frame import (
     DroppedFrame,
     ExposureSettings,
     Frame,
+    FramesPerSecond,
     Intrinsics,
     RightImage,
     grey,
@@ -33,7 +34,6 @@ from splatnode.capture.frame import (
     parse_exposure,
     wall_clock,
 )
-from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import sanitize_text
 

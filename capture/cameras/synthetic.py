@@ -16,11 +16,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.scene import Camera, Matrix, Solid, cast, cast_through, look_at, odometry, place
-from splatnode.capture.diorama.scene import Config as Odometry
-from splatnode.capture.frame import Baseline, Clock, Frame, Intrinsics, RightImage, Stamp, grey
+from splatnode.capture.diorama import Camera, Matrix, Solid, cast, cast_through, look_at, odometry, place
+from splatnode.capture.diorama import Config as Odometry
+from splatnode.capture.frame import Baseline, Clock, Frame, FramesPerSecond, Intrinsics, RightImage, Stamp, grey
 from splatnode.capture.odometry import Gravity, Motion
-from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.config import Internal
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
@@ -81,7 +80,7 @@ def frame_name(index: int) -> str:
 
 
 def scene_cameras(config: Config) -> list[Camera]:
-    """The cameras of the stream, in its order; world axes as in splatnode.capture.diorama.scene."""
+    """The cameras of the stream, in its order; world axes as in splatnode.capture.diorama."""
     return [_camera_on_path(config, float(index)) for index in range(config.views)]
 
 

@@ -27,10 +27,17 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import CameraUnavailable, DroppedFrame, Frame, Intrinsics, make_frame, wall_clock
+from splatnode.capture.frame import (
+    CameraUnavailable,
+    DroppedFrame,
+    Frame,
+    FramesPerSecond,
+    Intrinsics,
+    make_frame,
+    wall_clock,
+)
 from splatnode.capture.image_file import UnusableImage, decode_image
-from splatnode.capture.lens_file import check_fits
-from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.lenses import check_fits
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import event
 

@@ -9,10 +9,19 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.frame import LARGEST_NS, Clock, DroppedFrame, Frame, Intrinsics, Stamp, make_frame
+from splatnode.capture.frame import (
+    LARGEST_NS,
+    Clock,
+    DroppedFrame,
+    Frame,
+    Intrinsics,
+    Pace,
+    Stamp,
+    make_frame,
+    pace_frames,
+)
 from splatnode.capture.image_file import MaxPixels
-from splatnode.capture.lens_file import check_fits, same_aspect
-from splatnode.capture.pace import Pace, pace_frames
+from splatnode.capture.lenses import check_fits, same_aspect
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_name
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS, Span, VideoError, VideoFrame, decode_video

@@ -36,7 +36,7 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.image_header import name_time
-from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
+from splatnode.capture.lenses import assign_lens, check_fits, same_aspect
 from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers
 from splatnode.capture.process.config import Internal, record_in
 from splatnode.capture.process.files import read_bounded

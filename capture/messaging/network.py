@@ -42,7 +42,7 @@ import msgspec
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from splatnode.capture.messaging import wire
+from splatnode.capture.messaging import messages
 from splatnode.capture.process.files import (
     LockHeld,
     NotOwnerOnly,
@@ -348,7 +348,7 @@ _CAPTURE = re.compile(rf"capture\.keyframes(?:@({CAMERA_ID}))?")
 
 
 REQUEST_BYTES = 64 << 10  # no request, acknowledgement or subscription is larger
-REQUEST_LIMITS = wire.Limits(header_bytes=REQUEST_BYTES, arrays=0, total_bytes=2 * REQUEST_BYTES)
+REQUEST_LIMITS = messages.Limits(header_bytes=REQUEST_BYTES, arrays=0, total_bytes=2 * REQUEST_BYTES)
 _ZAP_DOMAIN = "splatnode"
 _MAX_FAILED_HANDSHAKES = 5  # in a row; one may fail because the other process was just ending
 _RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000  # pause before connecting again, doubled up to the second
@@ -368,8 +368,8 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_message_mb: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256  # a larger message is not taken, in 2^20 bytes
 
     @property
-    def limits(self) -> wire.Limits:
-        return wire.Limits(total_bytes=self.max_message_mb << 20)
+    def limits(self) -> messages.Limits:
+        return messages.Limits(total_bytes=self.max_message_mb << 20)
 
 
 def files_for_strangers(network: Network, sockets: int) -> int:
@@ -452,8 +452,8 @@ class Endpoint:
             except zmq.Again:
                 return
             try:
-                header = wire.decode(parts, schema, REQUEST_LIMITS).header
-            except wire.WireError as error:
+                header = messages.decode(parts, schema, REQUEST_LIMITS).header
+            except messages.WireError as error:
                 self._refuse(what, error)
                 continue
             yield identity, header

@@ -13,8 +13,7 @@ import msgspec
 import numpy.typing as npt
 import zmq
 
-from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network, Service
-from splatnode.capture.messaging.wire import (
+from splatnode.capture.messaging.messages import (
     Message,
     Part,
     Sequential,
@@ -25,6 +24,7 @@ from splatnode.capture.messaging.wire import (
     encode,
     size_bytes,
 )
+from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network, Service
 
 SEND_QUEUE = 16  # messages to one slow reader; a PUB socket drops further ones
 

@@ -316,7 +316,7 @@ _SURE = 3.0  # standard deviations
 
 
 def lens_file(choice: Choice, coverage: Coverage, board: Board) -> str:
-    """The YAML, which `capture.lens_file` reads."""
+    """The YAML, which `capture.lenses` reads."""
     estimate = choice.taken.estimate
     lens, sigmas = estimate.lens, np.sqrt(np.diag(estimate.covariance))
     corners = pixel_sigmas(estimate, coverage.outermost)

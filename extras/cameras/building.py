@@ -18,9 +18,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.scene import Camera, Matrix, Solid, colour_pixels, look_at, trace
-from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
-from splatnode.capture.pace import FramesPerSecond, Pace, pace_frames
+from splatnode.capture.diorama import Camera, Matrix, Solid, colour_pixels, look_at, trace
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, FramesPerSecond, Pace, Stamp, pace_frames
 from splatnode.capture.process.config import Internal
 from splatnode.extras.building import (
     CHAIR_ROOM,

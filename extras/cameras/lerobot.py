@@ -12,9 +12,8 @@ import msgspec
 
 from splatnode.capture.cameras import video
 from splatnode.capture.film import part_of
-from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp, rename_frame
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Pace, Stamp, pace_frames, rename_frame
 from splatnode.capture.image_file import MaxPixels
-from splatnode.capture.pace import Pace, pace_frames
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_name, sanitize_text
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
 from splatnode.extras.lerobot import Film, episode_name, film, is_data_set, list_parts, read_info

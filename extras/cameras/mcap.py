@@ -16,10 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_image import ALIGNED, DepthImage, make_depth_image
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Pace, make_frame, pace_frames
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
-from splatnode.capture.lens_file import same_aspect
-from splatnode.capture.pace import Pace, pace_frames
+from splatnode.capture.lenses import same_aspect
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_name, sanitize_text
 from splatnode.capture.rig import TOLERANCE_S, Rig

@@ -30,8 +30,7 @@ from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snap
 from splatnode.viewer.analysis import camera_colours
 from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, draw_given_pose, frustum_depth
 from splatnode.viewer.sources import Source
-from splatnode.viewer.state import Moment
-from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint, move_to_camera, overview
+from splatnode.viewer.state import BACKGROUND, Moment, Viewpoint, move_to_camera, overview
 from splatnode.viewer.web.server import LOOPBACK, Access
 
 _LIVE = "/live camera"

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
+from splatnode.capture.messaging.messages import Name, Numbering
 from splatnode.capture.messaging.network import (
     RECON_CONTROL,
     RECON_DEPTH,
@@ -38,7 +39,6 @@ from splatnode.capture.messaging.pubsub import (
     StateServer,
     ask,
 )
-from splatnode.capture.messaging.wire import Name, Numbering
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.files import shortage, state_directory
 from splatnode.capture.process.system import (

@@ -12,8 +12,8 @@ from weakref import WeakKeyDictionary
 import msgspec
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.messaging.messages import Numbering, WireError
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.terminal import event
 from splatnode.recon.daemon import submap_index

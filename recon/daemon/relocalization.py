@@ -22,9 +22,9 @@ from scipy.special import chdtr
 from splatnode.capture.config import PreviewHeader, decode_preview
 from splatnode.capture.frame import Intrinsics, Stamp
 from splatnode.capture.lenses import undistort_image
+from splatnode.capture.messaging.messages import Message
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import Subscriber
-from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.config import Internal
 from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.recon import poselib

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.messaging.wire import Amount, Count, Header, Name, Text
+from splatnode.capture.messaging.messages import Amount, Count, Header, Name, Text
 from splatnode.recon.result.message import CameraRecord
 
 

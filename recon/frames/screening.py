@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import quality
+from splatnode.capture import keyframe_selection
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.result.verdict import Code
 
@@ -22,7 +22,9 @@ REMEMBERED_REJECTED = 100  # frames of a stream: more of them change no verdict
 class ScreeningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Screening: copies, blank and blurred frames are left out before anything is computed from them."""
 
-    limits: quality.Limits = quality.Limits()  # those of capture, which has screened live frames already
+    limits: keyframe_selection.Limits = (
+        keyframe_selection.Limits()
+    )  # those of capture, which has screened live frames already
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,7 @@ class FrameSummary:
     """The record of a frame that screening keeps."""
 
     name: str
-    quality: quality.Quality
+    quality: keyframe_selection.Quality
     thumbnail: npt.NDArray[np.uint8]  # (h, w, 3) RGB, the longer side at most quality.THUMBNAIL_SIDE
     size: tuple[int, int]  # width and height of the frame, pixels
 
@@ -46,10 +48,10 @@ class Rejected:
 
 def summarise(frame: Frame) -> FrameSummary:
     """The frame's quality, measured, and its thumbnail."""
-    scale = min(1.0, quality.THUMBNAIL_SIDE / max(frame.width, frame.height))
+    scale = min(1.0, keyframe_selection.THUMBNAIL_SIDE / max(frame.width, frame.height))
     size = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
     thumbnail = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    return FrameSummary(frame.name, quality.assess(frame.image), thumbnail, (frame.width, frame.height))
+    return FrameSummary(frame.name, keyframe_selection.assess(frame.image), thumbnail, (frame.width, frame.height))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +111,11 @@ def screen(summaries: Sequence[FrameSummary], config: ScreeningConfig) -> tuple[
     kept: list[int] = []
     rejected: list[Rejected] = []
     for index, summary in enumerate(summaries):
-        too_small = quality.why_too_small(summary.size, largest)
+        too_small = keyframe_selection.why_too_small(summary.size, largest)
         if too_small is not None:
             rejected.append(Rejected(summary.name, Code.TOO_FEW_VIEWS, too_small))
             continue
-        why = quality.why_unusable(summary.quality, config.limits, sharpest[summary.size])
+        why = keyframe_selection.why_unusable(summary.quality, config.limits, sharpest[summary.size])
         if why is not None:
             rejected.append(Rejected(summary.name, _code(summary.quality, config.limits), why))
             continue
@@ -125,17 +127,19 @@ def screen(summaries: Sequence[FrameSummary], config: ScreeningConfig) -> tuple[
     return kept, rejected
 
 
-def _code(measured: quality.Quality, limits: quality.Limits) -> Code:
+def _code(measured: keyframe_selection.Quality, limits: keyframe_selection.Limits) -> Code:
     """The verdict on an unusable frame: nothing to see on it, else too blurred."""
     blank = measured.blur_px is None or measured.contrast < limits.contrast
     exposed = 1.0 - measured.dark - measured.bright >= limits.min_exposed_share
     return Code.LOW_TEXTURE if blank or not exposed else Code.BLUR
 
 
-def _is_copy(one: FrameSummary, other: FrameSummary, limits: quality.Limits) -> bool:
+def _is_copy(one: FrameSummary, other: FrameSummary, limits: keyframe_selection.Limits) -> bool:
     if one.size != other.size:
         return False
-    return quality.why_redundant(quality.novelty(one.thumbnail, other.thumbnail), limits) is not None
+    return (
+        keyframe_selection.why_redundant(keyframe_selection.novelty(one.thumbnail, other.thumbnail), limits) is not None
+    )
 
 
 # The dark rim of undistorted photographs: pixels at the border that the lens has not seen.

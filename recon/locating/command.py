@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.lens_file import read_lens, same_aspect
+from splatnode.capture.lenses import read_lens, same_aspect
 from splatnode.capture.process.terminal import say
 from splatnode.recon.locating.localize import (
     check_lens,

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.messaging.wire import Header, Message, Name, Sequential, Text, WireError
+from splatnode.capture.messaging.messages import Header, Message, Name, Sequential, Text, WireError
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.recon.occupancy.grid import OccupancyMap, Upright, VoxelState
 from splatnode.recon.result.message import Matrix4, ScaleRecord, Vector3, make_scale_record, parse_scale

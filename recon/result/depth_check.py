@@ -8,7 +8,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.messaging.wire import LARGEST, Finite
+from splatnode.capture.messaging.messages import LARGEST, Finite
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, sanitize_text
 
 _LONGEST_SENTENCE = 10_000  # characters, of a report; in a message LONGEST_TEXT

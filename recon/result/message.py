@@ -24,8 +24,19 @@ from splatnode.capture.frame import (
     make_optional_field,
     read_optional_field,
 )
-from splatnode.capture.messaging.messages import decode_jpeg, make_jpeg_array
-from splatnode.capture.messaging.wire import Amount, Count, Finite, Header, Message, Name, Sequential, Text, WireError
+from splatnode.capture.messaging.messages import (
+    Amount,
+    Count,
+    Finite,
+    Header,
+    Message,
+    Name,
+    Sequential,
+    Text,
+    WireError,
+    decode_jpeg,
+    make_jpeg_array,
+)
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
 from splatnode.recon.result.depth_check import DepthCheckRecord, make_depth_check_record
 from splatnode.recon.result.reference_frame import FIRST_CAMERA, FrameName, ReferenceFrame, find_frame_problem

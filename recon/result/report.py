@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.terminal import say
-from splatnode.capture.rig_file import format_rig
+from splatnode.capture.rig import format_rig
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import make_camera_dict
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from splatnode.capture import quality
+from splatnode.capture import keyframe_selection
 from splatnode.recon.frames.keyframe import longer_side
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.geometry import distortion
@@ -537,7 +537,7 @@ def _refuse_wrong_frames(case: VerificationCase) -> Verdict | None:
     if foreign:
         return refuse(rejections.MIXED_CAMERAS, foreign, others=len(foreign), count=len(names))
     widths = {
-        keyframe.name: quality.blur_width(keyframe.image) or 0.0
+        keyframe.name: keyframe_selection.blur_width(keyframe.image) or 0.0
         for keyframe in case.graph.keyframes
         if keyframe.name in names
     }

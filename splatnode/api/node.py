@@ -1,22 +1,101 @@
-"""A running node, as a program that listens to it."""
+"""A running node, as a program that listens to it: scenes, and what is known of free space."""
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from splatnode.api.entrance import enter_api
-from splatnode.api.live_map import LiveMap, NodeMap
+from splatnode.api.arguments import enter_api
 from splatnode.api.result import Camera, Result, camera_of, result_of
-from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.messages import WireError
+from splatnode.capture.messaging.network import RECON_MAP, Network
+from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config, read_yaml
+from splatnode.capture.process.terminal import Problems, is_logged
+from splatnode.recon.occupancy.grid import OccupancyMap
+from splatnode.recon.occupancy.message import MapHeader, decode_map
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.sources import LiveSource
 from splatnode.viewer.state import Moment
+
+# What a node says of free space, as a thread hears it.
+
+log = logging.getLogger(__name__)
+
+SILENT = "the node has said nothing of a map: set occupancy.live in the configuration of splatnode recon"
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMap:
+    """A node's current knowledge of free space."""
+
+    scene_id: str  # of the place; empty where the node has said nothing
+    occupancy: OccupancyMap | None  # in the world of that scene, as it is now
+    why: str  # there is no map; empty where there is one
+
+
+NOTHING_HEARD = NodeMap("", None, SILENT)
+
+
+@dataclass(frozen=True, eq=False)
+class ReceivedMap:
+    """The newest message about the map, and the message of recon.scene that it belongs to."""
+
+    told: NodeMap
+    scene: tuple[str, int] | None = None  # session and sequence
+
+
+class LiveMap:
+    """Hears the maps of a node; keeps the newest."""
+
+    def __init__(self, network: Network) -> None:
+        """Raises what opening the network raises."""
+        self._client = StateClient(RECON_MAP, network, MapHeader)
+        self._refusals = Problems()
+        self._heard = ReceivedMap(NOTHING_HEARD)
+        self._error: BaseException | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="live map", daemon=True)
+        self._thread.start()
+
+    @property
+    def newest(self) -> ReceivedMap:
+        """Raises what the connection failed with, for example PermissionError."""
+        if self._error is not None:
+            raise self._error
+        return self._heard
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._client.close()
+
+    def _listen(self) -> None:
+        try:
+            while not self._closing.is_set():
+                message = self._client.poll(_POLL_S)
+                if message is None:
+                    continue
+                header: MapHeader = message.header
+                try:
+                    told = NodeMap(header.scene_id, decode_map(message), header.why)
+                except WireError as error:
+                    if is_logged(self._refusals.add("maps that were refused", error)):
+                        log.warning("a map of the node was refused: %s", error)
+                    told = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
+                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence))
+        except Exception as error:
+            self._error = error
+
+
+# A running node, as a program that listens to it.
 
 FIRST_PORT = Network().first_port
 OUTDATED = "the scene has changed since its map was made"

@@ -1,7 +1,8 @@
-"""Photographs as a program has them: paths, arrays or PIL images, as the frames that are reconstructed."""
+"""Photographs as a program has them: files or arrays, with their depth; and where a further one was taken."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike, fspath
@@ -11,8 +12,9 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.api.image_arguments import Lens, check_camera_id, make_intrinsics
+from splatnode.api.arguments import DepthOf, Lens, check_camera_id, make_intrinsics, parse_optional_depth
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
+from splatnode.capture.depth_image import DepthImage, find_depth_files
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
 from splatnode.capture.image_file import (
     ORIENTATION,
@@ -24,11 +26,26 @@ from splatnode.capture.image_file import (
     upright,
 )
 from splatnode.capture.image_header import exif_exposure, exif_intrinsics, exif_time, read_tags
-from splatnode.capture.lens_file import ALL, Lenses, find_key
+from splatnode.capture.lenses import ALL, Lenses, find_key
 from splatnode.capture.masks import Find, Mask, apply_mask, open_masks, parse_mask, read_mask
-from splatnode.capture.process.terminal import Tell
+from splatnode.capture.odometry import rigid_problem
+from splatnode.capture.process.terminal import Tell, ignore_progress, notify
+from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.rig import TOLERANCE_S
-from splatnode.recon.replay_source import Request, Source, apply_lenses, load_source, parse_sources, select_frames
+from splatnode.recon.locating.localize import follow, localize_image
+from splatnode.recon.locating.outcome import Located, NotLocated
+from splatnode.recon.replay_source import (
+    Request,
+    Source,
+    apply_lenses,
+    attach_depths,
+    load_source,
+    parse_sources,
+    select_frames,
+)
+from splatnode.recon.result.snapshot import Landmarks
+
+# Photographs as a program has them: paths, arrays or PIL images, as the frames that are reconstructed.
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
 _EXIF = b"Exif\0\0"  # before the TIFF structure
@@ -279,3 +296,85 @@ def _mask(given: MaskOf, frame: Frame) -> Mask | None:
     if given is None:
         return None
     return read_mask(Path(given), frame) if isinstance(given, (str, PathLike)) else parse_mask(given)
+
+
+# Depth images as a program has them: arrays, files or records, by the photographs' names or in their order.
+
+log = logging.getLogger(__name__)
+
+Depths: TypeAlias = "str | PathLike[str] | Mapping[str, DepthOf] | Sequence[DepthOf]"
+
+
+def add_depths(source: Source, depths: Depths | None, images: Images) -> Source:
+    """The frames, each with its depth image. Raises TypeError, ValueError, FileNotFoundError."""
+    if depths is None:
+        return source
+    known = _name_depths(depths, images, source)
+
+    def find(frame: Frame) -> DepthImage | None:
+        try:
+            return parse_optional_depth(known.get(frame.name))
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"the depth image of {frame.name}: {error}") from error
+
+    return attach_depths(source, find)
+
+
+def _name_depths(depths: Any, images: Images, source: Source) -> dict[str, Any]:
+    """The depth images by the names of their frames."""
+    if isinstance(depths, (str, PathLike)):
+        return find_depth_files(Path(depths), [frame.name for frame in source.frames])
+    if isinstance(depths, Mapping):
+        named = {frame_name(Path(name)): each for name, each in depths.items()}
+        names = {frame.name for frame in source.frames}
+        if not names & named.keys():
+            raise ValueError(f"depths are of none of the photographs, such as {min(names, default='none')}")
+        if further := sorted(named.keys() - names):
+            some = sanitize_text(", ".join(further[:3]), 200)
+            notify(log, f"{len(further)} of {len(named)} depths are of no photograph that is used, such as {some}")
+        return named
+    names = names_of(images)
+    if len(depths) != len(names):
+        raise ValueError(f"depths must be one for each of the {len(names)} photographs, got {len(depths)}")
+    return dict(zip(names, depths, strict=True))
+
+
+# Where a further photograph of a scene was taken.
+
+Near: TypeAlias = "Located | NotLocated | npt.ArrayLike | None"
+
+
+def localize_query(
+    landmarks: Landmarks, image: str | PathLike[str] | Picture, lens: Lens | None, near: Near
+) -> Located | NotLocated:
+    """The camera of one photograph, a file or a picture. Raises TypeError, ValueError, FileNotFoundError."""
+    if isinstance(image, (str, PathLike)) and not Path(image).is_file():
+        raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
+    expected = _parse_near(near)
+    given = apply_lens(load_frames([image], None, False, ignore_progress), lens, [image]).frames
+    (frame, *_) = given
+    if not isinstance(frame, Frame):
+        raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
+    if expected is None:
+        return localize_image(landmarks, frame.image, frame.intrinsics)
+    return follow(landmarks, frame.image, expected, frame.intrinsics)
+
+
+def _parse_near(near: Near) -> Located | npt.NDArray[np.float64] | None:
+    """Parses the known position of the photograph; None where nothing is known."""
+    if near is None or isinstance(near, NotLocated):
+        return None
+    if isinstance(near, Located):
+        return near
+    try:
+        T_world_camera = np.asarray(near, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(_WHAT_NEAR_IS.format(type(near).__name__)) from None
+    if T_world_camera.shape != (4, 4):
+        raise TypeError(_WHAT_NEAR_IS.format(f"shape {T_world_camera.shape}"))
+    if problem := rigid_problem(T_world_camera.ravel().tolist()):
+        raise ValueError(f"near must be {problem}")
+    return T_world_camera
+
+
+_WHAT_NEAR_IS = "near must be what localise returned, or T_world_camera (4, 4), got {}"

@@ -14,14 +14,14 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.api.entrance import enter_api
-from splatnode.api.image_arguments import (
+from splatnode.api.arguments import (
     DepthOf,
     Lens,
     Mounts,
     Sigmas,
     append_motion,
     check_capture_id,
+    enter_api,
     find_mount,
     make_gravity,
     make_intrinsics,
@@ -41,10 +41,9 @@ from splatnode.capture.frame import (
     wall_clock,
 )
 from splatnode.capture.image_file import UnusableImage, decode_image
-from splatnode.capture.lens_file import assign_lens, check_fits
+from splatnode.capture.lenses import assign_lens, check_fits
 from splatnode.capture.masks import apply_mask, parse_mask
-from splatnode.capture.messaging.keyframe_queue import KeyframeServer
-from splatnode.capture.messaging.spool import Spool, SpoolFull
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolFull
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.config import merge_config, parse_config, read_yaml
 from splatnode.capture.process.files import LockHeld

@@ -13,8 +13,7 @@ import pytest
 
 import splatnode
 from splatnode import command_line
-from splatnode.api.depths import add_depths
-from splatnode.api.photographs import load_frames
+from splatnode.api.photographs import add_depths, load_frames
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png

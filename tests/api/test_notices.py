@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import splatnode
-from splatnode.api.entrance import sanitize_error
+from splatnode.api.arguments import sanitize_error
 from splatnode.capture.process import config
 from splatnode.capture.process.terminal import InputWarning, give_warnings, gives_warnings, notify
 from tests.api.test_publisher import changes, picture, publisher

@@ -11,8 +11,8 @@ import pytest
 
 import splatnode
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Config as Odometry
-from splatnode.capture.diorama.scene import odometry
+from splatnode.capture.diorama import Config as Odometry
+from splatnode.capture.diorama import odometry
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import errors
 

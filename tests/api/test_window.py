@@ -13,7 +13,7 @@ from importlib.util import find_spec
 import pytest
 
 import splatnode
-from splatnode.api import window
+from splatnode.api import result as window
 from splatnode.viewer.probe import Probe
 
 SHOWS = """

@@ -7,8 +7,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.keyframe_selection import THINNED, Config, choose
-from splatnode.capture.quality import Limits
+from splatnode.capture.keyframe_selection import THINNED, Config, Limits, choose
 
 WALK = synthetic.Config(views=8, width=160, height=120)
 FRAMES = 40

@@ -21,16 +21,13 @@ import pytest
 from splatnode.capture import keyframe_selection
 from splatnode.capture.cameras import folder
 from splatnode.capture.config import Camera, CaptureConfig, PreviewHeader, decode_preview
-from splatnode.capture.daemon import CaptureSession, capture, last_run
+from splatnode.capture.daemon import CaptureSession, CaptureStatus, capture, heartbeats, last_run
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.messaging.keyframe_queue import KeyframeClient
-from splatnode.capture.messaging.messages import FrameHeader
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, Spool, SpoolConfig
+from splatnode.capture.messaging.messages import FrameHeader, Key, encode
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
 from splatnode.capture.messaging.pubsub import Subscriber
-from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig
-from splatnode.capture.messaging.wire import encode
 from splatnode.capture.process.system import FailedAfterReady
-from splatnode.capture.status import CaptureStatus, heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 
@@ -238,7 +235,7 @@ def test_one_frame_that_fails_costs_that_frame_alone(tmp_path, photographs, monk
         return once
 
     target, error = {
-        "offer": ("splatnode.capture.messaging.spool.write_message", OSError(5, "Input/output error")),
+        "offer": ("splatnode.capture.messaging.keyframe_queue.write_message", OSError(5, "Input/output error")),
         "examine": ("splatnode.capture.keyframe_selection.assess", ArithmeticError("for the test")),
         "preview": ("splatnode.capture.daemon.encode_preview", ArithmeticError("for the test")),
     }[what]

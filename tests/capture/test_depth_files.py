@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import folder
-from splatnode.capture.depth_files import decode_exr, find_depth_files, read_depth_file
+from splatnode.capture.cameras.folder import RgbdFolderError, find_rgbd_folder
+from splatnode.capture.depth_image import decode_exr, find_depth_files, read_depth_file
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage
-from splatnode.capture.rgbd_folder import RgbdFolderError, find_rgbd_folder
 from splatnode.recon.replay_source import Request, load_source
 
 STEPS = np.random.default_rng(0).integers(1, 5000, (24, 32)).astype(np.uint16)

@@ -23,9 +23,16 @@ from splatnode.capture.depth_image import (
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lenses import undistort_frame
-from splatnode.capture.messaging.messages import FrameHeader, decode_frame, encode_frame, frame_in
-from splatnode.capture.messaging.spool import Key
-from splatnode.capture.messaging.wire import Limits, Numbering, decode
+from splatnode.capture.messaging.messages import (
+    FrameHeader,
+    Key,
+    Limits,
+    Numbering,
+    decode,
+    decode_frame,
+    encode_frame,
+    frame_in,
+)
 from splatnode.capture.recording import Recorder, read
 from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
 

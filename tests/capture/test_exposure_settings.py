@@ -15,9 +15,17 @@ from splatnode.capture.frame import ExposureSettings, Frame, Intrinsics, parse_e
 from splatnode.capture.image_header import exif_exposure, read_tags
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.masks import apply_mask
-from splatnode.capture.messaging.messages import FrameHeader, decode_frame, encode_frame
-from splatnode.capture.messaging.spool import Key
-from splatnode.capture.messaging.wire import Limits, Numbering, WireError, decode, encode
+from splatnode.capture.messaging.messages import (
+    FrameHeader,
+    Key,
+    Limits,
+    Numbering,
+    WireError,
+    decode,
+    decode_frame,
+    encode,
+    encode_frame,
+)
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
 from tests.capture.cameras.test_folder import encoded, tiff, with_exif

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, rename_frame
-from splatnode.capture.messaging.messages import FrameHeader, encode_frame
-from splatnode.capture.messaging.wire import Numbering, decode
+from splatnode.capture.messaging.messages import FrameHeader, Numbering, decode, encode_frame
 from splatnode.capture.odometry import LARGEST_M, GivenPose, make_given_pose
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.capture.rig import RigCamera

@@ -14,7 +14,7 @@ import struct
 import numpy as np
 import pytest
 
-from splatnode.capture import heif_file, image_file
+from splatnode.capture import image_file
 from splatnode.capture.cameras import folder, watched
 from splatnode.capture.frame import Clock, DroppedFrame, ExposureSettings, Frame, Stamp
 from splatnode.capture.image_file import UnusableImage, check_whole, decode_any_image, decode_image
@@ -85,7 +85,7 @@ def test_a_folder_takes_them_beside_others(tmp_path):
 
 def test_without_the_package_the_message_names_it(tmp_path, monkeypatch):
     (tmp_path / "a.heic").write_bytes(TURNED)
-    monkeypatch.setattr(heif_file.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(image_file.importlib.util, "find_spec", lambda name: None)
     remedy = "Run: pip install 'splatnode[heic]', or convert it to JPEG"
     with pytest.raises(ValueError) as caught:
         folder.stream(folder.Config(tmp_path))
@@ -152,7 +152,7 @@ def decoded(files: list[bytes], bounds: int) -> tuple[int, int]:
 
 
 def test_what_another_process_sends_reaches_no_such_decoder(monkeypatch):
-    monkeypatch.setattr(image_file.heif_file, "decode", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(image_file, "decode_heif", lambda *_: pytest.fail("decoded"))
     with pytest.raises(UnusableImage, match="not an image"):
         decode_image(TURNED)
 

@@ -3,7 +3,7 @@
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lens_file import UnusableLens, read_lens, read_lenses
+from splatnode.capture.lenses import UnusableLens, read_lens, read_lenses
 
 KALIBR = """cam0:
   cam_overlaps: []

@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Frame, rename_frame
-from splatnode.capture.messaging.messages import FrameHeader, encode_frame
-from splatnode.capture.messaging.wire import Numbering, WireError, decode, encode
+from splatnode.capture.messaging.messages import FrameHeader, Numbering, WireError, decode, encode, encode_frame
 from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.capture import recording, several
+from splatnode.capture import cli, recording
 from splatnode.capture.config import CaptureConfig, camera_opener, mount_camera
 from splatnode.capture.frame import DroppedFrame, Frame, make_frame
 from splatnode.capture.messaging.messages import FrameHeader, arrays_of, describe_stored_frame, frame_in
 from splatnode.capture.odometry import make_rigid
 from splatnode.capture.process.config import ConfigError, parse_config
-from splatnode.capture.rig import Rig, RigCamera
-from splatnode.capture.rig_file import UnusableRig, read_rig
+from splatnode.capture.rig import Rig, RigCamera, UnusableRig, read_rig
 
 ROWS = [[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.2], [0.0, 0.0, 0.0, 1.0]]
 NUMBERS = tuple(number for row in ROWS for number in row)
@@ -35,7 +34,7 @@ def test_a_camera_is_mounted_as_its_configuration_says():
 
 def test_each_of_several_cameras_has_its_own_mount():
     raw = {"cameras": {"left": {**CAMERA, "T_base_camera": ROWS}, "right": CAMERA}}
-    left, right = (parse_config(several.choose_camera(raw, each), CaptureConfig) for each in ("left", "right"))
+    left, right = (parse_config(cli.choose_camera(raw, each), CaptureConfig) for each in ("left", "right"))
     assert left.T_base_camera == tuple(map(tuple, ROWS)) and right.T_base_camera is None
 
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from splatnode.capture import recording
+from splatnode.capture.film import ALL, CameraSet, CameraSource, find_cameras, select_cameras
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.keyframe_selection import Config, choose, group_frame_sets
-from splatnode.capture.multi_camera import ALL, CameraSet, CameraSource, find_cameras, select_cameras
-from splatnode.capture.quality import Limits
+from splatnode.capture.keyframe_selection import Config, Limits, choose, group_frame_sets
 from splatnode.capture.rig import TOLERANCE_S
 from tests.support import lerobot_sets, mcap_files
 

@@ -6,7 +6,15 @@ import pytest
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
-from splatnode.capture.quality import Limits, Quality, assess, blur_width, novelty, why_redundant, why_unusable
+from splatnode.capture.keyframe_selection import (
+    Limits,
+    Quality,
+    assess,
+    blur_width,
+    novelty,
+    why_redundant,
+    why_unusable,
+)
 from tests.support import synthetic
 
 LIMITS = Limits()

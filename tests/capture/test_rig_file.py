@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.capture.rig_file import UnusableRig, format_rig, read_rig
+from splatnode.capture.rig import UnusableRig, format_rig, read_rig
 
 T = np.array([[0.0, 0.0, 1.0, 0.2], [0.0, 1.0, 0.0, -0.1], [-1.0, 0.0, 0.0, 0.05], [0.0, 0.0, 0.0, 1.0]])
 LENS = {

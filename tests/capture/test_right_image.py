@@ -9,8 +9,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Baseline, DroppedFrame, Frame, RightImage, rename_frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.messaging.messages import encode_frame
-from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.messaging.messages import Numbering, encode_frame
 from splatnode.capture.recording import Recorder, read
 from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
 

@@ -16,12 +16,12 @@ from splatnode.capture.keyframe_selection import (
     REMEMBERED_VIEWS,
     Config,
     CornerMotion,
+    Limits,
     Selector,
     explain_decision,
     measure,
     track,
 )
-from splatnode.capture.quality import Limits
 from tests.support import synthetic
 
 EVERY = Config(max_fps=1000.0, patience_s=0.0)

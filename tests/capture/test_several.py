@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from splatnode import command_line
-from splatnode.capture import several
+from splatnode.capture import cli
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
@@ -23,8 +23,8 @@ CAMERAS = {"left": {"kind": "synthetic", "views": 2}, "right": {"kind": "synthet
 
 def test_each_camera_has_a_configuration_of_its_own():
     raw = {"cameras": CAMERAS, "selection": {"every_frame": True}}
-    assert several.list_cameras(raw) == ["left", "right"] and several.list_cameras({"camera": {}}) == []
-    chosen = parse_config(several.choose_camera(raw, "right"), CaptureConfig)
+    assert cli.list_cameras(raw) == ["left", "right"] and cli.list_cameras({"camera": {}}) == []
+    chosen = parse_config(cli.choose_camera(raw, "right"), CaptureConfig)
     assert (chosen.camera_id, chosen.camera.config.views, str(chosen.body_mask)) == ("right", 3, "m.png")
     assert chosen.selection.every_frame
 
@@ -40,7 +40,7 @@ def test_each_camera_has_a_configuration_of_its_own():
 )
 def test_a_configuration_that_cannot_be_used_is_refused(raw, told):
     with pytest.raises(ConfigError, match=told):
-        several.list_cameras(raw)
+        cli.list_cameras(raw)
 
 
 def test_an_unknown_camera_id_is_refused_with_those_that_there_are(tmp_path, capsys):
@@ -53,15 +53,13 @@ def test_an_unknown_camera_id_is_refused_with_those_that_there_are(tmp_path, cap
 
 
 def test_a_camera_whose_process_fails_is_started_again_and_the_others_go_on(monkeypatch, tmp_path):
-    monkeypatch.setattr(several, "RESTART_S", 0.1)
+    monkeypatch.setattr(cli, "RESTART_S", 0.1)
     program = (
         "import pathlib, sys; p = pathlib.Path(sys.argv[1]); n = len(p.read_text()) if p.exists() else 0;"
         "p.write_text('x' * (n + 1)); sys.exit(0 if n else 69)"
     )
-    monkeypatch.setattr(
-        several.python, "command", lambda *parts: [sys.executable, "-c", program, str(tmp_path / parts[4])]
-    )
-    assert several.run_captures(tmp_path, ["left", "right"]) == 0
+    monkeypatch.setattr(cli.python, "command", lambda *parts: [sys.executable, "-c", program, str(tmp_path / parts[4])])
+    assert cli.run_captures(tmp_path, ["left", "right"]) == 0
     assert [(tmp_path / each).read_text() for each in ("left", "right")] == ["xx", "xx"]
 
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from splatnode.capture import recording
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.messaging.keyframe_queue import Spool, SpoolConfig, SpoolFull
+from splatnode.capture.messaging.messages import Key, ReceivedFrame
 from splatnode.capture.messaging.network import allow, create_keys, expect_server, read_keys
-from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, SpoolFull
 from splatnode.recon.daemon.checkpoint import records
 from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
 from splatnode.recon.daemon.checkpoint.store import Store

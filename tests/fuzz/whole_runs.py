@@ -11,9 +11,8 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.config import parse_config
 from splatnode.command_line import main
 from splatnode.recon.daemon.checkpoint.store import Store

@@ -53,7 +53,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "capture",
-        "capture/quality.py",
+        "capture/keyframe_selection.py",
         (
             "blur is measured in one direction",
             "return max((width for width in widths if width is not None), default=None)",
@@ -62,7 +62,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "messaging",
-        "capture/messaging/wire.py",
+        "capture/messaging/messages.py",
         (
             "an array without elements may promise anything",
             "math.prod(max(1, side) for side in shape)",
@@ -109,7 +109,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "spool",
-        "capture/messaging/spool.py",
+        "capture/messaging/keyframe_queue.py",
         (
             "a damaged message is not noticed",
             "if magic != _MAGIC or len(body) != size or zlib.crc32(body) != checksum:",
@@ -593,7 +593,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "viewer",
-        "viewer/viewpoint.py",
+        "viewer/state.py",
         (
             "an orbit to the right goes left",
             "turned = _rotation(view.up, right_rad) @ outwards",

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import decode_image, encode_png
-from splatnode.capture.lens_file import ALL, Lenses
+from splatnode.capture.lenses import ALL, Lenses
 from splatnode.recon import replay_source
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.replay_source import Request, load_recording, load_source, select_frames

@@ -14,12 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import splatnode
 from splatnode import command_line
+from splatnode.capture.film import select_cameras
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.multi_camera import select_cameras
 from splatnode.capture.process.terminal import InputWarning, give_warnings, ignore_progress
-from splatnode.capture.rig import Rig, RigCamera
-from splatnode.capture.rig_file import format_rig, read_rig
+from splatnode.capture.rig import Rig, RigCamera, format_rig, read_rig
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.pipeline import estimate_frame_cameras

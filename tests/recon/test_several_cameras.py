@@ -14,11 +14,11 @@ import pytest
 
 from splatnode import command_line
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.film import ALL
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.keyframe_selection import group_frame_sets
-from splatnode.capture.lens_file import Lenses
-from splatnode.capture.multi_camera import ALL
+from splatnode.capture.lenses import Lenses
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import PALETTES, Builder, cast, look_at, table
+from splatnode.capture.diorama import PALETTES, Builder, cast, look_at, table
 from splatnode.capture.frame import Frame
 from splatnode.extras.cameras import building
 from tests.support.synthetic import renumbered

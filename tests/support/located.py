@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Camera
+from splatnode.capture.diorama import Camera
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import Similarity, align_cameras

@@ -10,7 +10,7 @@ import numpy as np
 
 from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Camera, Shape, Solid, cast
+from splatnode.capture.diorama import Camera, Shape, Solid, cast
 from splatnode.capture.frame import Frame
 
 _THICK_M = 0.002

@@ -7,9 +7,9 @@ import threading
 import time
 from pathlib import Path
 
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_SCENE, RECON_STATUS, Network
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from tests.support.node import heartbeat

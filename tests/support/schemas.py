@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from splatnode.capture.messaging.wire import Header
+from splatnode.capture.messaging.messages import Header
 
 
 def without(schema: type[Header], field: str) -> Any:

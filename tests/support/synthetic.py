@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import BRICK_WALL, Camera, cast, place
+from splatnode.capture.diorama import BRICK_WALL, Camera, cast, place
 from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.protocol import CameraErrors, compare_cameras
 from splatnode.recon.frames.keyframe import Keyframe, resize_image

@@ -14,7 +14,7 @@ from tests.conftest import ROOT
 
 # Who must not import whom: at least one wrong arrow for each contract, and one for each pair of neighbouring stages.
 WRONG = (
-    ("splatnode.capture.quality", "splatnode.recon.geometry"),
+    ("splatnode.capture.keyframe_selection", "splatnode.recon.geometry"),
     ("splatnode.recon.result.report", "splatnode.viewer.state"),
     ("splatnode.recon.clock", "splatnode.command_line"),
     ("splatnode.recon.frames.screening", "splatnode.recon.matching.features"),

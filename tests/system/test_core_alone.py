@@ -27,7 +27,7 @@ assert main(["record", "camera.yaml", "--out", "recording"]) == 0
 assert main(["replay", "recording", "--out", "out", "--preset", "preview", "--size", "128"]) == 0
 assert main(["export", "out", "--to", "spz"]) == 0
 assert main(["view", "out", "--headless", "--num-frames", "1", "--size", "64x48"]) == 0
-import splatnode.api.session, splatnode.capture.daemon, splatnode.recon.daemon.node
+import splatnode.api.reconstruct, splatnode.capture.daemon, splatnode.recon.daemon.node
 import splatnode.viewer.cli
 print(json.dumps([name for name, module in sys.modules.items() if module is not None]))
 """

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Config as Odometry
+from splatnode.capture.diorama import Config as Odometry
 from tests.conftest import ROOT
 
 PAGE = re.sub(r"\s+", " ", (ROOT / "docs" / "metres.md").read_text(encoding="utf-8"))

@@ -22,7 +22,7 @@ FLAGS_OF_OTHERS = {"--no-compile", "--find-links", "--all", "--serve", "--only",
 KEYS = set(re.findall(r"^\| `([\w.]+)` \| ", text("docs/configuration.md"), re.MULTILINE))
 FORMER_SECTIONS = {former for former in former_names.KEYS | former_names.NODE_KEYS if "." not in former}
 SECTIONS = {key.partition(".")[0] for key in KEYS if "." in key} | FORMER_SECTIONS
-OF_A_RIG = {"T_rig_camera", "sigma_m", "sigma_deg", "metric"}  # of a camera in rig.yaml (capture/rig_file.py)
+OF_A_RIG = {"T_rig_camera", "sigma_m", "sigma_deg", "metric"}  # of a camera in rig.yaml (capture/rig.py)
 SUFFIXES = {"npz", "bt", "json", "pgm", "png", "yaml", "py"}  # occupancy.npz is no key of `occupancy`
 
 

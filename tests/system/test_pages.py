@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from splatnode.capture.config import PreviewHeader
+from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.frame import ExposureSettings, Intrinsics
-from splatnode.capture.messaging import messages, network, pubsub, wire
+from splatnode.capture.messaging import messages, network, pubsub
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
-from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.occupancy.message import MapHeader, MapRecord
@@ -88,7 +88,7 @@ SECTIONS = {
     "PreviewHeader": PreviewHeader,
     "CaptureStatus": CaptureStatus,
     "ReconStatus": ReconStatus,
-    "Fields that all headers have": wire.Header,
+    "Fields that all headers have": messages.Header,
 }
 ROWS = (
     Finish,
@@ -107,7 +107,7 @@ ROWS = (
 
 def own_fields(record: type) -> set[str]:
     """Without those that all headers have, which the page tells once."""
-    fields, common = set(record.__struct_fields__), set(wire.Header.__struct_fields__)
+    fields, common = set(record.__struct_fields__), set(messages.Header.__struct_fields__)
     return fields - common if common < fields else fields
 
 
@@ -136,8 +136,8 @@ def test_every_service_state_and_field_of_a_lens_is_told():
     of_records = [name for record in records for name in record.__dataclass_fields__]
     named = [f"`{each.value}`" for each in ReconState] + [f"`{name}`" for name in of_records]
     assert not [name for name in named if name not in page]
-    assert f"`SPLAT`, then one byte with the version ({wire.VERSION})" in page and all(
-        f"`{dtype}`" in page for dtype in wire.DTYPES
+    assert f"`SPLAT`, then one byte with the version ({messages.VERSION})" in page and all(
+        f"`{dtype}`" in page for dtype in messages.DTYPES
     )
 
 

@@ -13,11 +13,10 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import network as keys
-from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_SCENE, Network, NetworkError, runtime_directory
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.recon.daemon.checkpoint.store import Store
 from tests.conftest import ROOT

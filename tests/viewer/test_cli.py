@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_DEPTH, RECON_SCENE, RECON_STATUS, Network
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.export import SceneFileError, write_result
 from splatnode.recon.result.message import encode_snapshot, make_depth_header
 from splatnode.recon.result.report import build_report

@@ -7,8 +7,9 @@ import pytest
 
 from splatnode.recon.result.export.prepare import Box, Selection
 from splatnode.recon.result.snapshot import SHELL, GaussianArrays, encode_unconfirmed
-from splatnode.viewer.editing import (
+from splatnode.viewer.session import (
     EditError,
+    Session,
     add_edit,
     apply_edits,
     box,
@@ -17,7 +18,6 @@ from splatnode.viewer.editing import (
     edit_lines,
     write_edited,
 )
-from splatnode.viewer.session import Session
 from splatnode.viewer.sources import FixedSource, load_result
 from splatnode.viewer.state import Graph, Moment, ViewerState
 from tests.viewer.test_scene import camera, moment, together, wall

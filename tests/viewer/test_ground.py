@@ -8,7 +8,7 @@ import pytest
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale
 from splatnode.viewer.shapes import bar_length, format_length, ground, ground_lines, legend, round_number
-from splatnode.viewer.viewpoint import orbit, project
+from splatnode.viewer.state import orbit, project
 from tests.viewer.test_scene import camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from splatnode.capture.messaging.messages import Message, Numbering, WireError, decode, encode
 from splatnode.capture.messaging.network import RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.recon.result.message import SceneHeader, decode_snapshot, encode_snapshot
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

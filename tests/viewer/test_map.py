@@ -27,10 +27,10 @@ from splatnode.viewer.state import (
     append_moment,
     edge_lines,
     node_marks,
+    overview,
     place_lines,
     press,
 )
-from splatnode.viewer.viewpoint import overview
 from tests.support.walk import place, walk, write_walk
 
 NONE = np.zeros(3)

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.verdict import RELATIVE, Scale
-from splatnode.viewer.paint import paint_coarsely
 from splatnode.viewer.session import Session
-from splatnode.viewer.shapes import add_point, measurement_lines, measurement_shapes, surface_point
+from splatnode.viewer.shapes import add_point, measurement_lines, measurement_shapes, paint_coarsely, surface_point
 from splatnode.viewer.sources import FixedSource
-from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import empty_canvas, project
+from splatnode.viewer.state import ViewerState, empty_canvas, project
 from tests.viewer.test_scene import camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 

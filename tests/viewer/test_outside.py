@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.snapshot import SHELL, GaussianArrays
-from splatnode.viewer.paint import cull_far_shell, paint_gaussians
-from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import look_at
+from splatnode.viewer.shapes import cull_far_shell, paint_gaussians
+from splatnode.viewer.state import ViewerState, look_at
 from tests.viewer.test_scene import K
 
 CENTRE, RADIUS = np.array([3.0, -1.0, 2.0]), 5.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.viewer.paint import SLOWEST_S, choose_first_divisor, choose_next_divisor
+from splatnode.viewer.shapes import SLOWEST_S, choose_first_divisor, choose_next_divisor
 
 
 @pytest.mark.parametrize(("seconds", "part"), [(0.0, 1), (0.05, 1), (0.08, 2), (0.2, 2), (0.4, 3), (5.0, 4)])

@@ -10,21 +10,23 @@ import pytest
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.result.verdict import Bounds, Scale, make_ball
 from splatnode.viewer.analysis import analyse, source_colour
-from splatnode.viewer.paint import add_caption, blend_image, paint, paint_gaussians
 from splatnode.viewer.shapes import (
     ImageQuad,
     Lines,
     Shapes,
+    add_caption,
     advice_lines,
+    blend_image,
     ellipsoid,
     frustum,
     frustum_depth,
     image_corners,
+    paint,
+    paint_gaussians,
     path,
     shapes,
 )
-from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import BACKGROUND, move_to_camera
+from splatnode.viewer.state import BACKGROUND, ViewerState, move_to_camera
 from tests.viewer.test_scene import K, camera, moment, wall
 from tests.viewer.test_viewpoint import viewpoint
 

@@ -22,8 +22,7 @@ from splatnode.viewer.analysis import (
     support,
     surface_points,
 )
-from splatnode.viewer.state import Colouring, Moment, ViewerState, append_moment
-from splatnode.viewer.viewpoint import look_at
+from splatnode.viewer.state import Colouring, Moment, ViewerState, append_moment, look_at
 
 K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
 UP = np.array([0.0, -1.0, 0.0])

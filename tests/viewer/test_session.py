@@ -25,9 +25,10 @@ from splatnode.viewer.state import (
     help_lines,
     moment_index,
     open3d_draws,
+    orbit,
     press,
+    project,
 )
-from splatnode.viewer.viewpoint import orbit, project
 from tests.viewer.test_scene import camera, moment, wall
 
 

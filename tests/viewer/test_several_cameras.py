@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.capture.messaging.wire import Message
+from splatnode.capture.messaging.messages import Message
 from splatnode.recon.result.message import decode_snapshot, encode_snapshot
 from splatnode.recon.result.snapshot import GivenCameraPose
 from splatnode.recon.result.verdict import Scale

@@ -8,7 +8,7 @@ import pytest
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.cli import compute_arc, turntable_views
 from splatnode.viewer.shapes import ground
-from splatnode.viewer.viewpoint import Viewpoint, overview
+from splatnode.viewer.state import Viewpoint, overview
 from tests.viewer.test_scene import UP, camera, moment, wall
 
 

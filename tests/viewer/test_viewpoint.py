@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.viewer.viewpoint import Viewpoint, first_view, look_at, orbit, overview, pan, project, zoom
+from splatnode.viewer.state import Viewpoint, first_view, look_at, orbit, overview, pan, project, zoom
 from tests.viewer.test_scene import K, camera, moment, wall
 
 UP = np.array([0.0, -1.0, 0.0])

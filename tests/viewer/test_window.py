@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.viewer.probe import probe_window
-from splatnode.viewer.splash import splash
+from splatnode.viewer.probe import probe_window, splash
 from tests.conftest import ROOT
 from tests.support.walk import write_walk
 
@@ -118,7 +117,7 @@ def test_a_map_of_several_scenes_is_walked_through_in_a_window(display, tmp_path
 
 SPLASH = """
 import time
-from splatnode.viewer.splash import splash
+from splatnode.viewer.probe import splash
 from tests.support.screen import Screen
 
 def wait(shown):
@@ -136,7 +135,7 @@ with splash() as close:
 
 ORPHAN = """
 import os
-from splatnode.viewer.splash import splash
+from splatnode.viewer.probe import splash
 with splash() as close:
     print(close.__closure__[0].cell_contents.pid, flush=True)
     input()

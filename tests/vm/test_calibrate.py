@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lens_file import read_lens
+from splatnode.capture.lenses import read_lens
 from splatnode.extras.calibration.board import Board
 from tests.support.board_photographs import Conditions, Photographer, waved
 from tests.vm.machine import VIVID_LOOP, Kernel, find_kernel, run

@@ -18,10 +18,9 @@ import pytest
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, Network
 from splatnode.capture.messaging.pubsub import Publisher
-from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from tests.conftest import ROOT
 
 HERE, THERE = "10.213.7.1", "10.213.7.2"
@@ -37,7 +36,7 @@ from splatnode.capture.messaging import network
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW
-from splatnode.capture.messaging.wire import Header
+from splatnode.capture.messaging.messages import Header
 network._DEAD_LINK_S = {DEAD_LINK_S}
 folder = pathlib.Path(sys.argv[1])
 network = network.Network(directory=folder / "there", tcp=sys.argv[2], keys=folder / "laptop")

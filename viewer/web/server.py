@@ -45,8 +45,7 @@ from splatnode.viewer.analysis import Advice, camera_colours
 from splatnode.viewer.session import Session
 from splatnode.viewer.shapes import Lines, frustum_depth, ground, ground_lines, image_corners, shapes
 from splatnode.viewer.sources import Source
-from splatnode.viewer.state import Moment, ViewerState
-from splatnode.viewer.viewpoint import Viewpoint, overview, scene_pivot
+from splatnode.viewer.state import Moment, ViewerState, Viewpoint, overview, scene_pivot
 
 # Who may look: on this machine's own address anybody on it, over a network who has the key.
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.keyframe_selection import Limits, novelty, why_redundant
 from splatnode.capture.lenses import wide_pinhole
-from splatnode.capture.quality import Limits, novelty, why_redundant
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
 from splatnode.extras.evaluate.stability import perturbations
 from splatnode.extras.evaluate.stability.perturbations import (

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.messaging.wire import Message
+from splatnode.capture.messaging.messages import Message
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import event
 from splatnode.recon.config import ReconstructionConfig

@@ -15,9 +15,19 @@ from typing import Any
 import msgspec
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.messaging.messages import StoredFrameMeta, arrays_of, describe_stored_frame, frame_in
-from splatnode.capture.messaging.spool import read_message, write_message
-from splatnode.capture.messaging.wire import Limits, Message, SessionId, WireError, decode, encode
+from splatnode.capture.messaging.keyframe_queue import read_message, write_message
+from splatnode.capture.messaging.messages import (
+    Limits,
+    Message,
+    SessionId,
+    StoredFrameMeta,
+    WireError,
+    arrays_of,
+    decode,
+    describe_stored_frame,
+    encode,
+    frame_in,
+)
 from splatnode.capture.process.files import make_owner_only_folder, remove_leftovers, sync_folder
 from splatnode.capture.process.system import raise_shortage
 

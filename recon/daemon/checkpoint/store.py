@@ -33,8 +33,7 @@ import numpy.typing as npt
 import torch
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
-from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.messaging.wire import Message
+from splatnode.capture.messaging.messages import Message, ReceivedFrame
 from splatnode.capture.process.config import record_of
 from splatnode.capture.process.files import (
     LockHeld,

@@ -16,12 +16,13 @@ from splatnode.capture.messaging.messages import (
     Delivery,
     DroppedHeader,
     FrameHeader,
+    Numbering,
     Ready,
     Refuse,
     Request,
+    encode,
 )
 from splatnode.capture.messaging.pubsub import Want
-from splatnode.capture.messaging.wire import Numbering, encode
 
 LENS = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0, "calibration", (0.1, -0.1))
 IMAGE = np.random.default_rng(0).integers(0, 256, (12, 16, 3)).astype(np.uint8)

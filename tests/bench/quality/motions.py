@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Config as Odometry
-from splatnode.capture.diorama.scene import odometry
+from splatnode.capture.diorama import Config as Odometry
+from splatnode.capture.diorama import odometry
 from splatnode.capture.odometry import Motion
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import align_cameras

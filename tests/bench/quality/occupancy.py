@@ -30,7 +30,7 @@ import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Camera, Solid
+from splatnode.capture.diorama import Camera, Solid
 from splatnode.capture.frame import Frame
 from splatnode.extras.building import CHAIR_ROOM, MIRROR_ROOM, ZONES, interior
 from splatnode.extras.cameras import building

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Camera, Shape, Solid, cast, colour_pixels, trace, turn
+from splatnode.capture.diorama import Camera, Shape, Solid, cast, colour_pixels, trace, turn
 from splatnode.extras.cameras.building import mirror_camera
 
 THROUGH, BACK = 0.9, 0.08  # of the light, that passes the glass, and that it reflects

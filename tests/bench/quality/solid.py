@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.scene import Camera, Shape, Solid, trace
+from splatnode.capture.diorama import Camera, Shape, Solid, trace
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

@@ -19,17 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_SCENE, RECON_STATUS, Network
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.sources import load_result
-from splatnode.viewer.state import Moment
-from splatnode.viewer.viewpoint import overview, project
+from splatnode.viewer.state import Moment, overview, project
 from tests.support.node import heartbeat
 from tests.support.screen import Screen
 

@@ -27,8 +27,7 @@ from splatnode.recon.result.export.prepare import select_gaussians
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.sources import load_result
-from splatnode.viewer.state import Moment
-from splatnode.viewer.viewpoint import overview, project
+from splatnode.viewer.state import Moment, overview, project
 from tests.bench.speed.rasterize import processor_name
 from tests.bench.viewer.drive import growing
 from tests.support.chromium import Browser, browser

@@ -25,8 +25,7 @@ import numpy as np
 from splatnode.viewer.probe import probe_window
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import FixedSource, load_result
-from splatnode.viewer.state import Engine, Moment, ViewerState
-from splatnode.viewer.viewpoint import orbit
+from splatnode.viewer.state import Engine, Moment, ViewerState, orbit
 from tests.bench.speed.rasterize import processor_name
 from tests.bench.viewer.agreement import agreement
 from tests.bench.viewer.watching import thinned, watch

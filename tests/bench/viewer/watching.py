@@ -11,14 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.export.prepare import SH_C0, select_gaussians
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.viewer.sources import load_result
-from splatnode.viewer.state import Moment
-from splatnode.viewer.viewpoint import scene_pivot
+from splatnode.viewer.state import Moment, scene_pivot
 from tests.support.node import memory_mb, processor_s
 from tests.support.screen import Screen
 

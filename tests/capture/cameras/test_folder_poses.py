@@ -11,8 +11,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.messaging.messages import FrameHeader, encode_frame
-from splatnode.capture.messaging.wire import Numbering, decode
+from splatnode.capture.messaging.messages import FrameHeader, Numbering, decode, encode_frame
 from splatnode.capture.odometry import LARGEST_M, GivenPose
 
 NAMES = ("1341847980.722988.png", "1341847981.000000.png", "1341847982.500000.png")

@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.cameras.synthetic import Config
-from splatnode.capture.diorama.scene import Shape, face_points, place, ray_interval, surface_coordinates
+from splatnode.capture.diorama import Shape, face_points, place, ray_interval, surface_coordinates
 from splatnode.capture.frame import Clock, Intrinsics, Stamp
 from splatnode.capture.lenses import unproject
 from tests.support.synthetic import SMALL, photographs, planar, pure_rotation, pure_rotation_cameras, tiny_scene

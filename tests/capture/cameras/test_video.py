@@ -12,8 +12,7 @@ import pytest
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.cameras.video import Config, stream
-from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
-from splatnode.capture.pace import pace_frames
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp, pace_frames
 from tests.support.clips import level_images, turn, write_clip, write_sound
 
 

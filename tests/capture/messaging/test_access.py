@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from splatnode.capture.messaging import network as keys
-from splatnode.capture.messaging.messages import DroppedHeader
+from splatnode.capture.messaging.messages import DroppedHeader, Numbering
 from splatnode.capture.messaging.network import (
     CAPTURE_PREVIEW,
     RECON_SCENE,
@@ -23,7 +23,6 @@ from splatnode.capture.messaging.network import (
     runtime_directory,
 )
 from splatnode.capture.messaging.pubsub import Publisher, StateClient, StateServer, Subscriber
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.command_line import main
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
 from tests.conftest import ROOT
@@ -35,7 +34,7 @@ from splatnode.capture.messaging.messages import DroppedHeader
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.network import RECON_SCENE
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.messaging.messages import Numbering
 resource.setrlimit(resource.RLIMIT_NOFILE, (60, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
 with StateServer(RECON_SCENE, Network(directory=pathlib.Path(sys.argv[1]))) as server:
     server.publish(DroppedHeader(**Numbering().next(), name="a.png", reason="blurred"))

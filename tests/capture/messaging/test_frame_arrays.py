@@ -7,9 +7,17 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import Baseline, Frame, RightImage
-from splatnode.capture.messaging.messages import FrameHeader, arrays_of, decode_frame, encode_frame, frame_in
-from splatnode.capture.messaging.spool import Key
-from splatnode.capture.messaging.wire import Limits, Numbering, decode
+from splatnode.capture.messaging.messages import (
+    FrameHeader,
+    Key,
+    Limits,
+    Numbering,
+    arrays_of,
+    decode,
+    decode_frame,
+    encode_frame,
+    frame_in,
+)
 
 IMAGE = np.zeros((5, 11, 3), np.uint8)
 MASK = np.random.default_rng(0).random((5, 11)) < 0.5

@@ -10,9 +10,9 @@ import pytest
 import zmq
 
 from splatnode.capture.messaging import network as network_module
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, PLACES, Gate, files_for_strangers
 from splatnode.capture.messaging.pubsub import Publisher, Subscriber
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.system import LimitTooLow, network_of, next_to_go
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
 from tests.fuzz.siege import GREETING, HELLO

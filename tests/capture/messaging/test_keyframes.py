@@ -16,11 +16,27 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
-from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
-from splatnode.capture.messaging.messages import Delivery, FrameHeader, Refuse, Request, add_delivery
+from splatnode.capture.messaging.keyframe_queue import (
+    KeyframeClient,
+    KeyframeServer,
+    Spool,
+    SpoolConfig,
+    SpoolFull,
+    spool_directory,
+)
+from splatnode.capture.messaging.messages import (
+    MAGIC,
+    Delivery,
+    FrameHeader,
+    Key,
+    Refuse,
+    Request,
+    WireError,
+    add_delivery,
+    decode,
+    encode,
+)
 from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, AlreadyRunning, Network, runtime_directory
-from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, SpoolFull, spool_directory
-from splatnode.capture.messaging.wire import MAGIC, WireError, decode, encode
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.files import LockHeld
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
@@ -141,7 +157,7 @@ from splatnode.capture.process.files import LockHeld
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.spool import SpoolConfig, Spool
+from splatnode.capture.messaging.keyframe_queue import SpoolConfig, Spool
 folder = pathlib.Path(sys.argv[1])
 server = KeyframeServer(Network(directory=folder / "run"), Spool(SpoolConfig(folder / "state")))
 for index in range(3):

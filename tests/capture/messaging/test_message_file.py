@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.messaging.spool import MessageFileError, read_message, write_message
-from splatnode.capture.messaging.wire import MAGIC, VERSION
+from splatnode.capture.messaging.keyframe_queue import MessageFileError, read_message, write_message
+from splatnode.capture.messaging.messages import MAGIC, VERSION
 
 EDGES = (0, 1, 7, 8, 9, 2**31, 2**32 - 1, 2**62, 2**63, 2**64 - 1)
 

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from splatnode.capture.messaging.spool import Quarantine, QuarantineConfig, QuarantinedKeyframe
+from splatnode.capture.messaging.keyframe_queue import Quarantine, QuarantineConfig, QuarantinedKeyframe
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_a_disk_that_takes_nothing_costs_no_more_than_the_reason(tmp_path, waiti
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("splatnode.capture.messaging.spool.write_atomically", full)
+    monkeypatch.setattr("splatnode.capture.messaging.keyframe_queue.write_atomically", full)
     quarantine.take(waiting(0), "a", "b")
     assert quarantine.newest(1)[0].reason == "b"
     quarantine.mark_seen()

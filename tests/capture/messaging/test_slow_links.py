@@ -14,9 +14,8 @@ import zmq
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import network as network_module
-from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES
-from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from tests.capture.messaging.test_sockets import tcp, wait_for
 from tests.support.slow_link import THERE, slow_link
 

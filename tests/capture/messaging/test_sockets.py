@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from splatnode.capture.messaging import network as keys
+from splatnode.capture.messaging.messages import Header, Numbering
 from splatnode.capture.messaging.network import (
     CAPTURE_PREVIEW,
     RECON_CONTROL,
@@ -33,7 +34,6 @@ from splatnode.capture.messaging.pubsub import (
     Subscriber,
     ask,
 )
-from splatnode.capture.messaging.wire import Header, Numbering
 from tests.conftest import ROOT
 
 

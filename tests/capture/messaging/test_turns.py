@@ -14,8 +14,7 @@ from splatnode.capture.messaging.keyframe_queue import (
     KeyframeClient,
     KeyframeServer,
 )
-from splatnode.capture.messaging.messages import Acknowledge, Ready, Refuse
-from splatnode.capture.messaging.spool import Key
+from splatnode.capture.messaging.messages import Acknowledge, Key, Ready, Refuse
 from tests.capture.messaging.test_keyframes import frame, open_spool, receive, settle
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 

@@ -11,7 +11,7 @@ import zmq
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.messaging.wire import MAGIC, Header, Limits, Numbering, WireError, decode, encode
+from splatnode.capture.messaging.messages import MAGIC, Header, Limits, Numbering, WireError, decode, encode
 
 EDGES = st.sampled_from([-1, 0, 1, 2, 4, 31, 2**16, 2**31, 2**32, 2**62, 2**63]) | st.integers(0, 8)
 

@@ -20,9 +20,8 @@ from splatnode.capture.cameras import folder, watched
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_header import UnusableImage
-from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.network import AllowList, Network, allow, create_keys
-from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process import apart, system
 from splatnode.capture.process.system import is_shortage, may_be_shortage, outlast
 from splatnode.capture.process.terminal import Unfailing

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Camera
+from splatnode.capture.diorama import Camera
 from splatnode.capture.image_file import encode_png
 from splatnode.command_line import main
 from tests.support.located import PLACE, turned

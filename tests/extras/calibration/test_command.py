@@ -15,7 +15,7 @@ from splatnode import command_line
 from splatnode.capture import lenses
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, make_frame
-from splatnode.capture.lens_file import read_lens
+from splatnode.capture.lenses import read_lens
 from splatnode.capture.reader import Config, Reader
 from splatnode.capture.recording import Recorder
 from splatnode.extras.calibration import collect

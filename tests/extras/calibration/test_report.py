@@ -5,7 +5,7 @@ import yaml
 
 from splatnode.capture import lenses
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lens_file import read_lens
+from splatnode.capture.lenses import read_lens
 from splatnode.extras.calibration.board import Board, BoardView
 from splatnode.extras.calibration.collect import add_view, create_coverage, describe_choice, lens_file
 from splatnode.extras.calibration.estimate import MODELS, Choice, choose

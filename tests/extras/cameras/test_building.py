@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.config import CaptureConfig, camera_opener
-from splatnode.capture.diorama.scene import look_at
+from splatnode.capture.diorama import look_at
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.process.config import parse_config
 from splatnode.extras.building import CHAIR_ROOM, CORRIDOR, LOOK_ALIKES, MIRROR_ROOM, ZONES, interior, zones_at

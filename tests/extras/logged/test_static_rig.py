@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from splatnode.capture.multi_camera import select_cameras
+from splatnode.capture.film import select_cameras
 from splatnode.extras.logged.messages import UnusableMessage
 from splatnode.extras.logged.transforms import (
     parse_frame_transforms_protobuf,

@@ -16,10 +16,8 @@ import numpy as np
 import pytest
 
 from splatnode.extras.viewers.viser import ViserStage, _go, make_splat_arguments
-from splatnode.viewer.paint import paint_gaussians
-from splatnode.viewer.shapes import frustum_depth
-from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import move_to_camera, overview
+from splatnode.viewer.shapes import frustum_depth, paint_gaussians
+from splatnode.viewer.state import ViewerState, move_to_camera, overview
 from tests.support.chromium import NAMES, browser, chromium
 from tests.support.exported import make_gaussians, make_snapshot, write
 from tests.viewer.test_scene import camera, moment

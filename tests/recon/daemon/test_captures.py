@@ -17,10 +17,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Stamp
-from splatnode.capture.messaging.keyframe_queue import KeyframeServer
+from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import AlreadyRunning, Network, find_captures
-from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.terminal import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig

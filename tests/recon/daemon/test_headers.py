@@ -11,12 +11,12 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from splatnode.capture import config, status
+from splatnode.capture import config, daemon
 from splatnode.capture.depth_image import DepthNoise
 from splatnode.capture.frame import Baseline, ExposureSettings, Intrinsics
 from splatnode.capture.messaging import messages, pubsub
+from splatnode.capture.messaging.messages import Header
 from splatnode.capture.messaging.pubsub import Want
-from splatnode.capture.messaging.wire import Header
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.recon.daemon import node
 from splatnode.recon.daemon.status import ReconStatus
@@ -26,7 +26,7 @@ from splatnode.recon.result.message import DepthHeader, SceneHeader
 SCHEMAS = [
     messages.FrameHeader, messages.DroppedHeader, messages.Delivery,
     messages.ConsumerStatus, messages.Ready, messages.Acknowledge, messages.Refuse,
-    config.PreviewHeader, status.CaptureStatus, status.Heartbeat, pubsub.MarkProblemsSeen, pubsub.Answer,
+    config.PreviewHeader, daemon.CaptureStatus, daemon.Heartbeat, pubsub.MarkProblemsSeen, pubsub.Answer,
     node.RemoveKeyframe,
     Want, ReconStatus, SceneHeader, MapHeader, DepthHeader,
 ]  # fmt: skip

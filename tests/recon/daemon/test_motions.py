@@ -10,7 +10,7 @@ from msgspec.structs import replace as changed
 import splatnode
 from splatnode.capture import recording
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.diorama.scene import Config as Odometry
+from splatnode.capture.diorama import Config as Odometry
 from splatnode.capture.frame import Frame
 from splatnode.capture.recording import Recorder
 from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace

@@ -9,8 +9,8 @@ from dataclasses import replace as changed
 import numpy as np
 from msgspec.structs import replace
 
+from splatnode.capture.messaging.messages import WireError
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
-from splatnode.capture.messaging.wire import WireError
 from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.free_space import OccupancyResult
 from splatnode.recon.daemon.node import Daemon

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import DroppedFrame, Frame, rename_frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, ask
-from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon import finalizer
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
 from splatnode.recon.daemon.checkpoint import checkpoint, records

@@ -13,8 +13,8 @@ from dataclasses import replace
 import msgspec
 import pytest
 
+from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.status import heartbeats
 from splatnode.recon import incremental
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector

@@ -13,9 +13,9 @@ import pytest
 from splatnode.capture.config import Config as PreviewConfig
 from splatnode.capture.config import encode_preview
 from splatnode.capture.frame import Clock, Frame, Stamp
+from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 from splatnode.capture.messaging.pubsub import Publisher, Subscriber
-from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.terminal import Problems
 from splatnode.recon.daemon import relocalization
 from splatnode.recon.daemon.relocalization import FinalScene, Watcher

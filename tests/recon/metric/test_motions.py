@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from splatnode.capture.diorama.scene import Config as Odometry
-from splatnode.capture.diorama.scene import odometry
+from splatnode.capture.diorama import Config as Odometry
+from splatnode.capture.diorama import odometry
 from splatnode.capture.odometry import Gravity, Motion
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView, make_metric_views

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.diorama.scene import look_at
+from splatnode.capture.diorama import look_at
 from splatnode.capture.odometry import Gravity, Motion, make_given_pose
 from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.measurement import Baseline, MetricConfig

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.capture.diorama.scene import look_at
+from splatnode.capture.diorama import look_at
 from splatnode.recon.occupancy.grid import find_floor, level, upright
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from splatnode.capture.messaging.wire import Header, WireError, decode, encode
+from splatnode.capture.messaging.messages import Header, WireError, decode, encode
 from splatnode.recon.result.export.cameras import decode_cameras, encode_cameras
 from splatnode.recon.result.message import (
     DepthHeader,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Clock, DroppedFrame, Intrinsics, Stamp
-from splatnode.capture.messaging.messages import make_jpeg_array
-from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
+from splatnode.capture.messaging.messages import Message, Numbering, WireError, decode, encode, make_jpeg_array
 from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.result.message import (
     CameraRecord,

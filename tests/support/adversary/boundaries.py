@@ -10,23 +10,26 @@ from typing import Any
 
 from splatnode.capture import recording
 from splatnode.capture.config import CaptureConfig, PreviewHeader, decode_preview
+from splatnode.capture.daemon import CaptureStatus, Heartbeat
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.messaging import network
+from splatnode.capture.messaging.keyframe_queue import Spool, SpoolConfig, read_message
 from splatnode.capture.messaging.messages import (
     ConsumerStatus,
     Delivery,
     DroppedHeader,
     FrameHeader,
+    Key,
+    Limits,
     Request,
+    WireError,
+    decode,
     decode_frame,
 )
 from splatnode.capture.messaging.network import REQUEST_LIMITS
 from splatnode.capture.messaging.pubsub import Answer, Want
-from splatnode.capture.messaging.spool import Key, Spool, SpoolConfig, read_message
-from splatnode.capture.messaging.wire import Limits, WireError, decode
 from splatnode.capture.process.config import ConfigError, load_config
-from splatnode.capture.status import CaptureStatus, Heartbeat
 from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
 from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
 from splatnode.recon.daemon.checkpoint.store import Store

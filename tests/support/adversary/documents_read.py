@@ -21,7 +21,7 @@ import numpy as np
 from splatnode.capture import film
 from splatnode.capture.daemon import LastRun
 from splatnode.capture.image_header import name_time
-from splatnode.capture.messaging.spool import Quarantine, QuarantineConfig
+from splatnode.capture.messaging.keyframe_queue import Quarantine, QuarantineConfig
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.capture.process.text import is_printable, sanitize_name
@@ -257,7 +257,7 @@ def _draw_shown(rng: random.Random) -> messages.Parts:
 
 def _read_shown(parts: messages.Parts, folder: Path) -> object:
     """A scene as far as the browser's page and the panel show it."""
-    from splatnode.capture.messaging.wire import Limits, decode
+    from splatnode.capture.messaging.messages import Limits, decode
 
     snapshot = decode_snapshot(decode(parts, SceneHeader, Limits(1 << 16, 64, 4, 1 << 20))).snapshot
     moment = Moment(_sanitize_snapshot(snapshot), time.monotonic(), "scene-1")
@@ -302,7 +302,7 @@ _BATCH, _WEB = "splatnode.extras.batch", "splatnode.viewer.web"
 _WHOLE = Reader((SceneFileError,), ("splatnode.recon.result.submap_index",))
 _REPORTS = Reader((), (f"{_BATCH}.answer",))
 _LEDGERS = Reader((batch.OtherBatch,), (f"{_BATCH}.ledger",))
-_QUARANTINES = Reader((), ("splatnode.capture.messaging.spool",))
+_QUARANTINES = Reader((), ("splatnode.capture.messaging.keyframe_queue",))
 _LAST_RUNS = Reader((Refused,), ("splatnode.capture.daemon",))
 _MANIFESTS = Reader((), ("splatnode.recon.result.export.result",))
 _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))

@@ -14,7 +14,7 @@ from splatnode.capture.depth_image import make_depth_image
 from splatnode.capture.frame import Clock, Frame, Stamp
 from splatnode.capture.image_file import ORIENTATION, check_whole, measure_values, upright_size
 from splatnode.capture.image_header import UnusableImage, exif_time
-from splatnode.capture.lens_file import UnusableLens, read_lens
+from splatnode.capture.lenses import UnusableLens, read_lens
 from splatnode.capture.masks import UnusableMask, apply_mask, read_mask
 from splatnode.capture.pose_files import PosesFileError, read_poses
 from splatnode.capture.process.text import guard_untrusted
@@ -151,10 +151,10 @@ def _modules(*names: str) -> tuple[str, ...]:
     return tuple(f"{_CAPTURE}.{name}" for name in names)
 
 
-_LENSES = Reader((UnusableLens,), _modules("lens_file"))
+_LENSES = Reader((UnusableLens,), _modules("lenses"))
 _POSES = Reader((PosesFileError,), _modules("poses_file", "colmap_images"))
 _EXIF = Reader((), _modules("image_header"))
-_HEADERS = Reader((UnusableImage,), _modules("image_header", "jpeg2000", "heif_file"))
+_HEADERS = Reader((UnusableImage,), _modules("image_header", "image_file"))
 _LOGGED = Reader(
     (UnusableMessage,), tuple(f"splatnode.extras.logged.{name}" for name in ("messages", "depth_messages"))
 )

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from splatnode.capture.messaging.wire import DTYPES, MAGIC
+from splatnode.capture.messaging.messages import DTYPES, MAGIC
 from tests.support.adversary import edges
 from tests.support.adversary.schema_values import value
 

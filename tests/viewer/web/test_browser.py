@@ -12,10 +12,9 @@ import pytest
 
 from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
-from splatnode.viewer.paint import paint_gaussians
+from splatnode.viewer.shapes import paint_gaussians
 from splatnode.viewer.sources import FixedSource
-from splatnode.viewer.state import ViewerState
-from splatnode.viewer.viewpoint import BACKGROUND, Viewpoint, look_at, move_to_camera, orbit, pan, zoom
+from splatnode.viewer.state import BACKGROUND, ViewerState, Viewpoint, look_at, move_to_camera, orbit, pan, zoom
 from splatnode.viewer.web.server import ListenAddress, describe_session, make_content, open_server
 from tests.bench.viewer.drive_web import WINDOW, drive, fact, settle, watched
 from tests.support.chromium import NAMES, browser, chromium

@@ -1,4 +1,4 @@
-// Where the person looks from: orbit, pan, zoom. The same movements as in splatnode/viewer/viewpoint.py.
+// Where the person looks from: orbit, pan, zoom. The same movements as in splatnode/viewer/state.py.
 // A viewpoint is {T, distance, up, lens}: T is T_world_camera, 16 numbers by rows (camera x right, y down, z forward),
 // the pivot lies `distance` ahead, and lens is {K (9 numbers by rows), size [width, height]}.
 

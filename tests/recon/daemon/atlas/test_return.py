@@ -11,9 +11,9 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.status import heartbeats
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.daemon.atlas import loop_closure as module
 from splatnode.recon.daemon.atlas.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.messaging.wire import Message
+from splatnode.capture.messaging.messages import Message, ReceivedFrame
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint import store as checkpoint_store

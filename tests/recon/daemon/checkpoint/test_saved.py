@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.messaging.wire import Message, decode, encode
+from splatnode.capture.messaging.messages import Message, decode, encode
 from splatnode.recon.daemon.checkpoint.store import (
     GraphRecord,
     SceneRecord,

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
-from splatnode.capture.messaging.messages import ReceivedFrame
-from splatnode.capture.messaging.spool import write_message
-from splatnode.capture.messaging.wire import MAGIC, encode
+from splatnode.capture.messaging.keyframe_queue import write_message
+from splatnode.capture.messaging.messages import MAGIC, ReceivedFrame, encode
 from splatnode.recon.daemon.checkpoint import records as ledger_module
 from splatnode.recon.daemon.checkpoint.records import (
     VERSION,

@@ -1,10 +1,11 @@
-"""Lens, depth image, pose, motion, gravity and mount of one image, as a program gives them, as records of a frame."""
+"""What a program gives: its arguments as records, its warnings at its own line, its errors as text that only shows."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,8 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.depth_files import read_depth_file
-from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit, make_depth_image
+from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit, make_depth_image, read_depth_file
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_file import UnusableImage
 from splatnode.capture.messaging.network import CAMERA_ID
@@ -30,8 +30,41 @@ from splatnode.capture.odometry import (
     make_given_pose,
     rigid_problem,
 )
-from splatnode.capture.process.terminal import notify
-from splatnode.capture.process.text import LONGEST_NAME, is_printable
+from splatnode.capture.process.terminal import give_warnings, notify
+from splatnode.capture.process.text import LONGEST_NAME, is_printable, sanitize_lines
+
+# The entrance of a program: it hears warnings at its own line, and errors as text that only shows.
+
+
+@contextlib.contextmanager
+def enter_api() -> Iterator[None]:
+    """In here notices are Python warnings, and the texts of errors are those that the command line would print.
+
+    What a file or a sender wrote may be part of them: a traceback in a terminal shows it and does nothing else.
+    """
+    with give_warnings():
+        try:
+            yield
+        except Exception as error:
+            sanitize_error(error)
+            raise
+
+
+def sanitize_error(error: BaseException) -> None:
+    """Makes the texts of an error, and of those that led to it, printable."""
+    seen: set[int] = set()
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        each = waiting.pop()
+        if each is None or id(each) in seen:
+            continue
+        seen.add(id(each))
+        waiting += [each.__cause__, each.__context__]
+        if not isinstance(each, UnicodeError) and any(isinstance(part, str) for part in each.args):
+            each.args = tuple(sanitize_lines(part) if isinstance(part, str) else part for part in each.args)
+
+
+# Lens, depth image, pose, motion, gravity and mount of one image, as a program gives them, as records of a frame.
 
 log = logging.getLogger(__name__)
 

@@ -1,8 +1,4 @@
-"""Collects the solids of a place, and paints them: what layouts and furniture are built with.
-
-Light is baked into the skins: a low sun with soft shadows, and the sky as far as other solids leave it open. All
-surfaces are Lambertian, so that a point has one colour from everywhere and the skin can hold it.
-"""
+"""The place that the synthetic camera photographs: solids, their textures, their light and their layout."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.diorama import textures as paint
+from splatnode.capture import textures as paint
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import unproject
 from splatnode.capture.odometry import Gravity, Motion

@@ -1,1 +1,0 @@
-"""The place that the synthetic camera photographs: solids, their textures, their light and their layout."""
