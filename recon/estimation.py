@@ -9,7 +9,7 @@ from splatnode.capture.frame import Stamp
 from splatnode.recon.clock import make_deadline_pause
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.keyframes import Rejected
 from splatnode.recon.locating.landmarks import collect_landmarks
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.depth_fill import fill_measured_depth

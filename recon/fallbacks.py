@@ -28,9 +28,8 @@ import numpy.typing as npt
 from splatnode.recon.clock import is_over
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.frames.keyframe import PLAIN
-from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.geometry import align_cameras, angles_deg
+from splatnode.recon.keyframes import PLAIN, Rejected
 from splatnode.recon.learned_parts import LearnedPart, find_unavailable_reason
 from splatnode.recon.matching.features import count_search_pixels
 from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_weak_pair

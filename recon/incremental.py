@@ -20,8 +20,7 @@ from splatnode.recon.clock import Clock, OutOfTime, Timer
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth, extend_reconstruction
 from splatnode.recon.fallbacks import make_fallback_key, run_fallbacks
-from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.frames.screening import Rejected, ScreeningState
+from splatnode.recon.keyframes import Keyframe, Rejected, ScreeningState
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match_newest, match_pending
 from splatnode.recon.metric.depth_fill import fill_measured_depth

@@ -27,8 +27,8 @@ from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, ReconstructionSummary, estimate_cameras, estimate_depth
 from splatnode.recon.fallbacks import run_fallbacks
-from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.metric.depth_fit import describe_doubtful_units

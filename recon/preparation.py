@@ -12,7 +12,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, resize_image
+from splatnode.recon.keyframes import LIBRARY_ERRORS, Features, Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.rasterize.dispatch import choose_device, format_device

@@ -21,8 +21,8 @@ from splatnode.capture.image_file import encode_jpeg
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
 from splatnode.extras.evaluate.protocol import Row
 from splatnode.extras.evaluate.regions import UNKNOWN, Counts
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.geometry import project, transform_to_camera
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.priors import stereo
 from splatnode.recon.priors.stereo import DepthMap
 

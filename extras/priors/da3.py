@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from splatnode.capture.process.config_keys import Internal
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching.features import describe
 from splatnode.recon.matching.view_graph import ViewGraph

@@ -29,7 +29,7 @@ from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint.records import StoredFrame
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.preparation import prepare
 
 LOOK_S = 0.5  # between looks at whether another capture has come

@@ -22,8 +22,8 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale

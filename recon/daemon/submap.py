@@ -30,8 +30,8 @@ from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap_index import SubmapState
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore_cancel
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import SceneWithVerdict
 from splatnode.recon.result import snapshot as result_snapshot

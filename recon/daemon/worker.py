@@ -25,7 +25,7 @@ from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, 
 from splatnode.recon.daemon.output import Output, PublishedSnapshot
 from splatnode.recon.daemon.status import PLACES, SubmapStatus
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 
 log = logging.getLogger(__name__)
 

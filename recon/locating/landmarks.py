@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Keyframe, longer_side
+from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.features import DESCRIPTOR_SIZE
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import bundle_adjustment, triangulation

@@ -19,8 +19,8 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lens_file import assign_lens, check_fits, same_aspect
 from splatnode.capture.lenses import undistort_frame
-from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.geometry import compute_rms_radius
+from splatnode.recon.keyframes import Features, longer_side, principal_point
 from splatnode.recon.locating import pose_refinement, verification
 from splatnode.recon.locating.outcome import Located, NotLocated, Reason
 from splatnode.recon.locating.pose_refinement import (

@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon import poselib
-from splatnode.recon.frames.keyframe import PLAIN, Features
 from splatnode.recon.geometry import cross_matrix, distortion
 from splatnode.recon.geometry import undistort_rays as straight
+from splatnode.recon.keyframes import PLAIN, Features
 from splatnode.recon.locating.outcome import NORMAL_95, LensSource, Located
 from splatnode.recon.matching import features as matching_features
 from splatnode.recon.registration import epipolar

@@ -20,7 +20,7 @@ from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.clock import is_over
-from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Keyframe, content_key
+from splatnode.recon.keyframes import LIBRARY_ERRORS, Keyframe, content_key
 from splatnode.recon.matching import features
 from splatnode.recon.matching import pair_matching as candidates
 from splatnode.recon.matching import pair_matching as matching_pair_matching

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lenses import project, unproject
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.depth_fit import DepthFit, DepthView, find_depth_lens, fit_depth_images, group_by_name
 from splatnode.recon.priors.pointmap import LEAST_CONFIDENCE, Pointmap, compute_depth_normals

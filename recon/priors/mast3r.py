@@ -34,8 +34,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from splatnode.capture.process.config_keys import Internal
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import Similarity
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks import weights
 from splatnode.recon.networks.depth_anything import Fusion

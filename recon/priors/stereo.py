@@ -20,7 +20,7 @@ import numpy.typing as npt
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.clock import OutOfTime
 from splatnode.recon.core import library, pointer
-from splatnode.recon.frames.keyframe import LIBRARY_ERRORS
+from splatnode.recon.keyframes import LIBRARY_ERRORS
 from splatnode.recon.threads import map_parallel
 
 Float32 = npt.NDArray[np.float32]

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Keyframe, longer_side, principal_point
 from splatnode.recon.geometry import cross_matrix
+from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Keyframe, longer_side, principal_point
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration.known_poses import Given
 

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras, compute_rms_radius
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration.known_poses import Offset, has_pose
 from splatnode.recon.registration.registration import Registration
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import compute_rms_radius, cross_matrix
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment
 
 Array = npt.NDArray[np.float64]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.keyframes import REFERENCE_SIDE
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment, triangulation
 

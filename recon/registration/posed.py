@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import cross_matrix
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,

@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.rig import TOLERANCE_S, Rig
-from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
+from splatnode.recon.keyframes import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,

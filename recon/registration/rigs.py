@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Stamp
 from splatnode.capture.rig import FrameSet, Rig, form_frame_sets
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment, known_poses, rig_poses
 from splatnode.recon.registration.given_rig import GivenMounts, fit_given_rig
 from splatnode.recon.registration.incremental_mapper import Map

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe, longer_side
+from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment
 from splatnode.recon.registration.mapping_problem import Lens

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
 from splatnode.recon.geometry import cross_matrix
+from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
 from splatnode.recon.matching import features as matching_features
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import epipolar

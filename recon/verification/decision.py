@@ -13,9 +13,8 @@ from functools import cached_property
 import numpy as np
 
 from splatnode.capture import quality
-from splatnode.recon.frames.keyframe import longer_side
-from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.geometry import distortion
+from splatnode.recon.keyframes import Rejected, longer_side
 from splatnode.recon.matching.pair_matching import TwoView, median_motion_px
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, umeyama
+from splatnode.recon.keyframes import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,

@@ -14,8 +14,8 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image
 from splatnode.recon import preparation
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.dynamic_objects import moving_points
 from splatnode.recon.matching.view_graph import match

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph

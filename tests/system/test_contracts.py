@@ -17,7 +17,7 @@ WRONG = (
     ("splatnode.capture.quality", "splatnode.recon.geometry"),
     ("splatnode.recon.result.report", "splatnode.viewer.state"),
     ("splatnode.recon.clock", "splatnode.command_line"),
-    ("splatnode.recon.frames.screening", "splatnode.recon.matching.features"),
+    ("splatnode.recon.keyframes", "splatnode.recon.matching.features"),
     ("splatnode.recon.matching.features", "splatnode.recon.registration.bundle_adjustment"),
     ("splatnode.recon.registration.bundle_adjustment", "splatnode.recon.verification.evidence"),
     ("splatnode.recon.verification.evidence", "splatnode.recon.priors.prior"),

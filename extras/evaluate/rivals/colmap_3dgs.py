@@ -20,7 +20,7 @@ from splatnode.capture.lenses import undistort_frame
 from splatnode.extras.evaluate.rivals import outcome
 from splatnode.extras.evaluate.rivals.colmap import RegisteredFrame, SparseModel, reconstruct_sparse_model
 from splatnode.recon.clock import Clock
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.optimize import ensemble, training
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice

@@ -17,7 +17,7 @@ from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.rivals import outcome, radiance_field
 from splatnode.extras.evaluate.rivals.radiance_field import Focal, make_field_snapshot
 from splatnode.recon.clock import Clock
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 SIZE = 256  # longer side of the photographs, pixels

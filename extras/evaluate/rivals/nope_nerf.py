@@ -22,7 +22,7 @@ from splatnode.extras.evaluate.rivals import outcome, radiance_field
 from splatnode.extras.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
 from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
 from splatnode.extras.evaluate.rivals.radiance_field import Focal, make_field_snapshot, sample_pixels
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 _DEPTH, _CLOUD, _SURFACE = 0.04, 1.0, 1.0  # weights

@@ -23,7 +23,7 @@ from splatnode.recon.daemon.checkpoint.records import CheckpointError
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.submap_index import SubmapIndex
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.frames.keyframe import Keyframe, longer_side
+from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching import pair_matching
 from splatnode.recon.matching.features import compute_global_descriptor
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph, match_pending

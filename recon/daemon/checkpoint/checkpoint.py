@@ -12,9 +12,8 @@ from splatnode.capture.process.system import is_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint import store as checkpoint_store
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.frames.screening import ScreeningState
 from splatnode.recon.incremental import IncrementalReconstruction, ReconstructionCache, StreamState
+from splatnode.recon.keyframes import Features, Keyframe, ScreeningState
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import prepare_scene_for_display
 from splatnode.recon.preparation import prepare

@@ -60,7 +60,7 @@ from splatnode.recon.daemon.checkpoint.records import (
     write_ledger,
 )
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap

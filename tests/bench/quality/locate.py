@@ -40,8 +40,8 @@ from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.fallbacks import run_fallbacks
-from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.locating.localize import QUICK, follow, localize_image, localize_query, prepare_query_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching.view_graph import match

@@ -22,7 +22,7 @@ from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.extras.evaluate.regions import Counts
 from splatnode.extras.evaluate.shown import compute_surfaces, count_visibility_by_name
 from splatnode.recon.config import preset
-from splatnode.recon.frames.keyframe import resize_mask
+from splatnode.recon.keyframes import resize_mask
 from splatnode.recon.pipeline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case

@@ -11,7 +11,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.output import MetricScaler
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.metric.measurement import MetricConfig as Metric
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.cameras import decode_scale

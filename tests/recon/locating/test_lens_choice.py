@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.keyframes import Features
 from splatnode.recon.locating import pose_refinement
 from splatnode.recon.locating.localize import follow, localize_image, prepare_query_image
 from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.odometry import make_given_pose
-from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
+from splatnode.recon.keyframes import PLAIN, Features, Keyframe
 from splatnode.recon.registration import guided
 from splatnode.recon.registration.known_poses import collect_known_poses
 

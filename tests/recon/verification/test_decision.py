@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.keyframes import Rejected
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.consistency import Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration

@@ -14,7 +14,7 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.masks import apply_mask
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.preparation import prepare_all
 from splatnode.recon.result.verdict import Code, Verdict

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.verification import consistency
 from tests.support.synthetic import photographs

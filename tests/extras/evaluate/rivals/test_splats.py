@@ -17,7 +17,7 @@ from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.protocol import psnr
 from splatnode.extras.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, outcome
 from splatnode.extras.evaluate.rivals.colmap import reconstruct_sparse_model
-from splatnode.recon.frames.keyframe import resize_image
+from splatnode.recon.keyframes import resize_image
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import ControlChoice

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.frames.keyframe import Features, Keyframe, compute_model_size, resize_image
+from splatnode.recon.keyframes import Features, Keyframe, compute_model_size, resize_image
 
 NO_FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros(0, np.int64), np.zeros(0))
 

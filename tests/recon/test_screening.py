@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.frames.screening import ScreeningConfig, screen, summarise
+from splatnode.recon.keyframes import ScreeningConfig, screen, summarise
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import blurred, exposed, photographs, renumbered, repeated
 

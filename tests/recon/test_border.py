@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from splatnode.recon.frames.screening import valid_masks, valid_rectangle
+from splatnode.recon.keyframes import valid_masks, valid_rectangle
 
 HEIGHT, WIDTH = 80, 120
 
