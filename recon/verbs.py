@@ -146,7 +146,7 @@ VERBS = (
         "occupancy",
         "tell which space of a scene is free, occupied, or not seen",
         _occupancy_arguments,
-        import_lazily("splatnode.recon.occupancy.command", "map_result"),
+        import_lazily("splatnode.recon.occupancy.files", "map_result"),
     ),
     Verb(
         "merge",

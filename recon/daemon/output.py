@@ -28,7 +28,7 @@ from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.occupancy.message import encode_map, no_map
+from splatnode.recon.occupancy.grid import encode_map, no_map
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.report import write_result_folder

@@ -34,8 +34,8 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
 from splatnode.recon.daemon.node import Command
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.message import MapHeader
-from splatnode.recon.occupancy.message import decode_map as map_from
+from splatnode.recon.occupancy.grid import MapHeader
+from splatnode.recon.occupancy.grid import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
