@@ -27,7 +27,7 @@ from splatnode.capture.process.system import is_shortage
 from splatnode.capture.process.terminal import ProgressStep, format_times, is_interactive, progress, say, show_progress
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import config as daemon
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps

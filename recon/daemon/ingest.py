@@ -27,8 +27,8 @@ from splatnode.capture.process.logs import Problems, is_logged
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.checkpoint.records import StoredFrame
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import StoredFrame
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.preparation import prepare
 

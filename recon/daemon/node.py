@@ -56,7 +56,7 @@ from splatnode.capture.process.terminal import say, show_progress
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.process.unfailing import Unfailing
 from splatnode.recon.config import apply_changes
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame

@@ -16,9 +16,8 @@ from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
-from splatnode.recon.daemon import submap_index
-from splatnode.recon.daemon.checkpoint import checkpoint
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import checkpoint, submap_index
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record

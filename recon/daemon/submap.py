@@ -20,12 +20,11 @@ from splatnode.capture.process.system import is_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import submap_index
-from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
-from splatnode.recon.daemon.checkpoint import checkpoint
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import checkpoint, submap_index
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
+from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState

@@ -19,7 +19,7 @@ from splatnode.capture.messaging.messages import FrameHeader, decode_frame, enco
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Limits, Numbering, WireError, decode, encode
 from splatnode.capture.recording import INDEX, Recorder, read
-from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
+from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 from tests.capture.cameras.test_folder import encoded, tiff, with_exif
 
 TOLD = ExposureSettings(0.008, 400.0, 2.0)

@@ -16,7 +16,7 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.config import parse_config
 from splatnode.command_line import main
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.node import Daemon
 from splatnode.recon.daemon.status import ReconState

@@ -564,7 +564,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/checkpoint/store.py",
+        "recon/daemon/checkpoint.py",
         (
             "a frame that was removed may come again",
             "gone=(*ledger.gone, key)[-REMEMBERED:],",
@@ -578,7 +578,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/atlas/pose_graph.py",
+        "recon/daemon/pose_graph.py",
         ("a contradicted loop stays", "CONTRADICTED = 5.0", "CONTRADICTED = 1e6"),
         (
             "links are followed the wrong way",

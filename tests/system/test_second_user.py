@@ -19,7 +19,7 @@ from splatnode.capture.messaging.network import RECON_SCENE, Network, NetworkErr
 from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.messaging.spool import Spool, SpoolConfig
 from splatnode.capture.process.files import NotOwnerOnly
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from tests.conftest import ROOT
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 

@@ -13,7 +13,7 @@ from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.recon.config import FallbackConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.daemon import worker
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.preparation import prepare

@@ -29,9 +29,9 @@ from splatnode.capture.process.config import load_config
 from splatnode.capture.process.config_text import ConfigError
 from splatnode.capture.status import CaptureStatus, Heartbeat
 from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
-from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
+from splatnode.recon.daemon.ledger import CheckpointError, Ledger
 from splatnode.recon.daemon.node import Command
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.occupancy.grid import MapHeader
@@ -212,7 +212,7 @@ _RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
 _YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.capture.process.config"))
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
 _SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
-_CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))
+_CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint",))
 _KEYS = Reader((network.KeyFileError,), (f"{_MESSAGING}.keys",))
 
 

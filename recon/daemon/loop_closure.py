@@ -17,10 +17,10 @@ from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon.atlas.pose_graph import EdgeKind, PoseGraphEdge, make_loop_edge
-from splatnode.recon.daemon.checkpoint import checkpoint, records
-from splatnode.recon.daemon.checkpoint.records import CheckpointError
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import checkpoint, ledger
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import CheckpointError
+from splatnode.recon.daemon.pose_graph import EdgeKind, PoseGraphEdge, make_loop_edge
 from splatnode.recon.daemon.submap_index import SubmapIndex
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.keyframes import Keyframe, longer_side
@@ -299,9 +299,9 @@ class LoopDetector:
         self._directory, self._config, self._places = directory, config, places
         self._matcher: Matcher | None = None
         self._codes: dict[str, Codes] = {}
-        for folder in (*records.list_finished_folders(directory), *records.list_left_folders(directory)):
+        for folder in (*ledger.list_finished_folders(directory), *ledger.list_left_folders(directory)):
             try:
-                found = records.load(folder, "codes", DescriptorsRecord)
+                found = ledger.load(folder, "codes", DescriptorsRecord)
                 self._codes |= {} if found is None else {folder.name: parse_descriptors(found)}
             except ValueError as error:
                 log.warning("%s is not recognised again: %s", folder.name, error)
@@ -345,7 +345,7 @@ class LoopDetector:
 
     def _load_graph(self, scene: str) -> ViewGraph:
         """Loads the view graph of a verified scene; an empty one where it cannot be read."""
-        folder = records.find_folder(self._directory, scene)
+        folder = ledger.find_folder(self._directory, scene)
         if folder.exists():
             try:
                 with contextlib.closing(Store(folder)) as store:

@@ -14,8 +14,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.atlas import loop_closure as module
-from splatnode.recon.daemon.atlas.loop_closure import (
+from splatnode.recon.daemon import loop_closure as module
+from splatnode.recon.daemon.loop_closure import (
     LoopSide,
     VerifiedLoop,
     centre_descriptors,
@@ -26,7 +26,7 @@ from splatnode.recon.daemon.atlas.loop_closure import (
     rank_similar_scenes,
     verify_loop,
 )
-from splatnode.recon.daemon.atlas.pose_graph import EdgeKind, make_loop_edge
+from splatnode.recon.daemon.pose_graph import EdgeKind, make_loop_edge
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.preparation import prepare

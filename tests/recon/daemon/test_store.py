@@ -17,16 +17,9 @@ from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stam
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.spool import write_message
 from splatnode.capture.messaging.wire import MAGIC, encode
-from splatnode.recon.daemon.checkpoint import records as ledger_module
-from splatnode.recon.daemon.checkpoint.records import (
-    VERSION,
-    CheckpointError,
-    Ledger,
-    StoredFrame,
-    file_name,
-    read_ledger,
-)
-from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, Store
+from splatnode.recon.daemon import ledger as ledger_module
+from splatnode.recon.daemon.checkpoint import REMEMBERED_DROPPED, Store
+from splatnode.recon.daemon.ledger import VERSION, CheckpointError, Ledger, StoredFrame, file_name, read_ledger
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2

@@ -15,10 +15,10 @@ from msgspec.structs import replace
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
-from splatnode.recon.daemon.checkpoint import checkpoint
-from splatnode.recon.daemon.checkpoint import store as checkpoint_store
-from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
-from splatnode.recon.daemon.checkpoint.store import GraphRecord, Store
+from splatnode.recon.daemon import checkpoint
+from splatnode.recon.daemon import checkpoint as checkpoint_store
+from splatnode.recon.daemon.checkpoint import GraphRecord, Store
+from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
 from splatnode.recon.registration.registration import RegisteredCamera

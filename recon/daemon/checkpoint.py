@@ -22,7 +22,7 @@ import itertools
 import logging
 import threading
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,11 +43,12 @@ from splatnode.capture.process.files import (
     remove_leftovers,
 )
 from splatnode.capture.process.records import record_of
-from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.system import is_shortage, raise_shortage
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 from splatnode.capture.rig import form_frame_sets
-from splatnode.recon.daemon.checkpoint import records
-from splatnode.recon.daemon.checkpoint.records import (
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.daemon import ledger as records
+from splatnode.recon.daemon.ledger import (
     FRAME_FILE,
     MADE_ANEW,
     CheckpointError,
@@ -60,9 +61,12 @@ from splatnode.recon.daemon.checkpoint.records import (
     write_ledger,
 )
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.keyframes import Features, Keyframe
+from splatnode.recon.incremental import IncrementalReconstruction, ReconstructionCache, StreamState
+from splatnode.recon.keyframes import Features, Keyframe, ScreeningState
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.modelling import prepare_scene_for_display
+from splatnode.recon.preparation import prepare
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.registration.undistortion import undistort_keyframe
@@ -571,3 +575,128 @@ def parse_pointmaps(message: Message[PointmapsRecord], keyframes: Mapping[str, K
             unchecked=np.array(unchecked).view(np.float16) if unchecked.size else None,
         )
     return found
+
+
+# A reconstruction into the checkpoint and out of it again. What is missing there is made anew from the keyframes.
+
+
+@dataclass(frozen=True, eq=False)
+class RestoredReconstruction:
+    work: IncrementalReconstruction
+    keyframes: int
+    new: list[Keyframe]  # that the reconstruction does not know yet
+    final: bool  # whether its scene is as good as it gets
+
+
+def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
+    """Keeps what `work` knows; whether its scene is `final`. Raises OSError."""
+    store.save("graph", *make_graph_message(work.graph))
+    save_fallbacks(store, work)
+    estimate = work.find_reconstruction()
+    # Cameras that given poses hold have no evidence, and are estimated anew after a restart.
+    if estimate is not None and estimate.publishable and estimate.evidence is not None:
+        store.save("judgement", *make_reconstruction_message(estimate, work.publishable_names))
+    if work.scene is not None:
+        store.save("pointmaps", *make_pointmaps_message(work.state.pointmaps))
+        store.save("scene", *make_scene_message(work.scene, final))
+
+
+def save_fallbacks(store: Store, work: IncrementalReconstruction) -> None:
+    """Keeps which fallbacks gained nothing. Raises OSError."""
+    fruitless = work.state.memory.fruitless
+    if fruitless:
+        store.save("fallbacks", FallbacksRecord(list(fruitless)), [])
+
+
+def restore(store: Store, config: ReconstructionConfig) -> RestoredReconstruction:
+    """The reconstruction that the checkpoint holds. A frame that cannot be used is left out of it for good.
+
+    Raises MemoryError and the like: what there is no memory for now is no fault of the files.
+    """
+    frames = [stored.frame for stored in store.frames()]
+    try:
+        return _restore_reconstruction(store, frames, config)
+    except Exception as error:  # whatever the files of another version, or of a faulty disk, make fail
+        if is_shortage(error):
+            raise
+        log.warning("the checkpoint's scene is made anew: %s: %s", type(error).__name__, error)
+        keyframes = _prepare_keyframes(store, frames, config, {})
+        return RestoredReconstruction(
+            IncrementalReconstruction(config), len(keyframes), list(keyframes.values()), final=False
+        )
+
+
+def load_graph(store: Store, config: ReconstructionConfig) -> ViewGraph:
+    """The view graph that the checkpoint holds; an empty one where it holds none. Raises OSError."""
+    record = store.load("graph", GraphRecord)
+    if record is None:
+        return ViewGraph(config.matching)
+    before = parse_graph(record)
+    keyframes = _prepare_keyframes(store, [stored.frame for stored in store.frames()], config, before.features)
+    return _make_graph(config, [keyframe for name, keyframe in keyframes.items() if name in before.features], before)
+
+
+def _prepare_keyframes(
+    store: Store, frames: Sequence[Frame], config: ReconstructionConfig, known: Mapping[str, Features]
+) -> dict[str, Keyframe]:
+    """The keyframes by their names, with the features that are known."""
+    keyframes = {}
+    for frame in frames:
+        try:
+            keyframes[frame.name] = prepare(frame, config, known.get(frame.name))
+        except Exception as error:
+            if is_shortage(error):
+                raise
+            log.error("%s cannot be used: %s", frame.name, error)
+            with contextlib.suppress(OSError):  # the next start finds it again
+                store.forget(frame.name, f"cannot be used: {error}")
+    return keyframes
+
+
+def _restore_reconstruction(
+    store: Store, frames: Sequence[Frame], config: ReconstructionConfig
+) -> RestoredReconstruction:
+    record = store.load("graph", GraphRecord)
+    before = parse_graph(record) if record is not None else SavedGraph({}, {}, [])
+    keyframes = _prepare_keyframes(store, frames, config, before.features)
+    record = store.load("scene", SceneRecord)
+    scene = parse_scene(record, keyframes) if record is not None else None
+    final = record is not None and record.header.final and scene is not None
+    record = store.load("pointmaps", PointmapsRecord)
+    graph = _make_graph(config, [keyframes[name] for name in keyframes if name in before.features], before)
+    known = StreamState(
+        graph,
+        beside=ViewGraph(config.matching),
+        screened=_screen_keyframes(graph),
+        memory=_load_memory(store, graph),
+        pointmaps=parse_pointmaps(record, keyframes) if record is not None else {},
+        show=prepare_scene_for_display(scene, config),
+    )
+    new = [keyframe for name, keyframe in keyframes.items() if name not in before.features]
+    return RestoredReconstruction(IncrementalReconstruction(config, known), len(keyframes), new, final)
+
+
+def _make_graph(config: ReconstructionConfig, keyframes: Sequence[Keyframe], before: SavedGraph) -> ViewGraph:
+    """The view graph of the keyframes, with what an earlier process knew of their pairs."""
+    position = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
+    pairs = {(position[i], position[j]): pair for (i, j), pair in before.pairs.items() if {i, j} <= position.keys()}
+    pending = {(position[i], position[j]) for i, j in before.pending if {i, j} <= position.keys()}
+    return ViewGraph(config.matching, tuple(keyframes), pairs, frozenset(pending))
+
+
+def _screen_keyframes(graph: ViewGraph) -> ScreeningState:
+    screened = ScreeningState()
+    for keyframe in graph.keyframes:
+        screened = screened.add_known_frame(keyframe.frame)
+    return screened
+
+
+def _load_memory(store: Store, graph: ViewGraph) -> ReconstructionCache:
+    """Loads the estimate of exactly these keyframes, if there is one, and the fruitless fallbacks."""
+    record = store.load("fallbacks", FallbacksRecord)
+    memory = ReconstructionCache(fruitless=() if record is None else tuple(record.header.fruitless))
+    record = store.load("judgement", ReconstructionRecord)
+    if record is None or record.header.names != graph.names:
+        return memory
+    estimate, proven = parse_reconstruction(record, graph), frozenset(record.header.proven)
+    return replace(memory, recent=(((tuple(graph.names), 0), estimate),), proven=proven)

@@ -10,7 +10,7 @@ import torch
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.messaging.wire import Message, decode, encode
-from splatnode.recon.daemon.checkpoint.store import (
+from splatnode.recon.daemon.checkpoint import (
     GraphRecord,
     SceneRecord,
     make_graph_message,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.daemon.atlas.pose_graph import MIN_SHARED, make_chain_edge, transfer_edge
+from splatnode.recon.daemon.pose_graph import MIN_SHARED, make_chain_edge, transfer_edge
 from splatnode.recon.geometry import Similarity
 from tests.support.synthetic import SMALL
 

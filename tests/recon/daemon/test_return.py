@@ -15,12 +15,12 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.status import heartbeats
 from splatnode.extras.evaluate.protocol import compare_cameras
-from splatnode.recon.daemon.atlas import loop_closure as module
-from splatnode.recon.daemon.atlas.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message
-from splatnode.recon.daemon.checkpoint import checkpoint, records
-from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.finalizer import InactiveSubmaps
+from splatnode.recon.daemon import checkpoint, ledger
+from splatnode.recon.daemon import loop_closure as module
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message
 from splatnode.recon.daemon.submap_index import SubmapIndex
+from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
@@ -105,9 +105,9 @@ def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_
         wait_for(lambda: heartbeats(kidnapped.network)["recon"]["scenes"] == 3, PATIENCE_S)
     drafts = places_file(kidnapped)
     assert [place["judged"] for place in drafts["places"]] == [True] * 3
-    assert [folder.name for folder in records.list_left_folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
+    assert [folder.name for folder in ledger.list_left_folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
     with running(kidnapped):
-        wait_for(lambda: not records.list_left_folders(kidnapped.checkpoint), PATIENCE_S)
+        wait_for(lambda: not ledger.list_left_folders(kidnapped.checkpoint), PATIENCE_S)
         wait_for(lambda: heartbeats(kidnapped.network)["recon"]["unfinished"] == 0, PATIENCE_S)
     whole = places_file(kidnapped)
     assert not any(place["provisional"] for place in whole["places"])
@@ -128,7 +128,7 @@ def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kid
         with walked(kidnapped, peer):
             pass
     assert places_file(kidnapped)["links"] == []
-    assert [folder.name for folder in records.list_finished_folders(kidnapped.checkpoint)] == [
+    assert [folder.name for folder in ledger.list_finished_folders(kidnapped.checkpoint)] == [
         "scene-0001",
         "scene-0002",
     ]
@@ -156,7 +156,7 @@ def test_a_finished_place_whose_files_are_damaged_is_not_recognised_and_stops_no
                 *make_descriptors_message(work.graph.keyframes, compute_global_descriptors(work.graph.keyframes)),
             )
             store.finalize()
-    damaged = records.make_finished_path(tmp_path / "checkpoint", "scene-0001") / file
+    damaged = ledger.make_finished_path(tmp_path / "checkpoint", "scene-0001") / file
     damaged.write_bytes(damaged.read_bytes()[:-100])
     index = SubmapIndex(tmp_path, "0" * 32)
     atlas = LoopDetector(tmp_path / "checkpoint", config, index)
