@@ -16,8 +16,7 @@ from splatnode.recon import former_names, keyframes
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.metric import measurement as metric
 from splatnode.recon.optimize import ensemble, photometric_losses, training
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.registration import registration

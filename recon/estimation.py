@@ -16,11 +16,10 @@ from splatnode.recon.metric.depth_fill import fill_measured_depth
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, apply_image_masks
 from splatnode.recon.registration import registration as registration_registration
-from splatnode.recon.registration.hand_eye import offset_of
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
-from splatnode.recon.registration.posed import register_posed
+from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
+from splatnode.recon.registration.posed_mapping import offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register
-from splatnode.recon.registration.resection import compute_pooled_ratio
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.snapshot import Landmarks

@@ -13,7 +13,7 @@ from splatnode.recon.config import PriorChoice
 from splatnode.recon.networks import depth_anything
 from splatnode.recon.networks import weights as networks_weights
 from splatnode.recon.networks.weights import Weights, find_mismatch, locate_weights
-from splatnode.recon.optimize.losses import dino
+from splatnode.recon.optimize.losses import semantic
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class LearnedPart:
 
 OTHERS = (
     LearnedPart("mono depth", "depth and normal losses", (depth_anything.RELATIVE,)),
-    LearnedPart("dinov2", "semantic loss", (dino.WEIGHTS,)),
+    LearnedPart("dinov2", "semantic loss", (semantic.WEIGHTS,)),
     LearnedPart("metric", "metres indoors", (depth_anything.METRIC,)),
 )
 

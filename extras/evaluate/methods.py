@@ -21,8 +21,7 @@ from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize import ensemble, regularizers, training
-from splatnode.recon.optimize.losses import depth, normal, point_render, semantic
-from splatnode.recon.optimize.losses.loss import LossChoice
+from splatnode.recon.optimize.losses import LossChoice, depth, normal, point_render, semantic
 from splatnode.recon.pipeline import estimate_frames, model_scene, reconstruct
 from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.result.report import peak_rss_mb

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.features import DESCRIPTOR_SIZE
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration import bundle_adjustment, triangulation
+from splatnode.recon.registration import bundle_adjustment, multiview_geometry
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.npz_files import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
@@ -80,9 +80,9 @@ def _triangulate_points(graph: ViewGraph, registration: Registration) -> tuple[b
     problem = replace(problem, log_aspects=np.log([aspects.get(index, 1.0) for index in range(count)]))
     centred = [keyframe.features.points - principals[i] for i, keyframe in enumerate(graph.keyframes)]
     registered = [camera.index for camera in registration.cameras]
-    every = triangulation.build(centred, graph.pairs)
-    problem, _ = triangulation.retriangulate(
-        problem, every, registered, _scales(graph), triangulation.TriangulationConfig(), tolerance=1.0
+    every = multiview_geometry.build(centred, graph.pairs)
+    problem, _ = multiview_geometry.retriangulate(
+        problem, every, registered, _scales(graph), multiview_geometry.TriangulationConfig(), tolerance=1.0
     )
     return problem, centred
 

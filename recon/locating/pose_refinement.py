@@ -22,7 +22,7 @@ from splatnode.recon.geometry import undistort_rays as straight
 from splatnode.recon.keyframes import PLAIN, Features
 from splatnode.recon.locating.outcome import NORMAL_95, LensSource, Located
 from splatnode.recon.matching import features as matching_features
-from splatnode.recon.registration import epipolar
+from splatnode.recon.registration import multiview_geometry
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
 from splatnode.recon.verification.consistency import ReflectionConfig, mirror_descriptors
 
@@ -586,7 +586,7 @@ def search_pose(
     pose, info = poselib.estimate_absolute_pose(
         undistort_pixels(known.pixels, lens),
         known.points,
-        epipolar.pinhole(lens.focal),
+        multiview_geometry.pinhole(lens.focal),
         {
             "max_reproj_error": config.search_px * scale,
             "min_iterations": 500,

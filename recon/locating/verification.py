@@ -334,7 +334,7 @@ class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     """Checks of the camera that was found for a query image. Each check refuses by the evidence of its own."""
 
     max_log10_nfa: float = -12.0  # as of a pair of photographs (recon/matching/pair_matching.py)
-    min_points: int = 15  # that agree, as of a view that is added to a map (recon/registration/resection.py)
+    min_points: int = 15  # that agree, as of a view that is added to a map (recon/registration/mapping_problem.py)
     min_share_of_picture: float = 0.04  # that their hull covers: less may be a thing that stood elsewhere
     max_elsewhere: float = 0.5  # agreement with a second camera, over that with the first
     max_apart: float = 4.0  # standard deviations between what two halves of the picture say of the camera

@@ -25,8 +25,7 @@ from torch import Tensor
 from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
 from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import training
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.rasterize.dispatch import Camera
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians

@@ -15,7 +15,7 @@ from splatnode.recon.geometry import cross_matrix
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
 from splatnode.recon.matching import features as matching_features
 from splatnode.recon.matching.pair_matching import TwoView
-from splatnode.recon.registration import epipolar
+from splatnode.recon.registration import multiview_geometry
 from splatnode.recon.registration.registration import Registration
 from splatnode.recon.threads import map_parallel_lazily
 
@@ -71,7 +71,7 @@ def measure_cycle_consistency(
         focals = [float(np.sqrt(np.prod(cameras[k].focals))) for k in (i, j)]
         straight = replace(thinned, points1=focals[0] * rays[0], points2=focals[1] * rays[1])
         limit = config.max_error_px * scale
-        rotation, direction, num_inliers = epipolar.relative_pose(straight, focals[0], focals[1], limit)
+        rotation, direction, num_inliers = multiview_geometry.relative_pose(straight, focals[0], focals[1], limit)
         if num_inliers < MIN_INLIER_RATIO * len(thinned.matches):
             continue  # The pair has no rigid answer for these focal lengths; its inlier ratio says so, too.
         rotations[i, j] = rotation

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.pair_matching import TwoView, find_components
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.registration.resection import compute_pooled_ratio
 from splatnode.recon.verification import consistency, refit
 from splatnode.recon.verification.consistency import CycleConsistency, Reflection
 from splatnode.recon.verification.refit import Distortion, Errors, FreedLens, PoseErrors

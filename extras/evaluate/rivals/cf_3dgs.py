@@ -28,8 +28,7 @@ from splatnode.extras.evaluate.rivals import colmap_3dgs, outcome
 from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
 from splatnode.recon.clock import Clock
 from splatnode.recon.optimize import training
-from splatnode.recon.optimize.control import adaptive
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.priors.pointmap import compute_world_points
 from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot

@@ -22,8 +22,7 @@ from splatnode.extras.evaluate.rivals.colmap import RegisteredFrame, SparseModel
 from splatnode.recon.clock import Clock
 from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.optimize import ensemble, training
-from splatnode.recon.optimize.control import adaptive
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.initialization import gaussians_at
 from splatnode.recon.scene.scene import Scene, TrainingView

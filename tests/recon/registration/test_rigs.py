@@ -17,8 +17,8 @@ from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment, rigs
+from splatnode.recon.registration.bundle_adjustment import RigConstraint
 from splatnode.recon.registration.incremental_mapper import Map
-from splatnode.recon.registration.rig_constraint import RigConstraint
 from splatnode.recon.registration.rigs import Mount, RigEstimate, adjust_with_rig
 from tests.recon.registration.test_bundle import problem
 
