@@ -23,7 +23,7 @@ from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_pro
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.mapping import replay_map
 from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
-from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.metres import Evidence
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, set_preview_interval
 from splatnode.recon.replay_source import Request, Source, add_depth_folder, add_poses, load_source, parse_sources

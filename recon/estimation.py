@@ -10,9 +10,9 @@ from splatnode.recon.clock import make_deadline_pause
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.keyframes import Rejected
-from splatnode.recon.locating.landmarks import collect_landmarks
+from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.metric.depth_fill import fill_measured_depth
+from splatnode.recon.metric.depth_fit import fill_measured_depth
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, apply_image_masks
 from splatnode.recon.registration import registration as registration_registration
@@ -24,6 +24,7 @@ from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.snapshot import Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Verdict
+from splatnode.recon.verification.claims import compute_placed_bounds, compute_posed_bounds, decide_posed, describe_rig
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.error_model import (
     compute_log_odds,
@@ -34,8 +35,6 @@ from splatnode.recon.verification.error_model import (
 from splatnode.recon.verification.evidence import Evidence, verify, verify_further
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import explain_refusal, refuse_stereo_or_panorama
-from splatnode.recon.verification.on_rig import compute_placed_bounds, describe_rig
-from splatnode.recon.verification.posed import compute_posed_bounds, decide_posed
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
 # that were taken for this one had up to 20.

@@ -23,7 +23,7 @@ from splatnode.recon.fallbacks import make_fallback_key, run_fallbacks
 from splatnode.recon.keyframes import Keyframe, Rejected, ScreeningState
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match_newest, match_pending
-from splatnode.recon.metric.depth_fill import fill_measured_depth
+from splatnode.recon.metric.depth_fit import fill_measured_depth
 from splatnode.recon.modelling import (
     SceneWithVerdict,
     create_initial_scene,

@@ -32,9 +32,7 @@ from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.metric.depth_fit import describe_doubtful_units
-from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
-from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.reference_frame import check_frame
+from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, check_frame, gather_evidence
 from splatnode.recon.modelling import (
     create_coarse_preview,
     create_initial_scene,

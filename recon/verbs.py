@@ -140,7 +140,7 @@ VERBS = (
         "locate",
         "tell where further photographs of a scene were taken",
         _locate_arguments,
-        import_lazily("splatnode.recon.locating.command", "locate"),
+        import_lazily("splatnode.recon.locating.localize", "locate"),
     ),
     Verb(
         "occupancy",
@@ -152,7 +152,7 @@ VERBS = (
         "merge",
         "make one scene of the scenes of a long walk",
         _merge_arguments,
-        import_lazily("splatnode.recon.merging.command", "merge"),
+        import_lazily("splatnode.recon.merging", "merge"),
     ),
     Verb(
         "recon",

@@ -315,7 +315,7 @@ class Daemon:
 
     def _merge_maps(self) -> None:
         """Merges the scenes of each map that has several. What cannot be merged is a problem, and no reason to fail."""
-        from splatnode.recon.merging.command import write_maps  # brings what merges
+        from splatnode.recon.merging import write_maps  # brings what merges
 
         if not is_map_set(self._config.out):  # no scene was made
             return

@@ -23,9 +23,8 @@ from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
-from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.occupancy.grid import encode_map, no_map
 from splatnode.recon.result import snapshot as result_snapshot

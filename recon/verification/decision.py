@@ -20,7 +20,6 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, find_widest
 from splatnode.recon.verification import refit, rejections
-from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.error_model import (
     VerdictModel,
     VerdictModels,
@@ -32,7 +31,7 @@ from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import refuse_stereo_or_panorama
 from splatnode.recon.verification.refit import FreedLens
-from splatnode.recon.verification.rejections import Refusal, refuse
+from splatnode.recon.verification.rejections import DecisionConfig, Refusal, refuse
 
 Pair = tuple[int, int]
 

@@ -38,7 +38,7 @@ from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
-from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.metres import Evidence
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
 from splatnode.recon.replay_source import Source, add_poses, apply_masks

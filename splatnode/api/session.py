@@ -43,8 +43,7 @@ from splatnode.capture.quality import Limits
 from splatnode.recon import threads as limits
 from splatnode.recon.config import apply_changes
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric.evidence import NOTHING, gather_evidence
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import NOTHING, apply_metric_scale, gather_evidence
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.pipeline import OfflineResult, rebuild_from_scratch
 from splatnode.recon.replay_source import Source

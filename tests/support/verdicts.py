@@ -13,9 +13,8 @@ from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.consistency import CycleConsistency, Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide
-from splatnode.recon.verification.evidence import CameraEvidence, Evidence, WeakestLink
+from splatnode.recon.verification.evidence import CameraEvidence, CycleConsistency, Evidence, Reflection, WeakestLink
 from splatnode.recon.verification.refit import Distortion, Errors, PoseErrors
 
 PLAIN, RICH = 20, 2000  # features

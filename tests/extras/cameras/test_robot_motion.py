@@ -13,9 +13,8 @@ from splatnode.capture.frame import Frame
 from splatnode.extras.cameras.mcap import Config, stream
 from splatnode.extras.logged.messages import UnusableMessage
 from splatnode.extras.logged.robot_motion import parse_imu, parse_odometry, read_robot_motion
-from splatnode.recon.metric.evidence import gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import apply_metric_scale, gather_evidence
 from splatnode.recon.result.reference_frame import FrameName
 from splatnode.recon.result.verdict import Code
 from tests.recon.metric.test_poses import NAMES, TRUE, scene

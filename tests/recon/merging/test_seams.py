@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.merging.merge import (
+from splatnode.recon.merging import (
     NOBODY,
     REGION_PX,
     Submap,

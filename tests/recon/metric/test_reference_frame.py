@@ -13,10 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.diorama.scene import look_at
 from splatnode.capture.odometry import Gravity, Motion, make_given_pose
-from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.measurement import Baseline, MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.reference_frame import UnknownFrame, check_frame, make_upright_frame, transform_rigidly
+from splatnode.recon.metric.metres import (
+    NOTHING,
+    Evidence,
+    UnknownFrame,
+    apply_metric_scale,
+    check_frame,
+    make_upright_frame,
+    transform_rigidly,
+)
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.limits import SceneFileError

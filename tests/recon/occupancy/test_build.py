@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.metric.reference_frame import transform_rigidly
+from splatnode.recon.metric.metres import transform_rigidly
 from splatnode.recon.occupancy.files import encode_nav2
 from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
