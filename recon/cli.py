@@ -28,7 +28,7 @@ from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, set_preview_interval
 from splatnode.recon.replay_source import Request, Source, add_depth_folder, add_poses, load_source, parse_sources
 from splatnode.recon.result.export.result import LIVE_PICTURE
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.report import bound_result_bytes, print_summary
 from splatnode.recon.result.submap_index import FILE, is_map_set
 from splatnode.recon.rig_choice import apply_rig

@@ -35,8 +35,7 @@ from splatnode.recon.preparation import prepare
 from splatnode.recon.replay_source import IMAGES, ReplayRecording, Request, load_recording
 from splatnode.recon.result.export import read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file
-from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, json_bytes
 from splatnode.recon.result.submap_index import FILE
 
 log = logging.getLogger(__name__)

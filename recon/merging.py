@@ -34,11 +34,9 @@ from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.rasterize.dispatch import Camera
 from splatnode.recon.result.export import SceneFileError, write_result
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians, encode_ply
-from splatnode.recon.result.export.prepare import sanitize_gaussians, select_gaussians
-from splatnode.recon.result.export.quaternions import matrices_from_quats
-from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.export.limits import sanitize_gaussians, select_gaussians
+from splatnode.recon.result.export.staged import hold_result_folder, json_bytes
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.levels_of_detail import (
     LEVELS_FILE,
     DetailLevel,
@@ -48,8 +46,7 @@ from splatnode.recon.result.levels_of_detail import (
     make_levels_record,
 )
 from splatnode.recon.result.npz_files import DEPTHS, encode_depths, read_depths
-from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.reference_frame import ReferenceFrame
+from splatnode.recon.result.placement import Placement, matrices_from_quats
 from splatnode.recon.result.rendering import NEAR, render_arrays
 from splatnode.recon.result.report import (
     build_report,
@@ -61,7 +58,7 @@ from splatnode.recon.result.report import (
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, format_rounded_up
 from splatnode.recon.result.stored_snapshot import SHELL_PIECE, make_merged_path, make_piece_name, read_up
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry, group_edges, read_map_set, walk_edges
-from splatnode.recon.result.verdict import SURE, TWO_SIDED_95, Code, Scale, Up, Verdict
+from splatnode.recon.result.verdict import SURE, TWO_SIDED_95, Code, ReferenceFrame, Scale, Up, Verdict
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 

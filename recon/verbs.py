@@ -134,7 +134,7 @@ VERBS = (
         "export",
         "write a scene in another format",
         _export_arguments,
-        import_lazily("splatnode.recon.result.export.format", "export"),
+        import_lazily("splatnode.recon.result.export", "export"),
     ),
     Verb(
         "locate",

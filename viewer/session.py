@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.recon.result.export.prepare import Selection
+from splatnode.recon.result.export.limits import Selection
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.analysis import Analysis, Analyst, Support, colour_gaussians
 from splatnode.viewer.editing import (

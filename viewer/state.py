@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import Selection
+from splatnode.recon.result.export.limits import Selection
 from splatnode.recon.result.snapshot import Snapshot
 
 # A map as a graph: its scenes, how they are linked, and how much of each is loaded. Its lines and its words.

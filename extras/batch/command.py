@@ -43,7 +43,7 @@ from splatnode.extras.batch.report import CSV, PAGE, PARQUET, write_back, write_
 from splatnode.extras.jobs.calls import chosen_cores, own_version
 from splatnode.extras.jobs.child import Limits
 from splatnode.extras.verbs import replay_options
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 
 Run = Callable[[Sequence[BatchRecording]], Iterator[Outcome]]  # the outcomes as they come
 

@@ -39,7 +39,7 @@ from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.report import bound_result_bytes, print_summary, write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 

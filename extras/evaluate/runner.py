@@ -54,8 +54,7 @@ from splatnode.extras.jobs.calls import Answer, Engine, Task, Work, make_serial_
 from splatnode.extras.jobs.calls import Moment as Since
 from splatnode.extras.jobs.child import Limits
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.result.export.staged import write_files
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, write_files
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.quaternions import quats_from_matrices
+from splatnode.recon.result.placement import quats_from_matrices
 from splatnode.recon.result.snapshot import CameraEstimate
 
 _NS = 1_000_000_000

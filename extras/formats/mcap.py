@@ -19,7 +19,7 @@ from splatnode.extras.formats.foxglove import (
     make_pose,
     make_time,
 )
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.stored_snapshot import encode_image, load_full_snapshot

@@ -66,8 +66,7 @@ from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
-from splatnode.recon.result.export.staged import finish_interrupted_write
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import finish_interrupted_write, hold_result_folder
 from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record, make_depth_header
 from splatnode.recon.result.report import estimate_result_bytes
 from splatnode.recon.result.snapshot import CameraEstimate

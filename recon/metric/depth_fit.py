@@ -24,7 +24,7 @@ from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import LEAST_CONFIDENCE, Pointmap, compute_depth_normals
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.result.depth_check import DepthCheck, DepthCode
+from splatnode.recon.result.snapshot import DepthCheck, DepthCode
 from splatnode.recon.threads import map_parallel
 
 # Depth images without their noise where they show planes: what many neighbours measured together is known better.

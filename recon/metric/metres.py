@@ -44,16 +44,10 @@ from splatnode.recon.metric.stereo import (
 )
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.occupancy.grid import TILT, UNSURE_DEG, find_floor, level
-from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.reference_frame import (
-    FIRST_CAMERA,
-    FrameName,
-    ReferenceFrame,
-    encode_matrix,
-    parse_frame_name,
-)
 from splatnode.recon.result.snapshot import (
+    DepthCheck,
+    DepthCode,
     GaussianArrays,
     GivenCameraPose,
     InGivenWorld,
@@ -62,7 +56,18 @@ from splatnode.recon.result.snapshot import (
     find_confirmed,
     format_rounded_up,
 )
-from splatnode.recon.result.verdict import Code, Scale, Up, Verdict, join_sentences
+from splatnode.recon.result.verdict import (
+    FIRST_CAMERA,
+    Code,
+    FrameName,
+    ReferenceFrame,
+    Scale,
+    Up,
+    Verdict,
+    encode_matrix,
+    join_sentences,
+    parse_frame_name,
+)
 
 # What photographs themselves tell of metres, gathered before the scene is known.
 

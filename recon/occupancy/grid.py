@@ -18,9 +18,8 @@ import numpy.typing as npt
 from splatnode.capture.messaging.wire import Header, Message, Name, Sequential, Text, WireError
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.recon.result.message import Matrix4, ScaleRecord, Vector3, make_scale_record, parse_scale
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot, find_camera_problem
-from splatnode.recon.result.verdict import RELATIVE, SURE, Scale
+from splatnode.recon.result.verdict import RELATIVE, SURE, FrameName, ReferenceFrame, Scale
 
 # Layout: where the voxels of a map lie.
 

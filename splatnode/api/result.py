@@ -15,11 +15,11 @@ import numpy.typing as npt
 from splatnode.api.entrance import enter_api
 from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
 from splatnode.recon import core
-from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.limits import sanitize_gaussians
 from splatnode.recon.result.export.result import copy_result
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.npz_files import LANDMARKS, read_depths, read_landmarks
-from splatnode.recon.result.reference_frame import ReferenceFrame
+from splatnode.recon.result.placement import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
@@ -28,10 +28,9 @@ from splatnode.recon.result.snapshot import (
     find_camera_problem,
     find_confirmed,
 )
-from splatnode.recon.result.spherical_harmonics import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.stored_snapshot import read_result
 from splatnode.recon.result.submap_index import is_map_set
-from splatnode.recon.result.verdict import Bounds, Verdict, compute_covariance
+from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict, compute_covariance
 
 # A camera as a program sees it.
 
@@ -150,7 +149,7 @@ if TYPE_CHECKING:
     from splatnode.api.window import Viewer
     from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.occupancy.grid import OccupancyMap
-    from splatnode.recon.result.depth_check import DepthCheck
+    from splatnode.recon.result.snapshot import DepthCheck
 
 
 class Files(Protocol):

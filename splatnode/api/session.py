@@ -47,8 +47,8 @@ from splatnode.recon.metric.metres import NOTHING, apply_metric_scale, gather_ev
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.pipeline import OfflineResult, rebuild_from_scratch
 from splatnode.recon.replay_source import Source
-from splatnode.recon.result.reference_frame import FrameChoice
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import FrameChoice
 
 _EACH = 1e9  # frames a second: each is examined
 

@@ -78,7 +78,7 @@ def _check(viewer: Viewer) -> None:
 
 def _export_rrd(folder: Path) -> Path:
     """Exports the result in the folder as `splatnode export --to rrd` does."""
-    from splatnode.recon.result.export.format import export_scene
+    from splatnode.recon.result.export import export_scene
 
     return export_scene(folder, "rrd")
 

@@ -22,8 +22,8 @@ from splatnode.recon.daemon import ledger
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.export import export_scene
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.export.stored import read_gaussians
-from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.verdict import Code
 from tests.fuzz.interrupted import Piece, Tell
 from tests.support.exported import make_gaussians, make_snapshot, write

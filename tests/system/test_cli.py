@@ -20,8 +20,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.process import system
 from splatnode.capture.process.arguments import Verb
-from splatnode.recon.result.export import ResultWriteError
-from splatnode.recon.result.export.format import list_format_names
+from splatnode.recon.result.export import ResultWriteError, list_format_names
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.verbs import list_export_formats

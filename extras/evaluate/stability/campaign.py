@@ -39,8 +39,7 @@ from splatnode.extras.evaluate.stability.windows.campaign import run_windows_ver
 from splatnode.extras.jobs.calls import Engine, Task, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
-from splatnode.recon.result.export.staged import json_bytes, write_files
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, json_bytes, write_files
 
 _FAMILIES = (cases, degradations)
 

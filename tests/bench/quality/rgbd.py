@@ -25,7 +25,7 @@ from splatnode.recon.config import preset
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.metric.depth_fit import DepthFit, fit_depth_images, make_depth_view
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.result.depth_check import DepthCode
+from splatnode.recon.result.snapshot import DepthCode
 from tests.support.depth_camera import DepthCamera, add_depths, measure, whitewash
 
 VIEWS, SIZE = 6, (320, 240)

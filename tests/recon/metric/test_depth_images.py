@@ -30,8 +30,8 @@ from splatnode.recon.metric.metres import (
     gather_evidence,
 )
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.result.depth_check import DepthCode
 from splatnode.recon.result.report import build_report
+from splatnode.recon.result.snapshot import DepthCode
 from tests.recon.metric import test_stereo
 from tests.support import synthetic as support
 from tests.support.depth_camera import DepthCamera, add_depths, measure

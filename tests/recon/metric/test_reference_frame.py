@@ -27,11 +27,10 @@ from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import make_scale_record, parse_scale
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame, encode_matrix, parse_frame_name
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
-from splatnode.recon.result.verdict import Code, Scale
+from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale, encode_matrix, parse_frame_name
 from tests.recon.metric.test_poses import NAMES, TRUE, UNIT, scene
 from tests.recon.occupancy.test_floor import room
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from splatnode.recon.metric.metres import transform_rigidly
 from splatnode.recon.occupancy.files import encode_nav2
 from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.verdict import Code, Scale
+from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale
 from tests.support.exported import make_snapshot
 from tests.support.occupied import WALL, room_snapshot
 

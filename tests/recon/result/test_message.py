@@ -11,7 +11,6 @@ import pytest
 from splatnode.capture.frame import Clock, DroppedFrame, Intrinsics, Stamp
 from splatnode.capture.messaging.messages import make_jpeg_array
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
-from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.result.message import (
     CameraRecord,
     SceneHeader,
@@ -19,7 +18,7 @@ from splatnode.recon.result.message import (
     encode_snapshot,
     make_camera_record,
 )
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, DepthCheck, DepthCode, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import RELATIVE, Bounds, Code, Scale, Verdict
 from tests.support.schemas import without
 
