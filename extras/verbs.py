@@ -18,7 +18,7 @@ from splatnode.capture.process.arguments import (
     seconds,
 )
 from splatnode.capture.process.text import metres_argument
-from splatnode.recon.replay_verb import add_device, add_lens, add_reconstruction_options, add_selection_options
+from splatnode.recon.verbs import add_device, add_lens, add_reconstruction_options, add_selection_options
 
 
 def add_ray(parser: argparse.ArgumentParser) -> None:

@@ -30,8 +30,8 @@ from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.estimation import prepare
 from splatnode.recon.merging import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps
-from splatnode.recon.preparation import prepare
 from splatnode.recon.replay_source import IMAGES, ReplayRecording, Request, load_recording
 from splatnode.recon.result.export import read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file

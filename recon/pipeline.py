@@ -23,9 +23,16 @@ from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progre
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import threads
 from splatnode.recon.budget import find_budget_hits
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, ReconstructionSummary, estimate_cameras, estimate_depth
+from splatnode.recon.estimation import (
+    Reconstruction,
+    ReconstructionSummary,
+    check_device,
+    estimate_cameras,
+    estimate_depth,
+    load_prior,
+    prepare_all,
+)
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import screen_all
@@ -40,13 +47,13 @@ from splatnode.recon.modelling import (
     refine_scene,
     snapshot,
 )
-from splatnode.recon.preparation import check_device, load_prior, prepare_all
-from splatnode.recon.priors.prior import Prior
+from splatnode.recon.priors.pointmap import Prior
 from splatnode.recon.replay_source import IMAGES, Source
 from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene
+from splatnode.recon.threads import Clock
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from typing import Literal
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.modelling import create_initial_scene
@@ -27,6 +26,7 @@ from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import initialization
+from splatnode.recon.threads import Clock
 
 # What each part of the paper brings: alone on the base, and missing from the whole.
 #

@@ -60,13 +60,12 @@ from splatnode.recon.daemon.ledger import (
     write_frame,
     write_ledger,
 )
-from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.estimation import Reconstruction, prepare
 from splatnode.recon.incremental import IncrementalReconstruction, ReconstructionCache, StreamState
 from splatnode.recon.keyframes import Features, Keyframe, ScreeningState
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import prepare_scene_for_display
-from splatnode.recon.preparation import prepare
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.registration.undistortion import undistort_keyframe

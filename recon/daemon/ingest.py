@@ -29,8 +29,8 @@ from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import StoredFrame
+from splatnode.recon.estimation import prepare
 from splatnode.recon.keyframes import Keyframe
-from splatnode.recon.preparation import prepare
 
 LOOK_S = 0.5  # between looks at whether another capture has come
 MOST_CAPTURES = 32

@@ -22,12 +22,11 @@ from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import CheckpointError
 from splatnode.recon.daemon.pose_graph import EdgeKind, PoseGraphEdge, make_loop_edge
 from splatnode.recon.daemon.submap_index import SubmapIndex
-from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.estimation import estimate_cameras, load_prior
 from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching import pair_matching
 from splatnode.recon.matching.features import compute_global_descriptor
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph, match_pending
-from splatnode.recon.preparation import load_prior
 from splatnode.recon.result.verdict import Code
 
 # Do two scenes show one place? A few photographs of both are estimated together, as the photographs of one scene are.

@@ -41,9 +41,8 @@ from splatnode.recon.config import preset as named
 from splatnode.recon.metric.metres import Evidence
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, reconstruct_source
-from splatnode.recon.replay_source import Source, add_poses, apply_masks
+from splatnode.recon.replay_source import Source, add_poses, apply_masks, apply_rig
 from splatnode.recon.result.verdict import FrameChoice
-from splatnode.recon.rig_choice import apply_rig
 
 log = logging.getLogger(__name__)
 

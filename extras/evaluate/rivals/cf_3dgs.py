@@ -26,7 +26,6 @@ from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import GaussianAppearance
 from splatnode.extras.evaluate.rivals import colmap_3dgs, outcome
 from splatnode.extras.evaluate.rivals.outcome import FrameWithDepth
-from splatnode.recon.clock import Clock
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.priors.pointmap import compute_world_points
@@ -34,6 +33,7 @@ from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.initialization import gaussians_at
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+from splatnode.recon.threads import Clock
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

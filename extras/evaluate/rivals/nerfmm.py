@@ -16,9 +16,9 @@ import torch
 from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.rivals import outcome, radiance_field
 from splatnode.extras.evaluate.rivals.radiance_field import Focal, make_field_snapshot
-from splatnode.recon.clock import Clock
 from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.threads import Clock
 
 SIZE = 256  # longer side of the photographs, pixels
 OPTIMIZE = radiance_field.FitConfig()

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.pipeline import estimate_frames
@@ -19,6 +18,7 @@ from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.scene import background
 from splatnode.recon.scene.scene import Scene
+from splatnode.recon.threads import Clock
 
 MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
 

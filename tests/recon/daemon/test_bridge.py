@@ -27,9 +27,8 @@ from splatnode.recon.daemon.loop_closure import (
     verify_loop,
 )
 from splatnode.recon.daemon.pose_graph import EdgeKind, make_loop_edge
-from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.estimation import estimate_cameras, prepare
 from splatnode.recon.matching.view_graph import ViewGraph, match
-from splatnode.recon.preparation import prepare
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import SMALL
 

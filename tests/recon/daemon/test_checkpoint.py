@@ -19,8 +19,8 @@ from splatnode.recon.daemon import checkpoint
 from splatnode.recon.daemon import checkpoint as checkpoint_store
 from splatnode.recon.daemon.checkpoint import GraphRecord, Store
 from splatnode.recon.daemon.ledger import MADE_ANEW
+from splatnode.recon.estimation import prepare
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.preparation import prepare
 from splatnode.recon.registration.registration import RegisteredCamera
 from tests.support.synthetic import photographs
 

@@ -21,9 +21,9 @@ from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message
 from splatnode.recon.daemon.submap_index import SubmapIndex
 from splatnode.recon.daemon.worker import InactiveSubmaps
+from splatnode.recon.estimation import prepare
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.preparation import prepare
 from splatnode.recon.result.export import read_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, finished, peer, running

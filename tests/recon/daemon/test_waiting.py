@@ -25,9 +25,9 @@ from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap import ActiveSubmap
 from splatnode.recon.daemon.worker import InactiveSubmaps, Worker
+from splatnode.recon.estimation import prepare
 from splatnode.recon.fallbacks import make_fallback_key
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.preparation import prepare
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, index, running
 from tests.support.synthetic import SMALL, photographs, places

@@ -71,12 +71,11 @@ from splatnode.extras.jobs.calls import Engine, Task, Work, now, pack_call, work
 from splatnode.extras.jobs.calls import engine as opened
 from splatnode.extras.jobs.child import Limits
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import load_prior, prepare
 from splatnode.recon.result.export.staged import hold_result_folder, json_bytes, write_files
 
 # splatnode's answers to windows: the steps of recon/pipeline.py up to the verdict.
