@@ -21,7 +21,7 @@ from splatnode.capture.process.arguments import (
 )
 from splatnode.capture.process.terminal import say
 from splatnode.capture.process.text import metres_argument
-from splatnode.recon.replay_verb import add_device, add_lens, add_reconstruction_options, add_selection_options
+from splatnode.recon.verbs import add_device, add_lens, add_reconstruction_options, add_selection_options
 from splatnode.viewer.verbs import FurtherViewer
 
 if TYPE_CHECKING:

@@ -11,13 +11,11 @@ from msgspec import Meta
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Internal, Plugin, build_config, merge_config, replace_former_names
 from splatnode.capture.rig import TOLERANCE_S
-from splatnode.recon import former_names
-from splatnode.recon.frames import screening
+from splatnode.recon import former_names, keyframes
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.metric import measurement as metric
 from splatnode.recon.optimize import ensemble, photometric_losses, training
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.registration import registration
@@ -69,7 +67,7 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     no_fallbacks: bool = False  # reject at once: try no fallback first
     # What gives depth, and matches that plain features miss
     prior: PriorChoice = PriorChoice("classical", classical.Config())
-    screening: screening.ScreeningConfig = screening.ScreeningConfig()
+    screening: keyframes.ScreeningConfig = keyframes.ScreeningConfig()
     matching: matching.MatchingConfig = matching.MatchingConfig()
     registration: registration.RegistrationConfig = registration.RegistrationConfig()
     verification: Internal[evidence.VerificationConfig] = evidence.VerificationConfig()

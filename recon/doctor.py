@@ -201,7 +201,7 @@ def _version(distribution: str) -> str:
 def _check_learned_parts() -> list[Finding]:
     """Whether each learned part is ready; one that is not costs nothing but itself."""
     try:
-        from splatnode.recon.learned_parts import find_unavailable_reason, list_learned_parts
+        from splatnode.recon.fallbacks import find_unavailable_reason, list_learned_parts
 
         parts = list_learned_parts()
     except (ImportError, OSError) as error:

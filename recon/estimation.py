@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import logging
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from splatnode.capture.frame import Stamp
-from splatnode.recon.clock import make_deadline_pause
+import msgspec
+
+from splatnode.capture.frame import DroppedFrame, Frame, Stamp
+from splatnode.capture.lenses import undistort_frame
+from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.frames.screening import Rejected
-from splatnode.recon.locating.landmarks import collect_landmarks
+from splatnode.recon.keyframes import LIBRARY_ERRORS, Features, Keyframe, Rejected, resize_image
+from splatnode.recon.locating.localize import collect_landmarks
+from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.metric.depth_fill import fill_measured_depth
-from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import Prior, apply_image_masks
+from splatnode.recon.metric.depth_fit import fill_measured_depth
+from splatnode.recon.priors.pointmap import Pointmap, Prior, apply_image_masks
+from splatnode.recon.rasterize.dispatch import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
-from splatnode.recon.registration.hand_eye import offset_of
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
-from splatnode.recon.registration.posed import register_posed
+from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
+from splatnode.recon.registration.posed_mapping import offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register
-from splatnode.recon.registration.resection import compute_pooled_ratio
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.snapshot import Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Verdict
+from splatnode.recon.threads import make_deadline_pause
+from splatnode.recon.verification.claims import compute_placed_bounds, compute_posed_bounds, decide_posed, describe_rig
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.error_model import (
     compute_log_odds,
@@ -35,8 +41,68 @@ from splatnode.recon.verification.error_model import (
 from splatnode.recon.verification.evidence import Evidence, verify, verify_further
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import explain_refusal, refuse_stereo_or_panorama
-from splatnode.recon.verification.on_rig import compute_placed_bounds, describe_rig
-from splatnode.recon.verification.posed import compute_posed_bounds, decide_posed
+
+# What is needed before frames can be matched: the loaded prior, and each frame as a keyframe.
+
+log = logging.getLogger(__name__)
+
+
+class UnusableFrame(ValueError):
+    """One frame that cannot become a keyframe; the text names it and says why."""
+
+
+def load_prior(config: ReconstructionConfig) -> Prior:
+    """The prior that the configuration names. Raises ValueError or FileNotFoundError where it lacks its weights."""
+    return config.prior.module.load(msgspec.structs.replace(config.prior.config, seed=config.seed))
+
+
+def check_device(config: ReconstructionConfig) -> None:
+    """Before the work begins: raises DeviceUnavailable; the log tells the device where it was left open."""
+    device = choose_device(config.device)
+    if config.device != "cpu":
+        log.info("%s", format_device(config.device, device))
+
+
+def prepare(frame: Frame, config: ReconstructionConfig, found: Features | None = None) -> Keyframe:
+    """The frame without distortion, with its image at modelled size and its features, unless these are known.
+
+    No other frame is needed. Raises UnusableFrame where the given intrinsics cannot be used, or a library fails.
+    """
+    try:
+        straight = undistort_frame(frame)
+    except ValueError as error:  # it names the frame
+        raise UnusableFrame(str(error)) from error
+    except LIBRARY_ERRORS as error:
+        raise_shortage(error)
+        raise UnusableFrame(f"{frame.name}: its distortion cannot be taken out: {error}") from error
+    frame = replace(straight, encoded=None)  # recordings alone want the file as it came
+    try:
+        found = found or features.apply_mask(features.extract(frame.image, config.matching.features), frame.mask)
+        return Keyframe(frame, resize_image(frame.image, config.size), found)
+    except LIBRARY_ERRORS as error:
+        raise_shortage(error)
+        raise UnusableFrame(f"{frame.name}: no features can be found in it: {error}") from error
+
+
+def prepare_all(frames: Iterable[Frame], config: ReconstructionConfig) -> tuple[list[Keyframe], list[DroppedFrame]]:
+    """The keyframes of all frames that can become one, and the others with the reason, which the log tells too.
+
+    Raises UnusableFrame, of the first frame, where none of them can: then what they have in common is to blame.
+    """
+    keyframes, dropped, first = list[Keyframe](), list[DroppedFrame](), None
+    for frame in frames:
+        try:
+            keyframes.append(prepare(frame, config))
+        except UnusableFrame as error:
+            log.warning("left out: %s", error)
+            dropped.append(DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: ")))
+            first = first or error
+    if first is not None and not keyframes:
+        raise first
+    return keyframes, dropped
+
+
+# What is known of the keyframes' cameras and depth, and the verdict on it: thoroughly, or soon and provisionally.
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
 # that were taken for this one had up to 20.

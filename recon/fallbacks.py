@@ -15,6 +15,7 @@ been taken.
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import logging
 import math
 import time
@@ -25,17 +26,85 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.clock import is_over
-from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.frames.keyframe import PLAIN
-from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.geometry import align_cameras, angles_deg
-from splatnode.recon.learned_parts import LearnedPart, find_unavailable_reason
+from splatnode.recon.keyframes import PLAIN, Rejected
 from splatnode.recon.matching.features import count_search_pixels
 from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_weak_pair
+from splatnode.recon.networks import depth_anything
+from splatnode.recon.networks import weights as networks_weights
+from splatnode.recon.networks.weights import Weights, find_mismatch, locate_weights
+from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
 from splatnode.recon.result.verdict import Code
+from splatnode.recon.threads import is_over
+
+# The learned parts: what each is for, and whether it can be used here: its package, its weights and their licence.
+#
+# A prior's module says by itself what it takes: `WEIGHTS` are its files' paths in the catalogue of weights, `PACKAGE`
+# is the import name of what it needs beside torch. A prior without `WEIGHTS` is not learned.
+
+
+@dataclass(frozen=True)
+class LearnedPart:
+    """Something that can only be used with weights from elsewhere."""
+
+    name: str
+    purpose: str
+    weights: tuple[str, ...]  # paths in the catalogue
+    package: str | None = None  # import name of what it needs beside torch
+
+    @property
+    def licence(self) -> str:
+        """Returns the licence of the weights; empty where the catalogue does not have them."""
+        known = _catalogue()
+        return "; ".join(dict.fromkeys(known[path].licence for path in self.weights if path in known))
+
+
+OTHERS = (
+    LearnedPart("mono depth", "depth and normal losses", (depth_anything.RELATIVE,)),
+    LearnedPart("dinov2", "semantic loss", (semantic.WEIGHTS,)),
+    LearnedPart("metric", "metres indoors", (depth_anything.METRIC,)),
+)
+
+
+def list_learned_parts() -> tuple[LearnedPart, ...]:
+    """The priors that have weights, in recon/priors or beside it, and the networks of other rooms."""
+    return (*_priors(), *OTHERS)
+
+
+def find_unavailable_reason(part: LearnedPart) -> str:
+    """Returns why `part` is unavailable, and the remedy; empty if it is available, as far as digests tell."""
+    if part.package is not None and not importlib.util.find_spec(part.package):
+        return f"pip install {part.package}"
+    known = _catalogue()
+    for path in part.weights:
+        if path not in known:
+            return f"{path} is not in the catalogue of weights: recon/networks/weights.py needs its entry"
+        entry, file = known[path], locate_weights(path)
+        if file is None:
+            return f"no weights: splatnode weights fetch {entry.name}" if entry.url else f"no weights: see {entry.name}"
+        if wrong := find_mismatch(entry, file):
+            return f"{file}: {wrong}; splatnode weights fetch {entry.name}"
+    return ""
+
+
+def _priors() -> list[LearnedPart]:
+    modules = {kind: PriorChoice.load_module(kind) for kind in PriorChoice.kinds()}
+    return [
+        LearnedPart(kind, "prior", module.WEIGHTS, getattr(module, "PACKAGE", None))
+        for kind, module in modules.items()
+        if hasattr(module, "WEIGHTS")
+    ]
+
+
+def _catalogue() -> dict[str, Weights]:
+    """The catalogue's entries by their paths."""
+    return {entry.path: entry for entry in networks_weights.CATALOGUE}
+
+
+# Fallbacks: what costs more is tried before photographs are refused for want of matches.
 
 
 @dataclass(frozen=True, eq=False)

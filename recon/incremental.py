@@ -16,15 +16,22 @@ from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.budget import find_budget_hits
-from splatnode.recon.clock import Clock, OutOfTime, Timer
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth, extend_reconstruction
+from splatnode.recon.estimation import (
+    Reconstruction,
+    UnusableFrame,
+    check_device,
+    estimate_cameras,
+    estimate_depth,
+    extend_reconstruction,
+    load_prior,
+    prepare,
+)
 from splatnode.recon.fallbacks import make_fallback_key, run_fallbacks
-from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.frames.screening import Rejected, ScreeningState
+from splatnode.recon.keyframes import Keyframe, Rejected, ScreeningState
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import ViewGraph, match_newest, match_pending
-from splatnode.recon.metric.depth_fill import fill_measured_depth
+from splatnode.recon.metric.depth_fit import fill_measured_depth
 from splatnode.recon.modelling import (
     SceneWithVerdict,
     create_initial_scene,
@@ -34,12 +41,11 @@ from splatnode.recon.modelling import (
     snapshot,
 )
 from splatnode.recon.optimize import training
-from splatnode.recon.preparation import UnusableFrame, check_device, load_prior, prepare
-from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import apply_image_masks
+from splatnode.recon.priors.pointmap import Pointmap, apply_image_masks
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import growth
 from splatnode.recon.scene.scene import Scene
+from splatnode.recon.threads import Clock, OutOfTime, Timer
 
 REMEMBERED = 8  # estimates: a keyframe that is tried with each of several others, and taken back
 REMEMBERED_MASKED = 2  # estimates with things that move, whose photographs are copies without these

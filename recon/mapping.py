@@ -27,16 +27,15 @@ from splatnode.capture.process.system import is_shortage
 from splatnode.capture.process.terminal import ProgressStep, format_times, is_interactive, progress, say, show_progress
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import config as daemon
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
-from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps
-from splatnode.recon.preparation import prepare
+from splatnode.recon.estimation import prepare
+from splatnode.recon.merging import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps
 from splatnode.recon.replay_source import IMAGES, ReplayRecording, Request, load_recording
 from splatnode.recon.result.export import read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file
-from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, json_bytes
 from splatnode.recon.result.submap_index import FILE
 
 log = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ from splatnode.recon.budget import BudgetHit
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.estimation import Reconstruction, ReconstructionSummary
-from splatnode.recon.frames import screening
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.keyframes import valid_masks
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.training import examine, single_torch_thread, start_watch
 from splatnode.recon.priors.pointmap import Pointmap, compute_consistent_depths
@@ -105,7 +105,7 @@ def _find_transient_masks(
         return {}
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     used = []
-    for pointmap, rim in zip(pointmaps, screening.valid_masks(pictures), strict=True):
+    for pointmap, rim in zip(pointmaps, valid_masks(pictures), strict=True):
         mask = masks[pointmap.name]
         used.append(rim if mask is None else rim & mask)
     found = zip(pointmaps, transients.find_transient_masks(pointmaps, pictures, used), used, strict=True)

@@ -7,9 +7,12 @@ Of several cameras there is a folder or a film each; what they took together is 
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeVar
@@ -30,9 +33,10 @@ from splatnode.capture.keyframe_selection import THINNED, Choice, Config, Limits
 from splatnode.capture.lenses import Lenses, describe_image
 from splatnode.capture.masks import Find, mask_frames, open_masks
 from splatnode.capture.odometry import make_given_pose
-from splatnode.capture.process.terminal import Tell, ignore_progress, report_items
+from splatnode.capture.process.terminal import Tell, ignore_progress, notify, report_items
 from splatnode.capture.process.text import sanitize_name, sanitize_text
-from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
+from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera, form_frame_sets, read_rig
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -450,3 +454,155 @@ def _check_enough(views: int, count: int) -> None:
 
 def _space_evenly(count: int, wanted: int) -> list[int]:
     return np.linspace(0, count - 1, wanted).round().astype(int).tolist()
+
+
+# Which rig a reconstruction is given, with its lenses: that of a file, or what a recording tells of its cameras.
+
+log = logging.getLogger(__name__)
+
+# Standard deviations of a camera's pose by a log's static transforms, which are drawn more often than calibrated
+DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = 0.005, 0.5
+LONGEST_BASELINE_M = 20.0  # between two cameras of a robot; beyond, the file is probably in millimetres
+_TRUSTED = ("given", "calibration")  # sources of a lens that a rig's does not replace
+
+
+def apply_rig(
+    given: Source, config: ReconstructionConfig, file: str | PathLike[str] | None, tell: Tell
+) -> tuple[Source, ReconstructionConfig]:
+    """The frames with the lenses of their rig, and the configuration with it: that of a file, or of their recording.
+
+    What of the rig does not count is notified. Raises as `choose_rig` and `add_rig_lenses`.
+    """
+    rig = choose_rig(None if file is None else Path(file), given.cameras, tell)
+    if rig is None:
+        return given, config
+    given = add_mounts(given, rig)
+    if len(rig.cameras) < 2:
+        return given, config
+    with_lenses = add_rig_lenses(given, rig)
+    for text in describe_rig_use(rig, [each.camera_id for each in given.frames if isinstance(each, Frame)]):
+        notify(log, text)
+    return with_lenses, hold_rig(config, rig)
+
+
+def add_mounts(given: Source, rig: Rig) -> Source:
+    """The frames with where their camera stands on the robot's base, as far as the rig tells it.
+
+    Raises ValueError where it tells it of no camera of the frames.
+    """
+    if not rig.is_base:
+        return given
+    told = {each.name: rig.find_mount(each.camera_id) for each in given.frames if isinstance(each, Frame)}
+    if told and not any(told.values()):
+        names = ", ".join(each.camera_id for each in rig.cameras)
+        raise ValueError(
+            f"the rig has T_base_camera of {sanitize_text(names, 200)}, and no image is of such a camera. Name the "
+            "cameras as the rig does: --cameras A,B"
+        )
+    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
+              for each in given.frames)  # fmt: skip
+    return replace(given, frames=tuple(frames))
+
+
+def describe_rig_use(rig: Rig, camera_ids: Iterable[str]) -> Iterator[str]:
+    """Describes what of a rig does not count for images of these cameras, and what of it is probably not meant."""
+    ids = list(camera_ids)
+    there = set(ids) - {""}
+    if not there:
+        return
+    used = [each for each in rig.cameras if each.camera_id in there]
+    absent = [each.camera_id for each in rig.cameras if each.camera_id not in there]
+    further = sorted(there - {each.camera_id for each in used})
+    if absent:
+        yield (
+            f"no image is of {_join(absent)} of the rig, so the rig counts for {_join(e.camera_id for e in used)} "
+            "alone. Name the cameras as the rig does (--cameras, camera_ids), or leave those out of it"
+        )
+    if further:
+        yield (
+            f"the rig does not have {_join(further)}, whose images are there: these images alone tell where it stands. "
+            f"The rig has {_join(each.camera_id for each in rig.cameras)}; name the cameras as it does, or add it"
+        )
+    if unnamed := ids.count(""):
+        yield f"{unnamed} of {len(ids)} images are of no camera that is named: the rig does not count for these"
+    unplaced = [each.camera_id for each in used if each.matrix is None]
+    if unplaced:
+        few = len(used) - len(unplaced) < 2
+        yield (
+            f"the rig does not tell where {_join(unplaced)} stands (T_rig_camera, or cam_from_rig of COLMAP): the "
+            "images alone tell it. "
+            + ("The rig gives no metres: give two cameras or more a pose" if few else "The others give the metres")
+        )
+    yield from _describe_lengths(used)
+
+
+def _describe_lengths(cameras: Iterable[RigCamera]) -> Iterator[str]:
+    placed = [each for each in cameras if each.matrix is not None]
+    centres = {each.camera_id: each.matrix[:3, 3] for each in placed if each.matrix is not None}
+    apart = [(float(np.linalg.norm(centres[a] - centres[b])), a, b) for a, b in combinations(centres, 2)]
+    longest = max(apart, default=None)
+    if longest is not None and longest[0] > LONGEST_BASELINE_M:
+        yield (
+            f"the rig has {_join([longest[1]])} and {_join([longest[2]])} {longest[0]:.3g} m apart: its poses are "
+            "metres. Where they are millimetres, divide the translations by 1000; else all lengths are 1000 times too "
+            "large"
+        )
+    elif longest is not None and longest[0] <= max(each.sigma_m for each in placed):
+        yield f"the rig has {_join(centres)} in one place, within their sigma_m: it gives no metres"
+
+
+def _join(camera_ids: Iterable[str]) -> str:
+    return sanitize_text(", ".join(camera_ids), 200)
+
+
+def choose_rig(file: Path | None, cameras: CameraSet | None, tell: Tell) -> Rig | None:
+    """The rig of a file, else that of the static transforms of the one log of all cameras; None: neither tells one.
+
+    Raises UnusableRig where the file gives none. `tell` hears what the log tells, or why it tells nothing.
+    """
+    if file is not None:
+        return read_rig(file)
+    try:
+        told = None if cameras is None else cameras.find_rig()
+    except ValueError as error:
+        tell(f"no rig is known before, the images tell: {error}")
+        return None
+    if told is None:
+        return None
+    tell(
+        f"the static transforms of the recording tell where its {len(told.cameras)} cameras stand, "
+        f"within {100 * DRAWN_SIGMA_M:g} cm and {DRAWN_SIGMA_DEG:g} degrees (--rig FILE in place of these)"
+    )
+    return Rig(tuple(replace(each, sigma_m=DRAWN_SIGMA_M, sigma_deg=DRAWN_SIGMA_DEG) for each in told.cameras))
+
+
+def hold_rig(config: ReconstructionConfig, rig: Rig) -> ReconstructionConfig:
+    """The configuration with a rig that is given."""
+    return msgspec.structs.replace(config, registration=msgspec.structs.replace(config.registration, rig=rig))
+
+
+def add_rig_lenses(given: Source, rig: Rig) -> Source:
+    """The frames, each whose lens is neither given nor calibrated with the lens that the rig has of its camera.
+
+    Raises ValueError where fewer than two of the rig's cameras took frames, or a lens is of none of their aspect ratio.
+    """
+    frames = [each for each in given.frames if isinstance(each, Frame)]
+    _check_names(rig, frames)
+    lensless = [each for each in frames if each.intrinsics is None or each.intrinsics.source not in _TRUSTED]
+    used = {each.camera_id for each in lensless}
+    lenses = Lenses({each.camera_id: each.intrinsics for each in rig.cameras
+                     if each.intrinsics is not None and each.camera_id in used})  # fmt: skip
+    lenses.check(map(describe_image, lensless))
+    added = {each.name: lenses.apply(each) for each in lensless}
+    return replace(given, frames=tuple(added.get(each.name, each) for each in given.frames))
+
+
+def _check_names(rig: Rig, frames: list[Frame]) -> None:
+    there = {frame.camera_id for frame in frames} - {""}
+    if frames and sum(camera.camera_id in there for camera in rig.cameras) < 2:
+        raise ValueError(
+            f"a rig must name two or more of the cameras of the images; it has "
+            f"{_join(each.camera_id for each in rig.cameras)}, and the "
+            f"images are of {_join(sorted(there)) or 'no cameras that are named'}. Name the "
+            "cameras as the rig does: --cameras A,B with a folder or a film of each in their order"
+        )

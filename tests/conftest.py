@@ -20,7 +20,6 @@ ROOT = Path(__file__).resolve().parent.parent
 # Where results come from long sums in the compiled core: CI runs these a second time with another order of additions.
 NUMERICAL = (
     "extras/evaluate/rivals",
-    "recon/frames",
     "recon/matching",
     "recon/optimize",
     "recon/priors",

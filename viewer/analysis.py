@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import SH_C0, select_gaussians
-from splatnode.recon.result.export.quaternions import matrices_from_quats
+from splatnode.recon.result.export.limits import SH_C0, select_gaussians
+from splatnode.recon.result.placement import matrices_from_quats
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, decode_frame_id
 from splatnode.viewer.state import Colouring, Moment, look_at, scene_up, transform_to_camera

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians, write_files
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
-from splatnode.recon.result.export.prepare import Box, Selection
+from splatnode.recon.result.export.limits import Box, Selection
 from splatnode.recon.result.export.stored import SOURCES, encode_sources
 from splatnode.recon.result.snapshot import SHELL, CameraEstimate, GaussianArrays, find_confirmed
 from splatnode.viewer.analysis import Analysis, Analyst, Support, colour_gaussians

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import compute_base_rgb, select_gaussians
+from splatnode.recon.result.export.limits import compute_base_rgb, select_gaussians
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import SHELL, CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import Scale

@@ -18,7 +18,7 @@ from splatnode.capture.messaging.pubsub import StateClient, Subscriber
 from splatnode.capture.process.terminal import Problems, is_logged
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians
-from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.recon.result.levels_of_detail import concatenate_gaussians, find_far_shell, make_detail_levels
 from splatnode.recon.result.message import (
     CameraRecord,

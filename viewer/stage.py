@@ -17,7 +17,7 @@ import numpy.typing as npt
 import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.session import Session
 from splatnode.viewer.shapes import ImageQuad, Label, Lines, Shapes, choose_first_divisor, choose_next_divisor

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import Selection
+from splatnode.recon.result.export.limits import Selection
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 # What the viewer shows and how: a value that keys and buttons turn into another value.

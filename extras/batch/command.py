@@ -65,7 +65,7 @@ from splatnode.extras.logged.mcap import topics
 from splatnode.extras.logged.messages import read_times
 from splatnode.extras.verbs import replay_options
 from splatnode.recon.result.export import read_cameras
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.snapshot import CameraEstimate, format_rounded_up
 
 # index.html has counts by verdict, and a row with a picture for each recording; it needs no other file to be shown.

@@ -14,13 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize import ensemble, regularizers, training
-from splatnode.recon.optimize.losses import depth, normal, point_render, semantic
-from splatnode.recon.optimize.losses.loss import LossChoice
+from splatnode.recon.optimize.losses import LossChoice, depth, normal, point_render, semantic
 from splatnode.recon.pipeline import estimate_frames, model_scene, reconstruct
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.dispatch import Device
@@ -29,6 +27,7 @@ from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.scene import background, initialization
 from splatnode.recon.scene.scene import Scene
+from splatnode.recon.threads import Clock
 
 # The methods that a benchmark compares, by name: our presets, and others as configurations of the same engine.
 #

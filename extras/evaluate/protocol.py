@@ -32,9 +32,9 @@ from splatnode.extras.evaluate.regions import (
     compute_region_scores,
     make_appearance,
 )
-from splatnode.recon.frames import screening
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon import keyframes
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, exp_se3, twist_gradient, umeyama
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -201,10 +201,10 @@ def load_held_out_views(
     names = [name for name in split.test if name in scene.cameras]
     given = [undistort_view(lens, *scene.load_masked_image(name)) for name in names]
     photographs = [resize_image(image, longer_side) for image, _ in given]
-    rims = screening.valid_masks(photographs)
+    rims = keyframes.valid_masks(photographs)
     for name, photograph, valid, (_, mask) in zip(names, photographs, rims, given, strict=True):
         used = torch.from_numpy(resize_mask(mask, *photograph.shape[:2]))
-        shown = screening.valid_rectangle(valid)
+        shown = keyframes.valid_rectangle(valid)
         if used[shown].any():
             yield HeldOutView(name, torch.from_numpy(photograph).float() / 255.0, used, shown)
 
@@ -482,7 +482,7 @@ def evaluate(
 
     `show` gets the name of each test view, its photograph and what the scene looks like from there. `found` holds the
     test views' poses that another moment of the same run was given, from which the search then goes on; where it lacks
-    one, it gets it. `shown` tells of test views how many training photographs show each pixel (shown.py), at the size
+    one, it gets it. `shown` tells of test views how many training photographs show each pixel (regions.py), at the size
     at which they are scored: then the row has scores by region.
 
     A snapshot whose verdict forbids publishing it has no scene and is scored on nothing; its cameras are compared all

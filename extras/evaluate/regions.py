@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
 from splatnode.recon.geometry import project, transform_to_camera
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.networks.lpips import Lpips
 from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.priors import stereo

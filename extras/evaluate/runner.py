@@ -89,8 +89,7 @@ from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.pipeline import run as run_pipeline
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
-from splatnode.recon.result.export.staged import write_files
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, write_files
 from splatnode.recon.result.report import bound_result_bytes, peak_rss_mb, print_summary, write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -243,7 +242,7 @@ class Scoring:
     rasterize: Rasterize
     networks: Callable[[], PerceptualNetworks]  # loads them: a module's function, or a functools.partial of one
     settings: Settings
-    by_region: bool = False  # also of what two training photographs show, one, or none (shown.py)
+    by_region: bool = False  # also of what two training photographs show, one, or none (regions.py)
 
 
 @dataclass(frozen=True, eq=False)

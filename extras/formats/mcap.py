@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import compute_base_rgb
-from splatnode.recon.result.export.quaternions import quats_from_matrices
+from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.placement import quats_from_matrices
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.stored_snapshot import encode_image, load_full_snapshot
 

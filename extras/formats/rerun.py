@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from splatnode.capture.process.text import escape_text
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Landmarks, Snapshot
 from splatnode.recon.result.stored_snapshot import encode_image
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.config import Internal
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.networks.vit import crop, crop_image
 from splatnode.recon.networks.weights import find, load_network, read_weights
 from splatnode.recon.priors import classical

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching.features import describe
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -43,8 +43,7 @@ from splatnode.recon.networks.vit import (
 )
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors.monocular import make_registered_pointmap
-from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import Prior
+from splatnode.recon.priors.pointmap import Pointmap, Prior
 from splatnode.recon.registration.registration import Registration
 
 # Depth Anything 3's transformer: DINOv2, of which every second block of the later ones looks at all views at once.

@@ -25,7 +25,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.process.text import sanitize_text
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.viewer.analysis import camera_colours
 from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, draw_given_pose, frustum_depth

@@ -6,7 +6,7 @@
 
 #include "threads.h"
 
-// As splatnode.recon.registration.epipolar.Pose: the second camera's pose in the first one's frame, and both lenses.
+// As splatnode.recon.registration.multiview_geometry.Pose: the second camera's pose in the first one's frame, and both lenses.
 struct EpipolarPose {
     double rotation[9], translation[3];
     double focals[4], radials[4], shifts[4];  // across and down, of the first camera, then of the second

@@ -27,10 +27,10 @@ from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.terminal import Problems, is_logged
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.checkpoint.records import StoredFrame
-from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.preparation import prepare
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import StoredFrame
+from splatnode.recon.estimation import prepare
+from splatnode.recon.keyframes import Keyframe
 
 LOOK_S = 0.5  # between looks at whether another capture has come
 MOST_CAPTURES = 32

@@ -62,7 +62,7 @@ from splatnode.capture.process.terminal import (
 )
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.config import apply_changes
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
@@ -72,8 +72,7 @@ from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
-from splatnode.recon.result.export.staged import finish_interrupted_write
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import finish_interrupted_write, hold_result_folder
 from splatnode.recon.result.message import CameraRecord, encode_snapshot, make_camera_record, make_depth_header
 from splatnode.recon.result.report import estimate_result_bytes
 from splatnode.recon.result.snapshot import CameraEstimate
@@ -321,7 +320,7 @@ class Daemon:
 
     def _merge_maps(self) -> None:
         """Merges the scenes of each map that has several. What cannot be merged is a problem, and no reason to fail."""
-        from splatnode.recon.merging.command import write_maps  # brings what merges
+        from splatnode.recon.merging import write_maps  # brings what merges
 
         if not is_map_set(self._config.out):  # no scene was made
             return

@@ -16,19 +16,17 @@ from splatnode.capture.messaging.messages import Numbering, WireError
 from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.terminal import event
-from splatnode.recon.daemon import submap_index
-from splatnode.recon.daemon.checkpoint import checkpoint
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import checkpoint, submap_index
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.metric.measurement import MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.occupancy.message import encode_map, no_map
+from splatnode.recon.occupancy.grid import encode_map, no_map
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.report import write_result_folder

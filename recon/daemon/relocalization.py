@@ -28,8 +28,8 @@ from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.process.config import Internal
 from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.recon import poselib
-from splatnode.recon.frames.keyframe import PLAIN, Keyframe
 from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera
+from splatnode.recon.keyframes import PLAIN, Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.registration.undistortion import undistort_pixels
 from splatnode.recon.result.rendering import render_arrays

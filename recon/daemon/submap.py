@@ -20,18 +20,17 @@ from splatnode.capture.process.terminal import event
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import submap_index
-from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
-from splatnode.recon.daemon.checkpoint import checkpoint
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import checkpoint, submap_index
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
+from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap_index import SubmapState
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore_cancel
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import SceneWithVerdict
 from splatnode.recon.result import snapshot as result_snapshot

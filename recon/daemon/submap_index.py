@@ -15,7 +15,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import raise_shortage, resident_mb
 from splatnode.capture.process.text import guard_untrusted
-from splatnode.recon.daemon.atlas.pose_graph import (
+from splatnode.recon.daemon.pose_graph import (
     Cameras,
     EdgeKind,
     PoseGraphEdge,

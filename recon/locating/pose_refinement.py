@@ -17,14 +17,14 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon import poselib
-from splatnode.recon.frames.keyframe import PLAIN, Features
 from splatnode.recon.geometry import cross_matrix, distortion
 from splatnode.recon.geometry import undistort_rays as straight
+from splatnode.recon.keyframes import PLAIN, Features
 from splatnode.recon.locating.outcome import NORMAL_95, LensSource, Located
 from splatnode.recon.matching import features as matching_features
-from splatnode.recon.registration import epipolar
+from splatnode.recon.registration import multiview_geometry
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
-from splatnode.recon.verification.consistency import ReflectionConfig, mirror_descriptors
+from splatnode.recon.verification.evidence import ReflectionConfig, mirror_descriptors
 
 # A camera with an uncertain lens: where it sees points, and how that changes with its pose and its lens.
 
@@ -245,7 +245,7 @@ def match_landmarks(
 def measure_mirror_gain(features: Features, landmarks: Landmarks, config: ReflectionConfig) -> float:
     """How much better the plain `features` match the scene when the image is turned left to right.
 
-    It is the logarithm of the matches mirrored over those as it is (recon/verification/consistency.py), each with those
+    It is the logarithm of the matches mirrored over those as it is (recon/verification/evidence.py), each with those
     images of the scene with which it has most. In a symmetric place these are not the same.
     """
     plain = features.select_tilt(PLAIN).descriptors[: config.num_features]
@@ -586,7 +586,7 @@ def search_pose(
     pose, info = poselib.estimate_absolute_pose(
         undistort_pixels(known.pixels, lens),
         known.points,
-        epipolar.pinhole(lens.focal),
+        multiview_geometry.pinhole(lens.focal),
         {
             "max_reproj_error": config.search_px * scale,
             "min_iterations": 500,

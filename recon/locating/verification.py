@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.keyframes import REFERENCE_SIDE
 from splatnode.recon.locating import pose_refinement
 from splatnode.recon.locating.outcome import NORMAL_95, LensSource, LocalizationBounds, NotLocated, Reason
 from splatnode.recon.locating.pose_refinement import (
@@ -29,7 +29,7 @@ from splatnode.recon.locating.pose_refinement import (
 from splatnode.recon.matching.pair_matching import log10_number_of_false_alarms
 from splatnode.recon.result.snapshot import Landmarks
 from splatnode.recon.result.verdict import compute_length_95
-from splatnode.recon.verification import consistency
+from splatnode.recon.verification import evidence
 
 # All that is known of a photograph when it is judged.
 
@@ -334,13 +334,11 @@ class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     """Checks of the camera that was found for a query image. Each check refuses by the evidence of its own."""
 
     max_log10_nfa: float = -12.0  # as of a pair of photographs (recon/matching/pair_matching.py)
-    min_points: int = 15  # that agree, as of a view that is added to a map (recon/registration/resection.py)
+    min_points: int = 15  # that agree, as of a view that is added to a map (recon/registration/mapping_problem.py)
     min_share_of_picture: float = 0.04  # that their hull covers: less may be a thing that stood elsewhere
     max_elsewhere: float = 0.5  # agreement with a second camera, over that with the first
     max_apart: float = 4.0  # standard deviations between what two halves of the picture say of the camera
-    mirror: consistency.ReflectionConfig = (
-        consistency.ReflectionConfig()
-    )  # of the test whether it was turned left to right
+    mirror: evidence.ReflectionConfig = evidence.ReflectionConfig()  # of the test whether it was turned left to right
     max_mirror_gain: float = 0.05  # of matches, in logarithms, once it is turned left to right; right ones have below 0
     max_rival: float = 0.8  # agreement with a camera of another lens, over that with the first
     focal_range: tuple[float, float] = (0.3, 6.0)  # over the longer side: 118 to 10 degrees of view

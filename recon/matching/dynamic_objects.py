@@ -20,7 +20,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.masks import apply_mask
 from splatnode.capture.process.system import raise_shortage
-from splatnode.recon.frames.keyframe import (
+from splatnode.recon.keyframes import (
     LIBRARY_ERRORS,
     REFERENCE_SIDE,
     Keyframe,

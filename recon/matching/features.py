@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from splatnode.capture.process.config import Internal
 from splatnode.recon.core import library, pointer
-from splatnode.recon.frames.keyframe import PLAIN, REFERENCE_SIDE, Features
+from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features
 
 # Mutual nearest neighbours with the ratio test (Lowe, 2004), in one native sweep over all descriptor pairs.
 

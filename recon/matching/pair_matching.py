@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon import poselib
-from splatnode.recon.frames.keyframe import (
+from splatnode.recon.keyframes import (
     LIBRARY_ERRORS,
     PLAIN,
     REFERENCE_SIDE,

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from splatnode.capture.process.config import Internal
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
-from splatnode.recon.clock import is_over
-from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Keyframe, content_key
+from splatnode.recon.keyframes import LIBRARY_ERRORS, Keyframe, content_key
 from splatnode.recon.matching import features
 from splatnode.recon.matching import pair_matching as candidates
 from splatnode.recon.matching import pair_matching as matching_pair_matching
@@ -34,7 +33,7 @@ from splatnode.recon.matching.pair_matching import (
     select_short_list_pairs,
     select_weak_pairs,
 )
-from splatnode.recon.threads import map_parallel, map_parallel_lazily
+from splatnode.recon.threads import is_over, map_parallel, map_parallel_lazily
 
 # The configuration of matching: local features, which pairs are matched and how, which get simulated tilts.
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from splatnode.capture.process.text import measurement_argument, parse_measurement, sanitize_text
 
-# As `FrameChoice` in recon/result/reference_frame.py has them, which help does not wait for
+# As `FrameChoice` in recon/result/verdict.py has them, which help does not wait for
 FRAMES = ("first_camera", "base", "odometry", "upright", "base_link", "odom")
 _SHORTEST, _LONGEST = 1e-6, 1e6  # of a direction, whose length does not count
 DRIFT_DEG = 0.5  # of odometry's direction after a metre, where nobody tells it

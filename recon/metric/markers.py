@@ -17,9 +17,9 @@ from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.text import format_length
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.keyframes import REFERENCE_SIDE
 from splatnode.recon.metric.measurement import Measurement, MetricView, combine_measurements, compute_scale_sigma
-from splatnode.recon.registration.triangulation import largest_angles, triangulate
+from splatnode.recon.registration.multiview_geometry import largest_angles, triangulate
 
 # Where the corners of a printed marker are, to hundredths of a pixel: the marker as it must look is fitted to it.
 #

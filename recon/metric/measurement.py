@@ -19,9 +19,8 @@ from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.odometry import MOTION_DRIFT, MOTION_SIGMA_DEG, Gravity
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.registration.undistortion import radial_of
-from splatnode.recon.result.reference_frame import FrameChoice
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
-from splatnode.recon.result.verdict import TWO_SIDED_95
+from splatnode.recon.result.verdict import TWO_SIDED_95, FrameChoice
 
 MAX_DEVIATION = 3.0  # standard deviations by which two sources may differ
 

@@ -15,7 +15,7 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Baseline, DroppedFrame, Frame, grey, partners, reduce_image
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.text import format_length
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.keyframes import REFERENCE_SIDE
 from splatnode.recon.metric.measurement import Measurement, MetricView, compute_scale_sigma
 from splatnode.recon.networks.vit import Crop
 from splatnode.recon.registration import subpixel

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatnode.capture.process.config import Internal
 from splatnode.recon.geometry import transform_to_camera
-from splatnode.recon.optimize import pseudo_views
+from splatnode.recon.optimize import regularizers
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.snapshot import decode_frame_id
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
@@ -49,7 +49,7 @@ def render_between_views(members: Sequence[Scene], config: EnsembleConfig, seed:
     """Views between the cameras of the first of the members: what they show there in the mean. None of one camera."""
     views, rng = members[0].views, np.random.default_rng(seed)
     count = min(config.pseudo_views * len(views), math.ceil(config.iterations / 2))
-    found = pseudo_views.sample_pseudo_views(views, count, off_path=config.off_path, rng=rng)
+    found = regularizers.sample_pseudo_views(views, count, off_path=config.off_path, rng=rng)
     return [
         TrainingView(
             name=f"between {number}",

@@ -19,10 +19,9 @@ from torch import Tensor
 from splatnode.recon.core import library
 from splatnode.recon.geometry import exp_se3, matrices_from_quats, twist_gradient
 from splatnode.recon.optimize import ensemble, photometric_losses, regularizers
-from splatnode.recon.optimize.control.control import Control, OptimizerStep
-from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularizers import Regularizer
-from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
+from splatnode.recon.optimize.control import Control, OptimizerStep
+from splatnode.recon.optimize.photometric_losses import TrainingImage, make_training_image
+from splatnode.recon.optimize.regularizers import PseudoView, Regularizer
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.rasterize.reference import Render

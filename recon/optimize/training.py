@@ -23,13 +23,10 @@ from msgspec import Meta
 from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize import ensemble as optimize_ensemble
 from splatnode.recon.optimize import photometric_losses, regularizers
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.optimize.fit import PARAMETERS, Trainer
-from splatnode.recon.optimize.photometric_losses import PhotometricLoss
-from splatnode.recon.optimize.pseudo_views import PseudoView, sample_pseudo_views
-from splatnode.recon.optimize.regularizers import PointRender, render_points
-from splatnode.recon.optimize.training_image import make_training_image, scale_intrinsics
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss, make_training_image, scale_intrinsics
+from splatnode.recon.optimize.regularizers import PointRender, PseudoView, render_points, sample_pseudo_views
 from splatnode.recon.priors.pointmap import compute_world_points
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.snapshot import SHELL

@@ -34,8 +34,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import Similarity
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks import weights
 from splatnode.recon.networks.depth_anything import Fusion
@@ -54,8 +54,7 @@ from splatnode.recon.networks.vit import (
 )
 from splatnode.recon.networks.weights import LruCache, find
 from splatnode.recon.priors.monocular import make_registered_pointmap
-from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import Prior
+from splatnode.recon.priors.pointmap import Pointmap, Prior
 from splatnode.recon.registration.registration import Registration
 
 Array = npt.NDArray[np.float64]

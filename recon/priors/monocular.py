@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks.vit import Crop
 from splatnode.recon.priors.pointmap import Pointmap, compute_depth_normals, compute_modelled_K, select_sparse_points

@@ -18,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.system import raise_shortage
-from splatnode.recon.clock import OutOfTime
 from splatnode.recon.core import library, pointer
-from splatnode.recon.frames.keyframe import LIBRARY_ERRORS
-from splatnode.recon.threads import map_parallel
+from splatnode.recon.keyframes import LIBRARY_ERRORS
+from splatnode.recon.threads import OutOfTime, map_parallel
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.networks.weights import WeightsError, find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior

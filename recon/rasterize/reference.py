@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatnode.recon.result.spherical_harmonics import compute_sh_terms
+from splatnode.recon.result.placement import compute_sh_terms
 
 # Render: what every rasteriser returns.
 

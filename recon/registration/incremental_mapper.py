@@ -18,18 +18,24 @@ import numpy.typing as npt
 from splatnode.recon.geometry import distortion
 from splatnode.recon.registration import (
     bundle_adjustment,
-    epipolar,
     mapping_problem,
-    own_lenses,
+    multiview_geometry,
+    self_calibration,
     subpixel,
-    triangulation,
 )
-from splatnode.recon.registration import resection as registration_resection
-from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, Pair, Pairs, PartialMap
-from splatnode.recon.registration.resection import Resection
+from splatnode.recon.registration import mapping_problem as registration_resection
+from splatnode.recon.registration.mapping_problem import (
+    Lens,
+    MapperInput,
+    MapperView,
+    Pair,
+    Pairs,
+    PartialMap,
+    Resection,
+)
+from splatnode.recon.registration.multiview_geometry import Tracks
 from splatnode.recon.registration.self_calibration import CORNER, LEAST_SHIFT
 from splatnode.recon.registration.subpixel import PatchImage
-from splatnode.recon.registration.triangulation import Tracks
 from splatnode.recon.threads import map_parallel
 
 # Incremental mapping: a first pair, then one view after the other, with a bundle adjustment after each.
@@ -52,7 +58,7 @@ class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     """Incremental mapping: a first pair, then one view after the other, with a bundle adjustment after each."""
 
     resection: registration_resection.ResectionConfig = registration_resection.ResectionConfig()
-    triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
+    triangulation: multiview_geometry.TriangulationConfig = multiview_geometry.TriangulationConfig()
     robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
     min_points: int = 15  # points that a map needs
     candidates: int = 3  # views that are resected before the best of them is registered
@@ -85,10 +91,10 @@ def adjust(
     tracks: Tracks,
     loss: bundle_adjustment.BundleAdjustmentConfig,
     tolerance: float,
-    config: triangulation.TriangulationConfig,
+    config: multiview_geometry.TriangulationConfig,
 ) -> PartialMap:
     """The map with all points triangulated anew (see `retriangulate` for `tolerance`), then bundle-adjusted."""
-    estimate, track_of_point = triangulation.retriangulate(
+    estimate, track_of_point = multiview_geometry.retriangulate(
         partial.estimate, tracks, partial.registered, problem.scale, config, tolerance
     )
     if len(estimate.points):
@@ -112,7 +118,7 @@ def _initialise(
 ) -> PartialMap | None:
     """The map of the pair `first`: its first view is the world's origin, its baseline the unit of length."""
     count = len(problem.views)
-    rotation, direction, num_inliers = epipolar.relative_pose(
+    rotation, direction, num_inliers = multiview_geometry.relative_pose(
         problem.pairs[first],
         focals[problem.views[first[0]].lens],
         focals[problem.views[first[1]].lens],
@@ -212,7 +218,7 @@ _MIN_OBSERVATIONS = 6  # of a registered camera: three fix a pose, twice as many
 class FinalAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The last adjustment of a map: more tracks, subpixel observations, lenses as free as their priors leave them."""
 
-    triangulation: triangulation.TriangulationConfig = triangulation.TriangulationConfig()
+    triangulation: multiview_geometry.TriangulationConfig = multiview_geometry.TriangulationConfig()
     subpixel: subpixel.SubpixelConfig = subpixel.SubpixelConfig()
     min_points: int = 15  # points that a map needs
     # Smallest and largest scale of the robust loss, pixels at REFERENCE_SIDE
@@ -368,7 +374,7 @@ class MapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
     same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map
     same_focal: float = 0.02  # largest difference of the log focals of two such attempts
-    own_lenses: own_lenses.OwnLensesConfig = own_lenses.OwnLensesConfig()
+    own_lenses: self_calibration.OwnLensesConfig = self_calibration.OwnLensesConfig()
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,9 +471,9 @@ def give_own_lenses(
             if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
                 problem, finished = found[0], again
         searches = [_try_other_focals]
-        freed = own_lenses.free_lenses(problem, finished.map, finished.loss, config.own_lenses)
+        freed = self_calibration.free_lenses(problem, finished.map, finished.loss, config.own_lenses)
         if freed.refuting_views.any() or freed.displaced.any():
-            apart, partial = own_lenses.split_lenses(problem, finished.map, freed, config.own_lenses)
+            apart, partial = self_calibration.split_lenses(problem, finished.map, freed, config.own_lenses)
             again = run_final_adjustment(apart, partial, images, config.finishing)
             if again is not None:
                 problem, finished = apart, again
@@ -495,10 +501,10 @@ def _try_coarse_lenses(
     scale = float(np.median(problem.scale))
     noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
     loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=scale * _COARSE_ROBUST_PX, noise_px=noise_px)
-    freed = own_lenses.free_lenses(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
+    freed = self_calibration.free_lenses(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
     if not (freed.refuting_views.any() or freed.displaced.any()):
         return None
-    problem, partial = own_lenses.split_lenses(problem, partial, freed, config.own_lenses)
+    problem, partial = self_calibration.split_lenses(problem, partial, freed, config.own_lenses)
     partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None
@@ -525,7 +531,7 @@ def _try_other_focals(
     if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
         return None
     for view, focal in zoomed.items():
-        problem, partial = own_lenses.add_lens(problem, partial, view, focal)
+        problem, partial = self_calibration.add_lens(problem, partial, view, focal)
     partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None
@@ -572,7 +578,7 @@ def _first_pairs(pairs: Pairs) -> list[Pair]:
 def make_map(problem: MapperInput, finished: FinalMap, max_error_px: float, num_common: int) -> Map:
     """The finished map with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
     partial, estimate = finished.map, finished.map.estimate
-    angles = triangulation.largest_angles(
+    angles = multiview_geometry.largest_angles(
         bundle_adjustment.centres(estimate), estimate.points, estimate.camera_of, estimate.point_of
     )
     return Map(

@@ -1,8 +1,4 @@
-"""The map of images whose poses are given: these start it and hold it, and the images still judge each of them.
-
-Where an image's matches fit another pose, or the adjusted map is farther from a given pose than both sigmas allow, that
-pose is let go, the worst first; the images alone place its camera then, where they can.
-"""
+"""Registration with given poses: cameras in the world of these, whether images share matches or not."""
 
 from __future__ import annotations
 
@@ -13,15 +9,95 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from splatnode.recon.registration import bundle_adjustment, epipolar, incremental_mapper, resection
-from splatnode.recon.registration.known_poses import Deviation, Given
+from splatnode.recon.geometry import align_cameras, compute_rms_radius, cross_matrix
+from splatnode.recon.keyframes import Keyframe
+from splatnode.recon.matching.pair_matching import TwoView
+from splatnode.recon.registration import (
+    bundle_adjustment,
+    incremental_mapper,
+    known_poses,
+    mapping_problem,
+    multiview_geometry,
+    self_calibration,
+)
+from splatnode.recon.registration.bundle_adjustment import differentiate_by_pose
+from splatnode.recon.registration.known_poses import Deviation, Drift, Given, GivenWorld, Offset, has_pose
 from splatnode.recon.registration.mapping_problem import MapperInput, PartialMap
+from splatnode.recon.registration.registration import (
+    Registration,
+    RegistrationConfig,
+    convert_to_lens_pixels,
+    make_registration,
+    make_views,
+    patch_images,
+    relabel_pairs,
+    sort_by_content,
+)
 from splatnode.recon.registration.subpixel import PatchImage
 
+# What is wrong with all given poses alike: how the camera sits on what carries it was told wrongly.
+
 Array = npt.NDArray[np.float64]
+
+_LEAST_CAMERAS = 4  # 24 numbers for a similarity and an offset, which are 13
+_LEAST_TURN_DEG = 5.0  # by which orientations must differ: of cameras that look one way a shift is one of the world
+_MOST_SIGMAS = 3.0  # root of the mean square of what is left, of which images are a part
+_IMAGES = 2.0  # times as wide as given: what images do not know of their cameras counts, too
+_OF_SHIFT_M = 1.0  # standard deviation of the offset's shift before anything is known, metres
+
+
+def offset_of(keyframes: Sequence[Keyframe], registration: Registration) -> Offset | None:
+    """The offset in the camera's frame in which all given poses agree with the cameras of the images alone.
+
+    None where there are too few cameras to tell it, or no offset explains the poses.
+    """
+    chosen = [camera for camera in registration.cameras if has_pose(keyframes[camera.index])]
+    poses = [keyframes[camera.index].frame.given_pose for camera in chosen]
+    if len(chosen) < _LEAST_CAMERAS:
+        return None
+    scene, given = np.stack([camera.T_world_camera for camera in chosen]), np.stack([p.matrix for p in poses if p])
+    turned = Rotation.from_matrix(np.swapaxes(scene[:1, :3, :3], 1, 2) @ scene[:, :3, :3]).magnitude()
+    if np.degrees(turned.max()) < _LEAST_TURN_DEG:
+        return None
+    sigmas = _IMAGES * np.array([(np.radians(pose.sigma_deg), pose.sigma_m) for pose in poses if pose])
+    begun = align_cameras(scene, given)
+    middle, size = scene[:, :3, 3].mean(0), max(compute_rms_radius(given[:, :3, 3]), 1e-9)
+
+    def offset(values: Array) -> Array:
+        X = np.eye(4)
+        X[:3, :3], X[:3, 3] = Rotation.from_rotvec(values[7:10]).as_matrix(), size * values[10:13]
+        return X
+
+    def errors(values: Array) -> Array:
+        rotation = Rotation.from_rotvec(values[:3]).as_matrix() @ begun.rotation
+        scale = begun.scale * np.exp(values[6])
+        moved = np.tile(np.eye(4), (len(scene), 1, 1))
+        moved[:, :3, :3] = rotation @ scene[:, :3, :3]
+        moved[:, :3, 3] = begun(middle) + size * values[3:6] + scale * (scene[:, :3, 3] - middle) @ rotation.T
+        expected = moved @ offset(values)
+        turns = Rotation.from_matrix(np.swapaxes(expected[:, :3, :3], 1, 2) @ given[:, :3, :3]).as_rotvec()
+        moves = expected[:, :3, 3] - given[:, :3, 3]
+        parts = [(turns / sigmas[:, :1]).ravel(), (moves / sigmas[:, 1:]).ravel(), size * values[10:13] / _OF_SHIFT_M]
+        return np.concatenate(parts)
+
+    found = least_squares(errors, np.zeros(13), x_scale=0.01)
+    left = float(np.sqrt(2.0 * found.cost / (6 * len(scene) - 13)))
+    if left >= _MOST_SIGMAS:
+        return None
+    covariance = np.linalg.pinv(found.jac.T @ found.jac)
+    turn, shift = (float(np.sqrt(np.linalg.eigvalsh(covariance[b, b]).max())) for b in (slice(7, 10), slice(10, 13)))
+    return Offset(offset(found.x), turn, size * shift)
+
+
+# The map of images whose poses are given: these start it and hold it, and the images still judge each of them.
+#
+# Where an image's matches fit another pose, or the adjusted map is farther from a given pose than both sigmas allow,
+# that pose is let go, the worst first; the images alone place its camera then, where they can.
+
 
 # First observations decide where cameras are, each as if it were one of its own: poses do not bend what images agree
 # on, and what is left of the errors is noise of the images
@@ -295,7 +371,7 @@ def _free(problem: MapperInput, partial: PartialMap, view: int, config: incremen
     rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental_mapper.SETTLED_TOLERANCE, config)
     if len(rest.estimate.points) < config.incremental.min_points:
         return rest
-    found = resection.resect(problem, rest, view, config.incremental.resection)
+    found = mapping_problem.resect(problem, rest, view, config.incremental.resection)
     if found is None:
         return rest
     estimate = bundle_adjustment.replace_pose(rest.estimate, view, found.rotation, found.translation)
@@ -330,8 +406,10 @@ def _find_doubtful_views(
     problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
 ) -> list[int]:
     """The views that a given pose holds and few of whose matches fit; those first that fit least."""
-    ratios = resection.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
-    of_view = {view: resection.compute_pooled_ratio(ratios, problem.pairs, view) for view in _find_held_views(partial)}
+    ratios = mapping_problem.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
+    of_view = {
+        view: mapping_problem.compute_pooled_ratio(ratios, problem.pairs, view) for view in _find_held_views(partial)
+    }
     matched = {view for pair in ratios for view in pair}
     return sorted(
         (view for view, ratio in of_view.items() if ratio < _DOUBTED_RATIO and view in matched), key=of_view.__getitem__
@@ -402,7 +480,7 @@ def _pairs_say(
         if not {i, j} <= held or len(pair.matches) < _TELLING_MATCHES:
             continue
         scale = float(problem.scale[i])
-        share = float((epipolar.sampson_errors(partial.estimate, (i, j), pair) < limit * scale).mean())
+        share = float((multiview_geometry.sampson_errors(partial.estimate, (i, j), pair) < limit * scale).mean())
         if share > _AGREEING:
             found[i, j] = int(share > _DOUBTED_RATIO)
             continue
@@ -418,7 +496,7 @@ def _relative(
     i, j = pair
     focals = np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[[i, j]]])
     limit = config.incremental.triangulation.max_error_px * float(problem.scale[i])
-    return epipolar.relative_pose(problem.pairs[pair], float(focals[0]), float(focals[1]), limit)
+    return multiview_geometry.relative_pose(problem.pairs[pair], float(focals[0]), float(focals[1]), limit)
 
 
 def _place_by_pair(
@@ -533,3 +611,100 @@ def _deviations(finished: incremental_mapper.FinalMap, given: Given) -> tuple[De
         metres = given.metres * float(np.linalg.norm(shift))
         found.append(Deviation(view, metres, float(np.degrees(np.linalg.norm(turn))), sigmas))
     return tuple(sorted(found, key=lambda each: -each.sigmas if math.isfinite(each.sigmas) else 0.0))
+
+
+# Registration with given poses: cameras in the world of these, whether images share matches or not.
+
+Pairs = Mapping[tuple[int, int], TwoView]
+
+
+def register_posed(
+    keyframes: Sequence[Keyframe],
+    pairs: Pairs,
+    config: RegistrationConfig,
+    pause: Callable[[], None] = lambda: None,
+    offset: Offset | None = None,
+) -> Registration | None:
+    """The cameras of the keyframes whose pose is given and true, and of those that images place beside them.
+
+    None where given poses cannot hold a map: fewer than two have a pose and a lens that are told, or the images
+    contradict as many of them as they confirm. `offset` is taken out of all poses. `pairs` and `pause`: see `register`.
+    """
+    order = sort_by_content(keyframes)
+    ordered, rank = [keyframes[index] for index in order], np.argsort(order)
+    drift = Drift(config.poses_drift, config.poses_drift_deg)
+    given = known_poses.collect_known_poses(ordered, offset, drift)
+    if given is None:
+        return None
+    grouping = self_calibration.group(ordered, across_sizes=True)
+    matched = known_poses.add_guided_matches(ordered, relabel_pairs(pairs, rank), given)
+    pause()
+    views = make_views(ordered, grouping)
+    known = self_calibration.candidates(ordered, grouping, matched, config.lenses)
+    settings = config.mapper
+    problem = mapping_problem.prepare(
+        views,
+        known,
+        convert_to_lens_pixels(matched, grouping),
+        settings.max_growing_tracks,
+        settings.max_final_tracks,
+    )
+    focals, images = [lens.focals[0] for lens in known], patch_images(ordered, grouping, config)
+    built = build_map(problem, focals, given, images, settings, pause)
+    if built is None:
+        return None
+    moved = replace(built, map=built.map.relabel(order))
+    found = make_registration(moved.map, keyframes, [grouping.scales[i] for i in rank], config)
+    return replace(found, given=_world(moved, found, given, order, offset))
+
+
+def _world(
+    built: PosedMap, found: Registration, given: Given, order: Sequence[int], offset: Offset | None
+) -> GivenWorld:
+    """How the registration `found` of `built`, whose views are keyframes, lies in the given world.
+
+    View i of `built.deviations` is keyframe `order[i]`.
+    """
+    estimate, views = built.map.estimate, [camera.index for camera in found.cameras]
+    first, unit = views[0], _unit(built, found)
+    to_first, from_first = estimate.rotations[first], estimate.translations[first]
+    held = [] if estimate.given is None else [view for view in views if estimate.given.is_held[view]]
+    covariance = bundle_adjustment.covariance(estimate, built.map.prior, built.map.loss, -1)
+    turns, moves = differentiate_by_pose(estimate.rotations[views], estimate.translations[views])
+    rows = (6 * np.array(views)[:, None] + np.arange(6)).ravel()
+    joint = covariance.joint[np.ix_(rows, rows)]
+    blocks = [slice(3 * i, 3 * i + 3) for i in range(len(views))]
+    in_world = [(to_first @ turns[b], unit * to_first @ moves[b]) for b in blocks]
+    # What is not known of the offset is not known of any camera.
+    turn_sigma, shift_sigma = (0.0, 0.0) if offset is None else (offset.turn_sigma, offset.shift_sigma)
+    of_turn, of_shift = turn_sigma**2 * np.eye(3), (shift_sigma * unit / given.metres) ** 2 * np.eye(3)
+    return GivenWorld(
+        scale=given.metres / unit,
+        rotation=to_first.T,
+        translation=given.origin - given.metres * to_first.T @ from_first,
+        scale_sigma=0.0 if estimate.given is None else compute_scale_sigma(estimate.given),
+        deviations=tuple(replace(each, index=order[each.index]) for each in built.deviations),
+        offset=offset,
+        turn_covariances=np.stack([turn @ joint @ turn.T + of_turn for turn, _ in in_world]),
+        centre_covariances=np.stack([move @ joint @ move.T + of_shift for _, move in in_world]),
+        held=frozenset(held),
+    )
+
+
+def compute_scale_sigma(given: bundle_adjustment.GivenPoses) -> float:
+    """Standard deviation of the logarithm of the scale at which cameras of a known shape fit given poses."""
+    held = np.flatnonzero(given.is_held)
+    middle = given.centres[held].mean(0)
+    by_similarity = np.zeros((6 * len(given.centres), 7))
+    for camera in held.tolist():
+        rotation, off = given.rotations[camera], given.centres[camera] - middle
+        own = slice(6 * camera, 6 * camera + 3), slice(6 * camera + 3, 6 * camera + 6)
+        by_similarity[own[0], :3], by_similarity[own[1], 3:6] = rotation, rotation
+        by_similarity[own[1], :3], by_similarity[own[1], 6] = -rotation @ cross_matrix(off[None])[0], rotation @ off
+    covariance = np.linalg.pinv(by_similarity.T @ given.information @ by_similarity)
+    return float(np.sqrt(covariance[6, 6]))
+
+
+def _unit(built: PosedMap, found: Registration) -> float:
+    """A length in `found` over the same in `built`: the registration scaled it."""
+    return 1.0 / known_poses.distance(built.map.estimate, [camera.index for camera in found.cameras])

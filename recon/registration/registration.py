@@ -12,15 +12,14 @@ import numpy.typing as npt
 
 from splatnode.capture.process.config import Internal
 from splatnode.capture.rig import TOLERANCE_S, Rig
-from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
+from splatnode.recon.keyframes import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
     incremental_mapper,
     known_poses,
     mapping_problem,
-    own_lenses,
     rigs,
     self_calibration,
 )
@@ -246,7 +245,7 @@ def make_registration(
     estimate = found.estimate
     order = sorted(found.views)
     sides = np.array([scale * longer_side(k.frame) for scale, k in zip(scales, keyframes, strict=True)])
-    doubted, prior = own_lenses.widen_lens_priors(estimate, found.prior, sides, config.mapper.own_lenses)
+    doubted, prior = self_calibration.widen_lens_priors(estimate, found.prior, sides, config.mapper.own_lenses)
     covariance = bundle_adjustment.covariance(doubted, prior, found.loss, found.views[0])
     unit = 1.0 / max(known_poses.distance(estimate, order), _MIN_DEPTH)
     rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
@@ -271,7 +270,7 @@ def make_registration(
                 centre_sigma_rel=float(centre_sigmas[position]),
                 centre_covariance=covariances[position],
                 aspect=float(estimate.aspects[lens]),
-                near_lens=own_lenses.find_common_lens(found.prior, int(lens), config.mapper.own_lenses),
+                near_lens=self_calibration.find_common_lens(found.prior, int(lens), config.mapper.own_lenses),
                 displaced=bool(found.prior.shift_sigmas[lens] > _DISPLACED * sides[i]),
                 focal_sigma=float(focal_sigmas[i]),
                 own_lens=bool(lens >= found.num_common),
@@ -382,7 +381,7 @@ def _add_own_lenses(
         if not camera.own_lens:
             continue
         scale = grouping.scales[camera.index]
-        problem, first = own_lenses.add_lens(problem, first, camera.index, scale * camera.focal)
+        problem, first = self_calibration.add_lens(problem, first, camera.index, scale * camera.focal)
         radials, shifts = first.estimate.radials.copy(), first.estimate.shifts.copy()
         radials[-1] = camera.radial
         shifts[-1] = scale * (camera.principal - principal_point(keyframes[camera.index].frame))

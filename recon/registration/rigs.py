@@ -6,22 +6,329 @@ joint adjustment gives each set one pose and each camera a mount; images that no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from splatnode.capture.frame import Stamp
-from splatnode.capture.rig import FrameSet, Rig, form_frame_sets
-from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.registration import bundle_adjustment, known_poses, rig_poses
-from splatnode.recon.registration.given_rig import GivenMounts, fit_given_rig
+from splatnode.capture.rig import FrameSet, Rig, RigCamera, form_frame_sets
+from splatnode.recon.geometry import cross_matrix
+from splatnode.recon.keyframes import Keyframe
+from splatnode.recon.registration import bundle_adjustment, known_poses
+from splatnode.recon.registration.bundle_adjustment import RigConstraint
 from splatnode.recon.registration.incremental_mapper import Map
-from splatnode.recon.registration.rig_constraint import RigConstraint
-from splatnode.recon.registration.rig_poses import RelativePoses
+
+# How the cameras of frame sets stand to each other: single measurements, one a set, and where they change.
+#
+# Whether a camera moved on its rig is a question of time: its pose as the sets before tell it, against that of those
+# after. Errors of single sets that are larger than they claim, as of cameras that are not triggered together, make
+# each measurement less sure, and no change of the rig.
 
 Array = npt.NDArray[np.float64]
+
+LEAST_PROBABILITY = 1e-5  # of a false alarm, as of given poses
+STIFF_TURN = np.radians(0.005)  # by which cameras of a rig turn against each other in use: nothing is stiffer
+STIFF_SHIFT = 2e-4  # and shift, as a share of the distance to the scene
+MOST_SCATTER_TURN = np.radians(1.0)  # of a frame set: a camera that turns more is on an arm, and on no rig
+MOST_SCATTER_SHIFT = 0.03  # likewise, as a share of the distance to the scene
+_LEAST_RUN = 4  # frame sets that a camera stands still, in the mean, if it moves on its rig now and then
+_MEDIAN_OF_CHI2_3 = 2.366
+_ENOUGH_DIFFERENCES = 4  # between sets, to know how much their measurements scatter
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePoses:
+    """T_reference_camera of one camera by S frame sets, in the order of time."""
+
+    sets: tuple[int, ...]  # (S,)
+    rotations: Array  # (S, 3, 3)
+    centres: Array  # (S, 3)
+    covariances: Array  # (S, 6, 6) of the turn in the reference's axes, radians, and of the centre
+    scatter: tuple[float, float] = (0.0, 0.0)  # variances of turn and shift of a set, which the covariances have, too
+
+    @cached_property
+    def mounts(self) -> list[list[int]]:
+        """Positions that agree on one pose, the most first; see `find_mounts`."""
+        return find_mounts(self)
+
+    def select(self, positions: Sequence[int]) -> RelativePoses:
+        """Returns those of some positions."""
+        at = list(positions)
+        sets = tuple(self.sets[i] for i in at)
+        return RelativePoses(sets, self.rotations[at], self.centres[at], self.covariances[at], self.scatter)
+
+    def widen(self, turn: float, shift: float) -> RelativePoses:
+        """Returns them with these variances added in each direction."""
+        further = np.diag([turn] * 3 + [shift] * 3)
+        scatter = float(self.scatter[0] + turn), float(self.scatter[1] + shift)
+        return RelativePoses(self.sets, self.rotations, self.centres, self.covariances + further, scatter)
+
+    def residuals(self, rotation: Array, centre: Array) -> Array:
+        """(S, 6) turns and shifts from a pose."""
+        turns = Rotation.from_matrix(self.rotations @ rotation.T).as_rotvec()
+        return np.column_stack([turns, self.centres - centre])
+
+    def mean(self) -> tuple[Array, Array, Array]:
+        """Rotation (3, 3), centre (3,) and covariance (6, 6) of the mean, each weighed by its inverse covariance."""
+        rotation, centre = self.rotations[len(self.sets) // 2], np.median(self.centres, 0)
+        weights = np.linalg.inv(self.covariances)
+        covariance = np.linalg.inv(weights.sum(0))
+        for _ in range(3):
+            step = covariance @ np.einsum("sij,sj->i", weights, self.residuals(rotation, centre))
+            rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
+            centre = centre + step[3:]
+        return rotation, centre, covariance
+
+
+def measure_relative_poses(
+    problem: bundle_adjustment.Problem, joint: Array, pairs: Mapping[int, tuple[int, int]]
+) -> RelativePoses:
+    """The pose of a camera in another's frame by each frame set, of which `pairs` has (reference view, view).
+
+    `joint` (6 C, 6 C) is the covariance of the views' poses. Sets without a finite covariance are left out.
+    """
+    sets, rotations, centres, covariances = [], [], [], []
+    for index, (reference, view) in pairs.items():
+        X = problem.rotations[reference] @ problem.rotations[view].T
+        placed = X @ problem.translations[view]
+        by = np.zeros((6, 12))
+        by[:3, :3], by[:3, 6:9] = np.eye(3), -X
+        by[3:] = cross_matrix(placed[None])[0] @ by[:3]
+        by[3:, 3:6] = np.eye(3)
+        by[3:, 9:12] = -X
+        rows = np.r_[6 * reference : 6 * reference + 6, 6 * view : 6 * view + 6]
+        covariance = by @ joint[np.ix_(rows, rows)] @ by.T
+        if not np.isfinite(covariance).all():
+            continue
+        sets.append(index)
+        rotations.append(X)
+        centres.append(problem.translations[reference] - placed)
+        covariances.append((covariance + covariance.T) / 2.0)
+    count = len(sets)
+    return RelativePoses(
+        tuple(sets),
+        np.reshape(rotations, (count, 3, 3)),
+        np.reshape(centres, (count, 3)),
+        np.reshape(covariances, (count, 6, 6)),
+    )
+
+
+def estimate_scatter(poses: RelativePoses) -> tuple[float, float]:
+    """The variances of turns and of shifts that single sets have beyond what they claim; 0 where there is none.
+
+    By differences between one set and the next: a change of the rig is in one of them only.
+    """
+    if len(poses.sets) - 1 < _ENOUGH_DIFFERENCES:
+        return 0.0, 0.0
+    turns = Rotation.from_matrix(poses.rotations[1:] @ np.swapaxes(poses.rotations[:-1], 1, 2)).as_rotvec()
+    found = []
+    for differences, part in ((turns, slice(0, 3)), (np.diff(poses.centres, axis=0), slice(3, 6))):
+        claimed = np.median(np.trace(poses.covariances[:, part, part], axis1=1, axis2=2)) / 3.0
+        seen = float(np.median((differences**2).sum(1))) / (2.0 * _MEDIAN_OF_CHI2_3)
+        found.append(max(0.0, seen - float(claimed)))
+    return found[0], found[1]
+
+
+def compare(one: tuple[Array, Array, Array], other: tuple[Array, Array, Array]) -> float:
+    """The probability that two poses, each with a covariance, differ as much by chance."""
+    turn = Rotation.from_matrix(one[0] @ other[0].T).as_rotvec()
+    error = np.concatenate([turn, one[1] - other[1]])
+    return float(chi2.sf(error @ np.linalg.solve(one[2] + other[2], error), 6))
+
+
+def is_mounted(poses: RelativePoses, distance: float) -> bool:
+    """Whether a camera is on a rig with the reference: it stands still to it, or moves once and again, as by a blow.
+
+    A camera on an arm moves all the time. `distance` is that to the scene.
+    """
+    if poses.scatter[0] > MOST_SCATTER_TURN**2 or poses.scatter[1] > (MOST_SCATTER_SHIFT * distance) ** 2:
+        return False
+    parts, count = poses.mounts, len(poses.sets)
+    return len(parts[0]) > 1 and (2 * len(parts[0]) > count or _LEAST_RUN * len(parts) <= count)
+
+
+def find_mounts(poses: RelativePoses) -> list[list[int]]:
+    """Positions of `poses` that agree on one pose, the most first: more than one where the camera moved."""
+    parts = _split(poses, list(range(len(poses.sets))))
+    parts.sort(key=lambda part: (-len(part), part[0]))
+    mounts: list[list[int]] = []
+    for part in parts:
+        mean = poses.select(part).mean()
+        like = [compare(poses.select(mount).mean(), mean) for mount in mounts]
+        if like and max(like) >= LEAST_PROBABILITY:
+            mounts[int(np.argmax(like))].extend(part)
+        else:
+            mounts.append(part)
+    return [sorted(mount) for mount in sorted(mounts, key=lambda mount: (-len(mount), mount[0]))]
+
+
+def _split(poses: RelativePoses, positions: list[int]) -> list[list[int]]:
+    """The positions in runs without a change."""
+    if len(positions) < 2:
+        return [positions]
+    found = [
+        compare(poses.select(positions[:at]).mean(), poses.select(positions[at:]).mean())
+        for at in range(1, len(positions))
+    ]
+    best = int(np.argmin(found))
+    if found[best] * len(found) >= LEAST_PROBABILITY:
+        return [positions]
+    return _split(poses, positions[: best + 1]) + _split(poses, positions[best + 1 :])
+
+
+# A rig that is given, against what the images tell of it: which of it is believed, and how long its unit is.
+
+Told = Mapping[str, tuple[Array, Array, Array]]  # rotation, centre and covariance in the reference's frame, by camera
+
+_ROUNDS = 20  # of the fit of the scale
+_LEAST_BASELINE = 2.0  # sigmas by which two cameras must be apart to tell a scale
+
+
+@dataclass(frozen=True, eq=False)
+class GivenMounts:
+    """The given mounts that are believed, in the frame of the reference, metres."""
+
+    believed: Mapping[str, tuple[Array, Array, Array]]
+    refuted: tuple[str, ...]
+    metres_per_unit: float | None
+    reference: str
+
+    def hold(self, camera: str) -> tuple[Array, Array, tuple[float, float]]:
+        """Rotation, centre and sigmas by which the adjustment holds a mount, in the unit of the map."""
+        if self.metres_per_unit is None or camera not in self.believed:
+            return np.eye(3), np.zeros(3), (np.inf, np.inf)
+        rotation, centre, covariance = self.believed[camera]
+        turn, shift = (float(np.sqrt(np.trace(covariance[b, b]) / 3.0)) for b in (slice(0, 3), slice(3, 6)))
+        return rotation.T, centre / self.metres_per_unit, (turn, shift / self.metres_per_unit)
+
+    def fit_scale(self, told: Told) -> tuple[float | None, float]:
+        """Metres a unit of the map, and the standard deviation of its logarithm."""
+        chosen = {camera: told[camera] for camera in self.believed if camera in told}
+        fitted = _fit(chosen, self.believed, list(chosen)) if self.metres_per_unit is not None and chosen else None
+        return (None, np.inf) if fitted is None else fitted[:2]
+
+
+def fit_given_rig(rig: Rig | None, reference: str, told: Told) -> GivenMounts:
+    """Which given mounts the images do not contradict: those of all cameras, or of all but the one that is wrong."""
+    known = {} if rig is None else {each.camera_id: each for each in rig.cameras if each.matrix is not None}
+    names = [camera for camera in (reference, *sorted(told)) if camera in known]
+    if len(names) < 2:
+        return GivenMounts({}, (), None, reference)
+    fits = [chosen for chosen in _choices(names) if _is_consistent(known, told, chosen, reference)]
+    best = [chosen for chosen in fits if len(chosen) == len(fits[0])]
+    if len(best) != 1:
+        return GivenMounts({}, tuple(names), None, reference)
+    believed = _relative_to(known, reference, best[0]) if reference in best[0] else {}
+    fitted = _fit(told, believed, list(believed)) if believed else None
+    refuted = tuple(camera for camera in names if camera not in best[0])
+    return GivenMounts(believed, refuted, None if fitted is None else fitted[0], reference)
+
+
+def _choices(names: Sequence[str]) -> list[tuple[str, ...]]:
+    """All cameras, then all but one."""
+    few = list(combinations(names, len(names) - 1)) if len(names) > 2 else []
+    return [tuple(names), *few]
+
+
+def _is_consistent(known: Mapping[str, RigCamera], told: Told, chosen: Sequence[str], reference: str) -> bool:
+    first = reference if reference in chosen else chosen[0]
+    given = _relative_to(known, first, chosen)
+    seen = told if first == reference else {c: _between(told, first, c, reference) for c in chosen if c != first}
+    fitted = _fit(seen, given, list(given))
+    if fitted is None:
+        # Cameras in one place tell no scale: only how they are turned can be compared.
+        return all(_turn_probability(seen[c], given[c]) >= LEAST_PROBABILITY for c in given)
+    return fitted[2] >= LEAST_PROBABILITY
+
+
+def _relative_to(
+    known: Mapping[str, RigCamera], first: str, chosen: Sequence[str]
+) -> dict[str, tuple[Array, Array, Array]]:
+    """The given poses of the other cameras in the frame of `first`, with what both sigmas amount to."""
+    found = {}
+    base = _matrix(known[first])
+    for camera in chosen:
+        if camera == first:
+            continue
+        T = np.linalg.inv(base) @ _matrix(known[camera])
+        u, _, vt = np.linalg.svd(T[:3, :3])
+        covariance = np.zeros((6, 6))
+        turn_of_first = np.radians(known[first].sigma_deg) ** 2
+        covariance[:3, :3] = (turn_of_first + np.radians(known[camera].sigma_deg) ** 2) * np.eye(3)
+        lever = cross_matrix(T[None, :3, 3])[0]
+        covariance[3:, 3:] = (known[first].sigma_m ** 2 + known[camera].sigma_m ** 2) * np.eye(3)
+        covariance[3:, 3:] += turn_of_first * lever @ lever.T
+        found[camera] = u @ vt, T[:3, 3], covariance
+    return found
+
+
+def _matrix(camera: RigCamera) -> Array:
+    if camera.matrix is None:
+        raise AssertionError("these cameras have a pose on their rig")
+    return camera.matrix
+
+
+def _between(told: Told, first: str, camera: str, reference: str) -> tuple[Array, Array, Array]:
+    """The pose of a camera in the frame of `first`, both told in that of the reference."""
+    R, c, covariance = told[first]
+    if camera == reference:
+        other, centre, of_other = np.eye(3), np.zeros(3), np.zeros((6, 6))
+    else:
+        other, centre, of_other = told[camera]
+    away = centre - c
+    by = np.eye(6)
+    by[3:, :3] = cross_matrix(away[None])[0]
+    turn = np.kron(np.eye(2), R.T)
+    return R.T @ other, R.T @ away, turn @ (by @ covariance @ by.T + of_other) @ turn.T
+
+
+def _turn_probability(seen: tuple[Array, Array, Array], given: tuple[Array, Array, Array]) -> float:
+    turn = Rotation.from_matrix(seen[0] @ given[0].T).as_rotvec()
+    return float(chi2.sf(turn @ np.linalg.solve((seen[2] + given[2])[:3, :3], turn), 3))
+
+
+def _fit(seen: Told, given: Told, names: Sequence[str]) -> tuple[float, float, float] | None:
+    """Metres a unit, the standard deviation of its logarithm, and the probability of what is left; None: no scale."""
+    cameras = [camera for camera in names if camera in seen]
+    if not cameras:
+        return None
+    lengths = [(float(np.linalg.norm(given[c][1])), float(np.linalg.norm(seen[c][1]))) for c in cameras]
+    apart = [metres for c, (metres, _) in zip(cameras, lengths, strict=True)
+             if metres > _LEAST_BASELINE * float(np.sqrt(np.trace(given[c][2][3:, 3:]) / 3.0))]  # fmt: skip
+    unit = sum(unit for _, unit in lengths)
+    if not apart or unit <= 0.0:
+        return None
+    scale = sum(metres for metres, _ in lengths) / unit
+    information, squared = 0.0, 0.0
+    for _ in range(_ROUNDS):
+        top, information, squared = 0.0, 0.0, 0.0
+        for camera in cameras:
+            (R, c, of_seen), (R_given, c_given, of_given) = seen[camera], given[camera]
+            units = np.diag([1.0] * 3 + [scale] * 3)
+            inverse = np.linalg.inv(units @ of_seen @ units + of_given)
+            error = np.concatenate([Rotation.from_matrix(R_given @ R.T).as_rotvec(), c_given - scale * c])
+            by_log = np.concatenate([np.zeros(3), scale * c])
+            top += by_log @ inverse @ error
+            information += by_log @ inverse @ by_log
+            squared += error @ inverse @ error
+        if information <= 0.0:
+            return None
+        step = float(np.clip(top / information, -1.0, 1.0))
+        scale *= float(np.exp(step))
+        if abs(step) < 1e-9:
+            break
+    left = max(1, 6 * len(cameras) - 1)
+    return scale, float(information**-0.5), float(chi2.sf(squared, left))
+
+
+# Rigs: cameras that took their images together stand as they always do, by what is given or by all frame sets.
+
 
 _LEAST_SETS = 2  # that tell a mount: of a single one nothing says that it is fixed
 
@@ -170,11 +477,11 @@ def _measure(found: Map, sets: _Sets, joint: Array, distance: float) -> dict[tup
             pairs = sets.pairs(first, other, frozenset(found.views))
             if first == other or len(pairs) < _LEAST_SETS:
                 continue
-            poses = rig_poses.measure_relative_poses(found.estimate, joint, pairs)
+            poses = measure_relative_poses(found.estimate, joint, pairs)
             if len(poses.sets) >= _LEAST_SETS:
-                stiff = poses.widen(rig_poses.STIFF_TURN**2, (rig_poses.STIFF_SHIFT * distance) ** 2)
-                scattered = stiff.widen(*rig_poses.estimate_scatter(stiff))
-                if rig_poses.is_mounted(scattered, distance):
+                stiff = poses.widen(STIFF_TURN**2, (STIFF_SHIFT * distance) ** 2)
+                scattered = stiff.widen(*estimate_scatter(stiff))
+                if is_mounted(scattered, distance):
                     measured[first, other] = scattered
     return measured
 
@@ -205,7 +512,7 @@ def _constrain(
     count, every = len(problem.rotations), tuple(range(len(sets.views)))
     labels: list[tuple[str, tuple[int, ...]]] = [(reference, every)]
     rotations, translations = [np.eye(3)], [np.zeros(3)]
-    stiff = rig_poses.STIFF_TURN, rig_poses.STIFF_SHIFT * distance
+    stiff = STIFF_TURN, STIFF_SHIFT * distance
     of_mount, sigmas = np.full(count, -1), np.full((count, 2), np.inf)
     held = [(np.eye(3), np.zeros(3), (np.inf, np.inf))]
     for views in sets.views:

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe, longer_side
+from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching.pair_matching import TwoView
-from splatnode.recon.registration import bundle_adjustment
-from splatnode.recon.registration.mapping_problem import Lens
+from splatnode.recon.registration import bundle_adjustment, multiview_geometry
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, PartialMap
 
 # Focal length before anything is reconstructed: a vote of the pairs of frames.
 
@@ -185,3 +185,313 @@ def sizes_disagree(
         np.ptp(focals[observed & (lens_of == lens)]) > config.max_focal_difference
         for lens in set(lens_of[observed].tolist())
     )
+
+
+# Own lenses: is the lens that images are taken to share refuted by any of them?
+#
+# A zoom, an autofocus that breathes, a second camera of the same resolution or a crop gives an image a lens of its
+# own. Nothing tells that beforehand. So each lens parameter of an image is a common value plus a deviation, under a
+# prior whose width is estimated from the deviation itself (automatic relevance determination: MacKay, "Bayesian
+# interpolation", 1992). A deviation stays where the observations tell it well enough; any other falls to where
+# `Config` holds it. Images with a deviation that stays get a lens of their own. What cannot be decided widens the
+# covariance (`widen_lens_priors`).
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+_FOCAL, _RADIAL, _SHIFT, _ASPECT = 0, 1, slice(3, 5), 5  # columns of the parameters of a lens
+_ROUNDS = 8  # of adjustments, each under the prior that the one before gave
+_OWN_SIGMA = 0.5  # of log focal, of a lens whose focal length was refuted
+_NEGLIGIBLE = 1e-6  # a sigma below it is 0
+_WIDE_ROUNDS = 3  # of a coarse search, in which all deviations are free
+_COARSE_TOLERANCE = 5.0  # of the points of a coarse search, times `max_error_px`
+_MANY = 0.3  # share of a group's views that refute its common lens, from which on no view is taken to have it
+_MANY_CALIBRATED = 0.7  # the same of a lens that was given
+_WIDER = 1.5  # times the deviations of such a group that were found: those of its other views are not known
+_MORE = 1.001  # times a sigma: rounding does not make one larger
+_ITERATIONS, _DECREASE = 15, 1e-4  # of the adjustments but the last
+
+
+class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    # Standard deviations of an image's deviations from the common lens, where nothing refutes that it is common
+    focal_sigma: float = 0.004  # of log focal
+    shift_sigma: float = 0.0015  # of the principal point, as a share of the longer side
+    radial_sigma: float = 0.01  # of the first radial coefficient
+    aspect_sigma: float = 0.003  # of the log aspect that all images of a group have in common
+    # The same where the search for deviations begins, in which all of them are free
+    widest_focal: float = 0.3  # of log focal
+    widest_shift: float = 0.1  # of the principal point, as a share of the longer side
+    widest_radial: float = 0.1  # of the first radial coefficient
+    widest_aspect: float = 0.3  # of the log aspect that all images of a group have in common
+    # A deviation of at least so many standard errors stays
+    refuted_at: float = 4.25
+    # Of what all images have in common where it is given: calibrations differ by as much
+    calibrated_focal: float = 0.002  # of log focal
+    calibrated_shift: float = 0.001  # of the principal point, as a share of the longer side
+
+
+@dataclass(frozen=True, eq=False)
+class PerViewLensMap:
+    """A map in which each view has a lens of its own, near the common one of its group."""
+
+    estimate: bundle_adjustment.Problem  # with C lenses, one a view
+    prior: bundle_adjustment.LensPrior  # of these
+    stays: Flags  # (C, 6) deviations from the common lens that stay
+    widths: Array  # (C, 6) of the deviations of a group many of whose views refute that it has this in common; else 0
+    common: Array  # (C, 6) the common parameters of the group of each view
+    displaced: Flags  # (C,) views of groups whose common principal point or aspect is not what it was taken for
+
+    @property
+    def refuting_views(self) -> Flags:
+        """(C,) views that refute the common lens."""
+        return np.asarray(self.stays.any(axis=1))
+
+
+def free_lenses(
+    problem: MapperInput,
+    partial: PartialMap,
+    loss: bundle_adjustment.BundleAdjustmentConfig,
+    config: OwnLensesConfig,
+    coarse: multiview_geometry.TriangulationConfig | None = None,
+) -> PerViewLensMap:
+    """The map adjusted with a lens for each view, and which views refute that theirs is common.
+
+    `loss` has the noise of an observation, by which deviations are weighed. With `coarse` points are triangulated anew
+    before each adjustment, with large errors allowed: a map that a wrong common lens has bent lacks those that tell.
+    """
+    sides = np.array([view.longer_side for view in problem.views], np.float64)
+    groups, registered = partial.estimate.lens_of_camera, np.zeros(len(problem.views), bool)
+    registered[list(partial.registered)] = True
+    shared = np.bincount(groups[registered], minlength=len(partial.prior.sigmas)) > 1
+    floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides)
+    own = _sigmas(config.widest_focal, config.widest_shift, config.widest_radial, sides)
+    own[~shared[groups]] = 0.0  # of a lens with one view there is nothing to deviate from
+    least = _least_common(partial.prior, groups, sides, config)
+    common = np.maximum(least, _sigmas(0.0, config.widest_shift, 0.0, sides, config.widest_aspect))
+    common[~shared[groups]] = least[~shared[groups]]
+    estimate, kept = expand_lenses(partial.estimate), 2.0 / config.refuted_at
+    quick = msgspec.structs.replace(loss, max_iterations=_ITERATIONS, tolerance=_DECREASE)
+    middles, sizes = np.zeros_like(own), np.zeros_like(own)
+    prior = _prior(partial.prior, groups, own, common)
+    for turn in range(_ROUNDS):
+        if coarse is not None:
+            estimate, _ = multiview_geometry.retriangulate(
+                estimate, problem.growing_tracks, partial.registered, problem.scale, coarse, _COARSE_TOLERANCE
+            )
+        estimate = bundle_adjustment.adjust(
+            estimate, prior, loss if turn == _ROUNDS - 1 else quick, partial.registered[0]
+        )
+        middles = _common_parameters(estimate, prior, registered)
+        # What is `refuted_at` standard errors from its mean, or farther, stays under such a prior
+        sizes = kept * _pool_deviations(_parameters(estimate) - middles)
+        if coarse is not None and turn < _WIDE_ROUNDS:
+            continue
+        own = np.where(own > 0, np.maximum(sizes, floors), 0.0)
+        offset = kept * _pool_deviations(middles)
+        for k in (_SHIFT, _ASPECT):
+            common[:, k] = np.where(common[:, k] > 0, np.maximum(offset[:, k], least[:, k]), 0.0)
+        if turn < _ROUNDS - 1:
+            prior = _prior(partial.prior, groups, own, common)
+    stays = (sizes > floors) & (own > 0) & registered[:, None]
+    widths = _widths(stays, sizes / kept, groups, registered, partial.prior.sigmas == 0)
+    displaced = (common > _MORE * least)[:, 3:].any(1)
+    return PerViewLensMap(
+        estimate, prior, stays | (widths > 0), widths, middles, displaced & shared[groups] & registered
+    )
+
+
+def _widths(stays: Flags, sizes: Array, groups: Index, registered: Flags, calibrated: Flags) -> Array:
+    """(C, 6) the RMS deviation of a view's group in a parameter that many of its views refute; 0 where few do."""
+    widths = np.zeros_like(sizes)
+    for group in np.unique(groups[registered]):
+        (members,) = np.nonzero((groups == group) & registered)
+        many = stays[members].mean(0) >= (_MANY_CALIBRATED if calibrated[group] else _MANY)
+        widths[members] = np.where(many & (stays[members].sum(0) > 1), np.sqrt((sizes[members] ** 2).mean(0)), 0.0)
+    return widths
+
+
+def split_lenses(
+    problem: MapperInput, partial: PartialMap, freed: PerViewLensMap, config: OwnLensesConfig
+) -> tuple[MapperInput, PartialMap]:
+    """Both, with lenses of their own for the refuted views, and everything where the freed map has it."""
+    (views,) = np.nonzero(freed.refuting_views)
+    groups, found = partial.estimate.lens_of_camera, freed.estimate
+    lens_of = groups.copy()
+    lens_of[views] = len(problem.lenses) + np.arange(len(views))
+    # What a group has in common is taken where it may change.
+    common = _parameters(partial.estimate)
+    sigmas = partial.prior.own_sigmas
+    for view in partial.registered:
+        group = groups[view]
+        if partial.prior.sigmas[group] > 0:
+            common[group, _FOCAL] = freed.common[view, _FOCAL]
+        if freed.displaced[view]:
+            common[group, 3:] = freed.common[view, 3:]
+            if freed.prior.common is not None:
+                sigmas[group, 3:] = np.maximum(sigmas[group, 3:], freed.prior.common.sigmas[view, 3:])
+    of_views = _parameters(found)[views]
+    own = np.maximum(freed.prior.own_sigmas[views], np.abs(of_views))
+    own[:, _FOCAL] = _OWN_SIGMA
+    sides = np.array([problem.views[view].longer_side for view in views], np.float64)
+    floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides, config.aspect_sigma)
+    values, sigmas = np.concatenate([common, of_views]), np.concatenate([sigmas, own])
+    estimate = replace(
+        found,
+        lens_of_camera=lens_of,
+        log_focals=values[:, _FOCAL],
+        radials=values[:, 1:3],
+        shifts=values[:, _SHIFT],
+        log_aspects=values[:, _ASPECT],
+    )
+    known = partial.prior.ties
+    to, tied = (np.full(len(common), -1), np.zeros_like(common)) if known is None else (known.to, known.sigmas)
+    ties = bundle_adjustment.LensTies(
+        to=np.concatenate([to, groups[views]]),
+        sigmas=np.concatenate([tied, np.where(freed.stays[views], _WIDER * freed.widths[views], floors)]),
+    )
+    means = partial.prior.log_focals
+    prior = bundle_adjustment.LensPrior(
+        log_focals=np.concatenate([means, means[groups[views]]]),
+        sigmas=sigmas[:, _FOCAL],
+        radial_sigmas=sigmas[:, 1:3],
+        shift_sigmas=sigmas[:, 3],
+        aspect_sigmas=sigmas[:, _ASPECT],
+        ties=ties,
+    )
+    lenses = [*problem.lenses, *(Lens((float(np.exp(focal)),), _OWN_SIGMA) for focal in of_views[:, _FOCAL])]
+    numbered = [replace(view, lens=int(lens)) for view, lens in zip(problem.views, lens_of, strict=True)]
+    problem = replace(problem, views=tuple(numbered), lenses=tuple(lenses))
+    return problem, replace(partial, estimate=estimate, prior=prior)
+
+
+def find_common_lens(prior: bundle_adjustment.LensPrior, lens: int, config: OwnLensesConfig) -> int:
+    """The common lens whose focal length and distortion a lens has; the lens itself where these are its own."""
+    if prior.ties is None or prior.ties.to[lens] < 0:
+        return lens
+    tied = prior.ties.sigmas[lens]
+    if not 0 < tied[_FOCAL] <= _MORE * config.focal_sigma or not 0 < tied[_RADIAL] <= _MORE * config.radial_sigma:
+        return lens
+    return int(prior.ties.to[lens])
+
+
+def widen_lens_priors(
+    problem: bundle_adjustment.Problem, prior: bundle_adjustment.LensPrior, sides: Array, config: OwnLensesConfig
+) -> tuple[bundle_adjustment.Problem, bundle_adjustment.LensPrior]:
+    """The same map with what is not known of lenses: each view may deviate from the lens that it shares.
+
+    `sides` (C,) are the longer sides of the views' pictures. The covariance of the two has that in it.
+    """
+    lenses = problem.lens_of_camera
+    common = prior.own_sigmas[lenses]
+    floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides)
+    if prior.ties is None:
+        groups, tied = lenses, floors
+    else:
+        to = prior.ties.to[lenses]
+        groups = np.where(to < 0, lenses, to)
+        tied = np.where((to < 0)[:, None], floors, prior.ties.sigmas[lenses])
+    shared = np.bincount(groups, minlength=len(prior.sigmas)) > 1
+    # A parameter that is not tied, or of a lens that no other view shares, has its whole prior as its own.
+    alone = ~shared[groups][:, None] | ((tied == 0) & (common > 0))
+    own = np.where(alone, common, tied)
+    common = np.where(alone, 0.0, prior.own_sigmas[groups])
+    return expand_lenses(problem), _prior(prior, groups, own, common)
+
+
+def expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Problem:
+    """The same map with as many lenses as views, in their order; those of a group are alike."""
+    groups = estimate.lens_of_camera
+    return replace(
+        estimate,
+        lens_of_camera=np.arange(len(groups)),
+        log_focals=estimate.log_focals[groups],
+        radials=estimate.radials[groups],
+        shifts=estimate.shifts[groups],
+        log_aspects=np.log(estimate.aspects)[groups],
+    )
+
+
+def _sigmas(focal: float, shift: float, radial: float, sides: Array, aspect: float = 0.0) -> Array:
+    """(C, 6)"""
+    sigmas = np.zeros((len(sides), 6))
+    sigmas[:, _FOCAL], sigmas[:, _RADIAL], sigmas[:, _SHIFT] = focal, radial, (shift * sides)[:, None]
+    sigmas[:, _ASPECT] = aspect
+    return sigmas
+
+
+def _least_common(prior: bundle_adjustment.LensPrior, groups: Index, sides: Array, config: OwnLensesConfig) -> Array:
+    """(C, 6) sigmas of what the views of a group have in common, where nothing speaks against what is known of it."""
+    least = _sigmas(config.calibrated_focal, config.calibrated_shift, 0.0, sides, config.aspect_sigma)
+    return np.maximum(prior.own_sigmas[groups], least)
+
+
+def _prior(
+    of_groups: bundle_adjustment.LensPrior, groups: Index, own: Array, common: Array
+) -> bundle_adjustment.LensPrior:
+    return bundle_adjustment.LensPrior(
+        log_focals=of_groups.log_focals[groups],
+        sigmas=own[:, _FOCAL],
+        radial_sigmas=own[:, 1:3],
+        shift_sigmas=own[:, 3],
+        aspect_sigmas=own[:, _ASPECT],
+        common=bundle_adjustment.CommonLensPrior(groups, common),
+    )
+
+
+def _parameters(estimate: bundle_adjustment.Problem) -> Array:
+    """(G, 6)"""
+    return np.column_stack([estimate.log_focals, estimate.radials, estimate.shifts, np.log(estimate.aspects)])
+
+
+def _common_parameters(
+    estimate: bundle_adjustment.Problem, prior: bundle_adjustment.LensPrior, registered: Flags
+) -> Array:
+    """(C, 6) the most likely common parameters of each view's group."""
+    if prior.common is None:
+        raise ValueError("the prior must have common parameters")
+    values, means, own, common = _parameters(estimate), prior.means, prior.own_sigmas, prior.common.sigmas
+    middles = values.copy()
+    for group in np.unique(prior.common.group_of[registered]):
+        (members,) = np.nonzero((prior.common.group_of == group) & registered)
+        weights = 1.0 / np.maximum(own[members], _NEGLIGIBLE) ** 2
+        held = 1.0 / np.maximum(common[members[0]], _NEGLIGIBLE) ** 2
+        total = (weights * values[members]).sum(0) + held * means[members[0]]
+        middles[prior.common.group_of == group] = total / (weights.sum(0) + held)
+    return middles
+
+
+def _pool_deviations(deviations: Array) -> Array:
+    """(C, 6) sizes of the deviations; both coordinates of a principal point count as one."""
+    sizes = np.abs(deviations)
+    sizes[:, _SHIFT] = np.sqrt((deviations[:, _SHIFT] ** 2).mean(1))[:, None]
+    return sizes
+
+
+def add_lens(problem: MapperInput, partial: PartialMap, view: int, focal: float) -> tuple[MapperInput, PartialMap]:
+    """Both, with a lens of its own of this focal length (pixels) for a view, which the map then does not have."""
+    number, before, prior = len(problem.lenses), partial.estimate, partial.prior
+    lens_of = before.lens_of_camera.copy()
+    lens_of[view] = number
+    estimate = replace(
+        before,
+        lens_of_camera=lens_of,
+        log_focals=np.append(before.log_focals, np.log(focal)),
+        radials=np.vstack([before.radials, np.zeros((1, 2))]),
+        shifts=np.vstack([before.shifts, np.zeros((1, 2))]),
+        log_aspects=np.append(np.log(before.aspects), 0.0),
+    )
+    prior = bundle_adjustment.LensPrior(
+        log_focals=np.append(prior.log_focals, np.log(focal)),
+        sigmas=np.append(prior.sigmas, _OWN_SIGMA),
+        radial_sigmas=np.vstack([prior.radial_sigmas, np.zeros((1, 2))]),
+        shift_sigmas=np.append(prior.shift_sigmas, 0.0),
+        aspect_sigmas=None if prior.aspect_sigmas is None else np.append(prior.aspect_sigmas, 0.0),
+        ties=None
+        if prior.ties is None
+        else bundle_adjustment.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
+    )
+    views = tuple(replace(each, lens=number) if index == view else each for index, each in enumerate(problem.views))
+    problem = replace(problem, views=views, lenses=(*problem.lenses, Lens((focal,), _OWN_SIGMA)))
+    registered = tuple(each for each in partial.registered if each != view)
+    return problem, replace(partial, registered=registered, estimate=estimate, prior=prior)

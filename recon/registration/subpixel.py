@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.core import library
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.keyframes import REFERENCE_SIDE
 from splatnode.recon.registration import bundle_adjustment
 
 # Affine alignment of image patches to parts of a pixel (Baker and Matthews, 2004).

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from splatnode.capture import lenses as opencv
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import SQUARE_TOLERANCE, undistort_frame
-from splatnode.recon.frames.keyframe import Features, Keyframe, resize_image, resize_mask
 from splatnode.recon.geometry import distortion
+from splatnode.recon.keyframes import Features, Keyframe, resize_image, resize_mask
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.registration.self_calibration import LEAST_SHIFT

@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import select_gaussians
-from splatnode.recon.result.export.quaternions import matrices_from_quats, quats_from_matrices
+from splatnode.recon.result.export.limits import select_gaussians
+from splatnode.recon.result.placement import matrices_from_quats, quats_from_matrices
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, find_confirmed
 
 Array = npt.NDArray[np.float64]

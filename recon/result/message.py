@@ -38,16 +38,26 @@ from splatnode.capture.messaging.messages import (
     make_jpeg_array,
 )
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text
-from splatnode.recon.result.depth_check import DepthCheckRecord, make_depth_check_record
-from splatnode.recon.result.reference_frame import FIRST_CAMERA, FrameName, ReferenceFrame, find_frame_problem
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
+    DepthCheckRecord,
     GaussianArrays,
     GivenCameraPose,
     Snapshot,
     find_camera_problem,
+    make_depth_check_record,
 )
-from splatnode.recon.result.verdict import RELATIVE, Bounds, Code, Scale, Verdict
+from splatnode.recon.result.verdict import (
+    FIRST_CAMERA,
+    RELATIVE,
+    Bounds,
+    Code,
+    FrameName,
+    ReferenceFrame,
+    Scale,
+    Verdict,
+    find_frame_problem,
+)
 
 THUMBNAIL_SIDE = 320  # pixels
 THUMBNAIL_QUALITY = 85  # of 100, as JPEG

@@ -27,13 +27,12 @@ from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import outlast, raise_shortage
 from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import guard_untrusted, is_printable, sanitize_text
-from splatnode.recon.result.depth_check import StoredDepthCheck
 from splatnode.recon.result.export.cameras import decode_cameras
 from splatnode.recon.result.export.limits import SceneFileError, read_json_file
 from splatnode.recon.result.export.stored import SOURCES, StoredResult, read_cameras, read_gaussians
 from splatnode.recon.result.npz_files import LANDMARKS, read_landmarks
 from splatnode.recon.result.placement import IDENTITY, Placement
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, StoredDepthCheck
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry
 from splatnode.recon.result.verdict import Code, Up, Verdict
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.priors import pointmap as priors_pointmap
 from splatnode.recon.priors.pointmap import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap
 from splatnode.recon.scene.scene import Exposure

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix, transform_to_camera
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap, compute_modelled_K, select_sparse_points
 from splatnode.recon.registration.registration import RegisteredCamera, Registration

@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.config import Internal
+from splatnode.recon import keyframes
 from splatnode.recon.core import library
-from splatnode.recon.frames import screening
 from splatnode.recon.geometry import quat_from_matrix
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors import pointmap as priors_pointmap
@@ -462,7 +462,7 @@ def initialize_scene(
     images.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
-    valid = screening.valid_masks(pictures)
+    valid = keyframes.valid_masks(pictures)
     known_masks = [masks.get(pointmap.name) for pointmap in pointmaps]
     pointmaps = tuple(map(Pointmap.apply_image_mask, map(Pointmap.apply_mask, pointmaps, valid), known_masks))
     used = [rim if mask is None else rim & mask for rim, mask in zip(valid, known_masks, strict=True)]

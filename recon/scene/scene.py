@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.frame import Intrinsics, Stamp
-from splatnode.recon.frames import screening
+from splatnode.recon import keyframes
 from splatnode.recon.geometry import multiply_quats, quat_from_matrix
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
@@ -128,7 +128,7 @@ class TrainingView:
 
 def compute_fit_masks(views: Sequence[TrainingView]) -> list[npt.NDArray[np.bool_]]:
     """Returns each view's pixels (h, w) that the scene is fitted to: neither in a dark rim nor masked."""
-    shown = screening.valid_masks([view.image for view in views])
+    shown = keyframes.valid_masks([view.image for view in views])
     return [rim if view.mask is None else rim & view.mask for view, rim in zip(views, shown, strict=True)]
 
 

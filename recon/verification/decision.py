@@ -13,15 +13,13 @@ from functools import cached_property
 import numpy as np
 
 from splatnode.capture import keyframe_selection
-from splatnode.recon.frames.keyframe import longer_side
-from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.geometry import distortion
+from splatnode.recon.keyframes import Rejected, longer_side
 from splatnode.recon.matching.pair_matching import TwoView, median_motion_px
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, find_widest
 from splatnode.recon.verification import refit, rejections
-from splatnode.recon.verification.config import DecisionConfig
 from splatnode.recon.verification.error_model import (
     VerdictModel,
     VerdictModels,
@@ -33,7 +31,7 @@ from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import refuse_stereo_or_panorama
 from splatnode.recon.verification.refit import FreedLens
-from splatnode.recon.verification.rejections import Refusal, refuse
+from splatnode.recon.verification.rejections import DecisionConfig, Refusal, refuse
 
 Pair = tuple[int, int]
 

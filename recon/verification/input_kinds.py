@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import PLAIN, Keyframe, longer_side
+from splatnode.recon.keyframes import PLAIN, Keyframe, longer_side
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict

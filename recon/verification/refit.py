@@ -10,16 +10,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, umeyama
+from splatnode.recon.keyframes import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.pair_matching import TwoView
-from splatnode.recon.registration import (
-    bundle_adjustment,
-    incremental_mapper,
-    own_lenses,
-    self_calibration,
-    triangulation,
-)
+from splatnode.recon.registration import bundle_adjustment, incremental_mapper, multiview_geometry, self_calibration
 from splatnode.recon.registration.registration import Registration
 from splatnode.recon.registration.self_calibration import CORNER
 
@@ -84,7 +78,9 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     position = np.full(len(keyframes), -1)
     position[[camera.index for camera in cameras]] = np.arange(len(cameras))
     camera_of = position[registration.observed_by]
-    chosen = triangulation.longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
+    chosen = multiview_geometry.longest(
+        camera_of, registration.observed_point, len(registration.points), tracks_per_camera
+    )
     observed = chosen[registration.observed_point]
     sides = np.array([longer_side(keyframes[c.index].frame) for c in cameras])
     numbers, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
@@ -151,7 +147,7 @@ def _tie_near_lenses(numbers: Index, near: Index) -> bundle_adjustment.LensTies 
         (itself,) = np.nonzero(numbers == common)
         first = itself[0] if len(itself) else members[0]
         others = members[members != first]
-        to[others], sigmas[others, 0] = first, own_lenses.OwnLensesConfig().focal_sigma
+        to[others], sigmas[others, 0] = first, self_calibration.OwnLensesConfig().focal_sigma
     return bundle_adjustment.LensTies(to, sigmas) if (to >= 0).any() else None
 
 
@@ -521,14 +517,14 @@ def doubt_common_lenses(fit: BundleFit) -> CameraShifts:
     """
     whole = adjust(fit)
     count, side = len(whole.problem.rotations), REFERENCE_SIDE * fit.scale
-    config = msgspec.structs.replace(own_lenses.OwnLensesConfig(), focal_sigma=DOUBTED_FOCAL)
+    config = msgspec.structs.replace(self_calibration.OwnLensesConfig(), focal_sigma=DOUBTED_FOCAL)
     shared = np.bincount(whole.problem.lens_of_camera, minlength=len(whole.prior.sigmas)) > 1
     shifts = np.where(shared, np.maximum(whole.prior.shift_sigmas, DOUBTED_SHIFT * side), whole.prior.shift_sigmas)
     prior = replace(whole.prior, shift_sigmas=shifts)
-    apart, prior = own_lenses.widen_lens_priors(whole.problem, prior, np.full(count, side), config)
+    apart, prior = self_calibration.widen_lens_priors(whole.problem, prior, np.full(count, side), config)
     apart = bundle_adjustment.adjust(apart, prior, fit.loss)
     mean = compute_camera_shifts(
-        replace(whole, problem=own_lenses.expand_lenses(whole.problem)), replace(whole, problem=apart)
+        replace(whole, problem=self_calibration.expand_lenses(whole.problem)), replace(whole, problem=apart)
     )
     covariance = bundle_adjustment.covariance(apart, prior, fit.loss, 0)
     rotations, centres = bundle_adjustment.camera_sigmas(apart, covariance, range(count))

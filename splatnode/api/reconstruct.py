@@ -61,15 +61,13 @@ from splatnode.recon import threads as limits
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.metric.stereo import StereoPair, make_pairs, stream_right_images
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.pipeline import OfflineResult, check_baseline, rebuild_from_scratch, reconstruct_source
-from splatnode.recon.replay_source import Source, add_poses, apply_masks
-from splatnode.recon.result.reference_frame import FrameChoice
+from splatnode.recon.replay_source import Source, add_poses, apply_masks, apply_rig
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.rig_choice import apply_rig
+from splatnode.recon.result.verdict import FrameChoice
 
 # Photographs that are all at hand, reconstructed in the process that asks.
 

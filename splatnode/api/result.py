@@ -23,11 +23,11 @@ from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
 from splatnode.capture.process import python
 from splatnode.capture.process.system import remedy
 from splatnode.recon import core
-from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.limits import sanitize_gaussians
 from splatnode.recon.result.export.result import copy_result
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.npz_files import LANDMARKS, read_depths, read_landmarks
-from splatnode.recon.result.reference_frame import ReferenceFrame
+from splatnode.recon.result.placement import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
@@ -36,17 +36,16 @@ from splatnode.recon.result.snapshot import (
     find_camera_problem,
     find_confirmed,
 )
-from splatnode.recon.result.spherical_harmonics import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.stored_snapshot import read_result
 from splatnode.recon.result.submap_index import is_map_set
-from splatnode.recon.result.verdict import Bounds, Verdict, compute_covariance
+from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict, compute_covariance
 from splatnode.viewer.probe import open3d_installed, probe_window
 
 if TYPE_CHECKING:
     from splatnode.api.photographs import Lens, Picture
     from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.occupancy.grid import OccupancyMap
-    from splatnode.recon.result.depth_check import DepthCheck
+    from splatnode.recon.result.snapshot import DepthCheck
 
 # A result in a viewer, which is a process of its own: in a window, in rerun's, or in a browser.
 #
@@ -108,7 +107,7 @@ def _check(viewer: Viewer) -> None:
 
 def _export_rrd(folder: Path) -> Path:
     """Exports the result in the folder as `splatnode export --to rrd` does."""
-    from splatnode.recon.result.export.format import export_scene
+    from splatnode.recon.result.export import export_scene
 
     return export_scene(folder, "rrd")
 

@@ -17,10 +17,10 @@ from splatnode.api.photographs import add_depths, load_frames
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.result.depth_check import DepthCode
+from splatnode.recon.result.snapshot import DepthCode
+from splatnode.recon.threads import Clock
 from tests.api.conftest import QUICK, SMALL
 from tests.api.test_publisher import picture, publisher, receive, recon
 from tests.support import depth_camera

@@ -7,8 +7,7 @@ import pytest
 
 import splatnode
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.result.reference_frame import FrameName
-from splatnode.recon.result.verdict import Code
+from splatnode.recon.result.verdict import Code, FrameName
 from tests.api.conftest import SMALL
 
 QUICK = {"optimize": {"iterations": 5}}

@@ -34,7 +34,7 @@ from splatnode.capture.messaging.messages import (
     frame_in,
 )
 from splatnode.capture.recording import Recorder, read
-from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
+from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 
 LENS = Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0, "calibration")
 BESIDE = np.array([[1.0, 0, 0, 0.02], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

@@ -27,7 +27,7 @@ from splatnode.capture.messaging.messages import (
     encode_frame,
 )
 from splatnode.capture.recording import INDEX, Recorder, read
-from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
+from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 from tests.capture.cameras.test_folder import encoded, tiff, with_exif
 
 TOLD = ExposureSettings(0.008, 400.0, 2.0)

@@ -11,7 +11,7 @@ from splatnode.capture.messaging.messages import FrameHeader, Numbering, decode,
 from splatnode.capture.odometry import LARGEST_M, GivenPose, make_given_pose
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.capture.rig import RigCamera
-from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
+from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 
 MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 POSE = make_given_pose(MOVED, 0.02, 1.5)

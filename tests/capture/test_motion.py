@@ -13,7 +13,7 @@ from splatnode.capture.frame import Frame, rename_frame
 from splatnode.capture.messaging.messages import FrameHeader, Numbering, WireError, decode, encode, encode_frame
 from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.recording import INDEX, Recorder, read
-from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
+from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 
 STEP = np.eye(4)
 STEP[:3, :3], STEP[:3, 3] = Rotation.from_rotvec([0.0, 0.3, 0.0]).as_matrix(), [0.1, 0.0, 0.5]

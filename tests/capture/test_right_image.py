@@ -11,7 +11,7 @@ from splatnode.capture.frame import Baseline, DroppedFrame, Frame, RightImage, r
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.messaging.messages import Numbering, encode_frame
 from splatnode.capture.recording import Recorder, read
-from splatnode.recon.daemon.checkpoint.records import file_name, read_frame, write_frame
+from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 
 SEEN = np.random.default_rng(0).integers(0, 256, (6, 8)).astype(np.uint8)
 RIGHT = RightImage(SEEN, Baseline(0.075, 0.001))

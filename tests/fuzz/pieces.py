@@ -18,12 +18,12 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_queue import Spool, SpoolConfig, SpoolFull
 from splatnode.capture.messaging.messages import Key, ReceivedFrame
 from splatnode.capture.messaging.network import allow, create_keys, expect_server, read_keys
-from splatnode.recon.daemon.checkpoint import records
-from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import ledger
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.export import export_scene
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.export.stored import read_gaussians
-from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.verdict import Code
 from tests.fuzz.interrupted import Piece, Tell
 from tests.support.exported import make_gaussians, make_snapshot, write
@@ -136,7 +136,7 @@ def _storing(disk: Path, tell: Tell) -> None:
 
 def _finishing(store: Store) -> None:
     """Takes the place that was left among the finished ones, as the daemon does once its scene is final."""
-    for folder in records.list_left_folders(store.directory):
+    for folder in ledger.list_left_folders(store.directory):
         with contextlib.closing(Store(folder)) as kept:
             kept.save("codes", _Thing(3), _arrays(3))
             kept.remove_scene_files()
@@ -146,7 +146,7 @@ def _finishing(store: Store) -> None:
 def _retracting(store: Store) -> None:
     """Takes a finished place back among those that were left, and a frame out of it."""
     for scene, name in store.ledger.retracted:
-        folder = records.reopen(store.directory, scene)
+        folder = ledger.reopen(store.directory, scene)
         if folder is not None:
             with contextlib.closing(Store(folder)) as kept:
                 kept.forget(name, "retracted")
@@ -192,14 +192,14 @@ def _store_after(disk: Path, told: list[str]) -> None:
 
 def _left_after(store: Store, promised: set[int], told: list[str]) -> None:
     """A place is here, in left/ or in finished/, whole each way."""
-    folders = [*records.list_left_folders(store.directory), *records.list_finished_folders(store.directory)]
+    folders = [*ledger.list_left_folders(store.directory), *ledger.list_finished_folders(store.directory)]
     assert len(folders) == (store.scene_id == "scene-0002"), folders
     if "retract 0" in told and folders:
         _retracting(store)
         promised = promised - {0}
     elif "begin retract 0" in told:
         promised = promised - {0}
-    folders = [*records.list_left_folders(store.directory), *records.list_finished_folders(store.directory)]
+    folders = [*ledger.list_left_folders(store.directory), *ledger.list_finished_folders(store.directory)]
     for folder in folders:
         with contextlib.closing(Store(folder)) as kept:
             frames = {stored.key[1] for stored in kept.frames()}

@@ -18,8 +18,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import write_capture
 from splatnode.extras.evaluate.runner import evaluate_held_out_views
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training import RefinementConfig, refine

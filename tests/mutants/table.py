@@ -198,7 +198,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "registration",
-        "recon/registration/triangulation.py",
+        "recon/registration/multiview_geometry.py",
         ("points of a tenth of a degree are kept", "min_angle_deg: float = 1.0", "min_angle_deg: float = 0.1"),
         ("a frame's two features of one track both stay", "unique = count[group] == 1", "unique = count[group] >= 1"),
     ),
@@ -308,7 +308,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "losses",
-        "recon/optimize/pseudo_views.py",
+        "recon/optimize/regularizers.py",
         (
             "semantic loss against the farthest view",
             "nearest = start if share < 0.5 else end",
@@ -317,7 +317,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "losses",
-        "recon/optimize/losses/dino.py",
+        "recon/optimize/losses/semantic.py",
         (
             "semantic loss: embeddings not of unit length",
             "return functional.normalize(tokens[0, 0], dim=0)",
@@ -564,7 +564,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/checkpoint/store.py",
+        "recon/daemon/checkpoint.py",
         (
             "a frame that was removed may come again",
             "gone=(*ledger.gone, key)[-REMEMBERED:],",
@@ -578,7 +578,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/atlas/pose_graph.py",
+        "recon/daemon/pose_graph.py",
         ("a contradicted loop stays", "CONTRADICTED = 5.0", "CONTRADICTED = 1e6"),
         (
             "links are followed the wrong way",

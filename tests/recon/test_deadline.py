@@ -2,7 +2,7 @@ import time
 
 import pytest
 
-from splatnode.recon.clock import OutOfTime, make_deadline_pause
+from splatnode.recon.threads import OutOfTime, make_deadline_pause
 
 
 def test_a_pause_is_asked_first_and_then_the_time():

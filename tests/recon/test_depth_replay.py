@@ -12,7 +12,7 @@ import pytest
 import splatnode
 from splatnode import command_line
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.result.depth_check import DepthCode
+from splatnode.recon.result.snapshot import DepthCode
 from tests.support import mcap_files
 from tests.support.depth_camera import DepthCamera, measure
 from tests.support.synthetic import photographs

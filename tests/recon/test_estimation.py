@@ -14,7 +14,7 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction, ReconstructionCache, StreamState
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import registration
-from splatnode.recon.verification import consistency
+from splatnode.recon.verification import evidence
 from tests.support.synthetic import photographs, places, view_graph
 
 CONFIG = ReconstructionConfig()
@@ -85,7 +85,7 @@ def test_two_keyframes_are_no_start_for_a_quick_estimate(graph):
 def test_a_mirrored_photograph_is_not_accepted_provisionally(graph):
     """Where a place is symmetric, the mirror image of a photograph fits to the pixel: only its details tell."""
     photograph = graph.keyframes[3]
-    features = replace(photograph.features, descriptors=consistency.mirror_descriptors(photograph.features.descriptors))
+    features = replace(photograph.features, descriptors=evidence.mirror_descriptors(photograph.features.descriptors))
     fitting = replace(graph, keyframes=(*graph.keyframes[:3], replace(photograph, features=features)))
     before = holding(first(graph, 3))
     assert before.estimate_soon().publishable

@@ -12,14 +12,14 @@ import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import decode_image
-from splatnode.recon import preparation
+from splatnode.recon import estimation
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.frames.screening import screen_all
+from splatnode.recon.estimation import UnusableFrame, prepare_all
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.dynamic_objects import moving_points
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import UnusableFrame, prepare_all
 from splatnode.recon.priors import stereo
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import photographs
@@ -129,7 +129,7 @@ def test_a_lens_that_folds_one_photograph_costs_that_one_and_of_all_it_is_the_le
 def test_a_stream_goes_on_without_the_frame_that_cannot_be_prepared(monkeypatch):
     views = photographs()[:2]
     work = IncrementalReconstruction(preset("preview"))
-    monkeypatch.setattr(preparation, "undistort_frame", failing_for(views[1].name, preparation.undistort_frame))
+    monkeypatch.setattr(estimation, "undistort_frame", failing_for(views[1].name, estimation.undistort_frame))
     for view in views:
         work.add_frame(view)
     assert work.names == [views[0].name]

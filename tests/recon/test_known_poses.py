@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.odometry import make_given_pose
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
-from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth, load_prior
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.pipeline import estimate_frame_cameras, run
-from splatnode.recon.preparation import load_prior
 from splatnode.recon.result.verdict import Code
+from splatnode.recon.threads import Clock
 from tests.support.synthetic import SMALL, photographs
 
 Array = npt.NDArray[np.float64]

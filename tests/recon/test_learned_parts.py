@@ -12,7 +12,7 @@ from splatnode.capture.process.config import parse_config
 from splatnode.recon import priors
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.doctor import findings
-from splatnode.recon.learned_parts import LearnedPart, find_unavailable_reason, list_learned_parts
+from splatnode.recon.fallbacks import LearnedPart, find_unavailable_reason, list_learned_parts
 from splatnode.recon.networks import weights as networks_weights
 from splatnode.recon.networks.weights import CATALOGUE, Weights
 

@@ -14,11 +14,11 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.masks import apply_mask
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.estimation import prepare
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.pipeline import run
-from splatnode.recon.preparation import prepare
 from splatnode.recon.result.report import build_report, render_rgb
 from tests.support.synthetic import SMALL, errors, photographs
 

@@ -19,20 +19,20 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.terminal import InputWarning, give_warnings, ignore_progress
 from splatnode.capture.rig import Rig, RigCamera, format_rig, read_rig
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig, apply_changes
+from splatnode.recon.estimation import load_prior
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.preparation import load_prior
-from splatnode.recon.replay_source import Source
-from splatnode.recon.rig_choice import (
+from splatnode.recon.replay_source import (
     DRAWN_SIGMA_DEG,
     DRAWN_SIGMA_M,
+    Source,
     add_rig_lenses,
     apply_rig,
     choose_rig,
     describe_rig_use,
     hold_rig,
 )
+from splatnode.recon.threads import Clock
 from tests.support import mcap_files
 from tests.support.rig_walk import RigWalk, make_rig_walk, true_mounts
 

@@ -19,12 +19,11 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.keyframe_selection import group_frame_sets
 from splatnode.capture.lenses import Lenses
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction
+from splatnode.recon.estimation import Reconstruction, load_prior
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.preparation import load_prior
 from splatnode.recon.replay_source import Request, Source, load_source, parse_sources
+from splatnode.recon.threads import Clock
 from splatnode.recon.verification.decision import _find_other_lens_frames
 from tests.support import lerobot_sets, mcap_files
 

@@ -12,20 +12,19 @@ from pathlib import Path
 import msgspec
 import pytest
 
-import splatnode.recon.viewer_process
+import splatnode.recon.cli
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config, read_yaml
-from splatnode.recon.cli import LOOK_EVERY
+from splatnode.recon.cli import LOOK_EVERY, viewer
 from splatnode.recon.config import preset
 from splatnode.recon.pipeline import set_preview_interval
-from splatnode.recon.viewer_process import viewer
 from tests.viewer.test_cli import snapshot
 
 SLEEPER = (sys.executable, "-c", "import time; time.sleep(60)", "--")
 
 
 def test_the_viewer_gets_the_last_snapshot(tmp_path, capfd, monkeypatch):
-    monkeypatch.chdir(Path(splatnode.recon.viewer_process.__file__).parent.parent)
+    monkeypatch.chdir(Path(splatnode.recon.cli.__file__).parent.parent)
     command = (sys.executable, "-m", "splatnode", "view", "--headless", "--size", "64x48")
     with viewer(tmp_path, command) as show:
         for sequence in range(20):
@@ -52,7 +51,7 @@ def test_showing_waits_for_nobody_and_a_failed_run_ends_the_viewer(tmp_path, mon
         return started[-1]
 
     popen = subprocess.Popen
-    monkeypatch.setattr(splatnode.recon.viewer_process.subprocess, "Popen", remember)
+    monkeypatch.setattr(splatnode.recon.cli.subprocess, "Popen", remember)
     shown = snapshot()
     with pytest.raises(RuntimeError, match="the run failed"), viewer(tmp_path, SLEEPER) as show:
         begin = time.perf_counter()

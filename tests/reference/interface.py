@@ -15,9 +15,8 @@ from splatnode.capture.frame import DroppedFrame, Stamp
 from splatnode.capture.process.terminal import ProgressStep
 from splatnode.recon.locating.outcome import LocalizationBounds
 from splatnode.recon.occupancy.grid import Upright
-from splatnode.recon.result.depth_check import DepthCheck
-from splatnode.recon.result.reference_frame import ReferenceFrame
-from splatnode.recon.result.verdict import Bounds, Verdict
+from splatnode.recon.result.snapshot import DepthCheck
+from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict
 from tests.reference.comments import field_comments
 
 _INTRODUCTION = """# API

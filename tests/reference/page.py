@@ -13,7 +13,7 @@ from splatnode.capture.process.config import Plugin, has_fields
 from splatnode.recon.config import PRESETS
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.config import DaemonConfig as Daemon
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.keyframes import REFERENCE_SIDE
 from tests.reference.options import REQUIRED, Option, Section, sections
 
 _INTRODUCTION = f"""# Configuration

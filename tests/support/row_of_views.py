@@ -8,8 +8,8 @@ from types import MappingProxyType, SimpleNamespace
 import numpy as np
 
 from splatnode.capture.frame import ExposureSettings, Frame
-from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.geometry import Similarity
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap

@@ -16,7 +16,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama import BRICK_WALL, Camera, cast, place
 from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.protocol import CameraErrors, compare_cameras
-from splatnode.recon.frames.keyframe import Keyframe, resize_image
+from splatnode.recon.keyframes import Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph, match

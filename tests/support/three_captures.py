@@ -11,7 +11,7 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.terminal import Problems
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import ingest
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 
 STEP_NS = 200_000_000  # five frames a second
 CAMERA = f'''

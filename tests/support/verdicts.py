@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.consistency import CycleConsistency, Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide
-from splatnode.recon.verification.evidence import CameraEvidence, Evidence, WeakestLink
+from splatnode.recon.verification.evidence import CameraEvidence, CycleConsistency, Evidence, Reflection, WeakestLink
 from splatnode.recon.verification.refit import Distortion, Errors, PoseErrors
 
 PLAIN, RICH = 20, 2000  # features

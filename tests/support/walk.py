@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.export.prepare import SH_C0
+from splatnode.recon.result.export.limits import SH_C0
 from splatnode.recon.result.npz_files import DEPTHS, encode_depths
 from splatnode.recon.result.placement import IDENTITY, Placement
 from splatnode.recon.result.report import build_report

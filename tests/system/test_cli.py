@@ -20,8 +20,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.process import system
 from splatnode.capture.process.arguments import Verb
-from splatnode.recon.result.export import ResultWriteError
-from splatnode.recon.result.export.format import list_format_names
+from splatnode.recon.result.export import ResultWriteError, list_format_names
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.verbs import list_export_formats
@@ -66,7 +65,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.extras.verbs",
         "splatnode.recon.former_names",
         "splatnode.recon.metric.arguments",
-        "splatnode.recon.replay_verb",
+        "splatnode.recon.verbs",
         "splatnode.recon.verbs",
         "splatnode.viewer.verbs",
     ]
@@ -86,7 +85,7 @@ def test_a_verb_of_the_core_loads_no_plug_in():
     loaded = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).split()
     assert loaded == [
         "splatnode.capture.verbs",
-        "splatnode.recon.replay_verb",
+        "splatnode.recon.verbs",
         "splatnode.recon.verbs",
         "splatnode.viewer.verbs",
     ]

@@ -15,8 +15,8 @@ from splatnode.capture.messaging import messages, network, pubsub
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
-from splatnode.recon.occupancy.message import MapHeader, MapRecord
-from splatnode.recon.result.export.format import list_format_names
+from splatnode.recon.occupancy.grid import MapHeader, MapRecord
+from splatnode.recon.result.export import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
 from tests.conftest import ROOT

@@ -18,7 +18,7 @@ from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_SCENE, Network, NetworkError, runtime_directory
 from splatnode.capture.messaging.pubsub import StateServer
 from splatnode.capture.process.files import NotOwnerOnly
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from tests.conftest import ROOT
 from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 

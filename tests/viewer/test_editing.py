@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export.prepare import Box, Selection
+from splatnode.recon.result.export.limits import Box, Selection
 from splatnode.recon.result.snapshot import SHELL, GaussianArrays, encode_unconfirmed
 from splatnode.viewer.session import (
     EditError,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Bounds, Code, Scale, Verdict, make_ball
 from splatnode.viewer import text

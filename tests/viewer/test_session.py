@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export.prepare import Selection
+from splatnode.recon.result.export.limits import Selection
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Scale
 from splatnode.viewer.analysis import Analyst

@@ -6,7 +6,7 @@ far after each new one, with adaptive density control.
 
 As published: this order, the losses, and the step sizes of 3DGS. Compact: photographs of 512 pixels; a Gaussian for
 every ninth pixel; and, but for `PUBLISHED`, 60 iterations for a frame alone, 200 for a motion, 60 after each frame. The
-500 at the end are ours. A monocular network's place takes known depth (outcome.py), which also gives the focal length.
+500 at the end are ours. A monocular network's place takes known depth (methods.py), which also gives the focal length.
 """
 
 from __future__ import annotations
@@ -27,15 +27,14 @@ from splatnode.extras.evaluate.methods import FrameWithDepth
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import GaussianAppearance
 from splatnode.extras.evaluate.rivals import colmap_3dgs
-from splatnode.recon.clock import Clock
 from splatnode.recon.optimize import training
-from splatnode.recon.optimize.control import adaptive
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.priors.pointmap import compute_world_points
 from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.initialization import gaussians_at
 from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+from splatnode.recon.threads import Clock
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -19,14 +19,13 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.lenses import undistort_frame
 from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.rivals.colmap import RegisteredFrame, SparseModel, reconstruct_sparse_model
-from splatnode.recon.clock import Clock
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.optimize import ensemble, training
-from splatnode.recon.optimize.control import adaptive
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.initialization import gaussians_at
 from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.threads import Clock
 
 SIZE = 512  # longer side of the photographs, pixels
 _OPACITY = 0.1  # of a Gaussian that starts from a point

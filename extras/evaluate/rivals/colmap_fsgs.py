@@ -18,10 +18,8 @@ from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate.rivals import colmap_3dgs
 from splatnode.extras.evaluate.rivals.colmap import SparseModel
 from splatnode.recon.optimize import regularizers, training
-from splatnode.recon.optimize.control import adaptive, proximity
-from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.optimize.losses import depth
-from splatnode.recon.optimize.losses.loss import LossChoice
+from splatnode.recon.optimize.control import ControlChoice, adaptive, proximity
+from splatnode.recon.optimize.losses import LossChoice, depth
 from splatnode.recon.priors import classical, stereo
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot

@@ -18,9 +18,9 @@ from torch.nn import functional
 from splatnode.capture.frame import Frame
 from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.regions import FieldSnapshot
-from splatnode.recon.clock import Clock
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.threads import Clock
 
 # A radiance field: density and colour of every point, by a small network (Mildenhall et al. 2020).
 

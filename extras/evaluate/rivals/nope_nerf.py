@@ -2,7 +2,7 @@
 
 As published: the weights of the losses (depth 0.04; point clouds 1 and surface colours 1 between consecutive frames,
 until the relative poses stand), and a focal length that is known. Compact as nerfmm is. A monocular network's place
-takes known depth (outcome.py), each map divided by its median so that its scale has to be found; it also gives the
+takes known depth (methods.py), each map divided by its median so that its scale has to be found; it also gives the
 focal length.
 """
 
@@ -22,7 +22,7 @@ from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.methods import FrameWithDepth
 from splatnode.extras.evaluate.rivals import nerfmm
 from splatnode.extras.evaluate.rivals.nerfmm import OPTIMIZE, SIZE, Focal, make_field_snapshot, sample_pixels
-from splatnode.recon.frames.keyframe import resize_image, resize_mask
+from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 _DEPTH, _CLOUD, _SURFACE = 0.04, 1.0, 1.0  # weights

@@ -36,8 +36,7 @@ from splatnode.extras.evaluate.stability.trial import (
 from splatnode.extras.evaluate.stability.window_campaign import run_windows_verb
 from splatnode.extras.jobs.calls import Engine, Limits, Task, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
-from splatnode.recon.result.export.staged import json_bytes, write_files
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, json_bytes, write_files
 
 # The trials counted: how often a wrong scene was published, how often a right one refused.
 

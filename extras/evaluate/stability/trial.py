@@ -38,7 +38,6 @@ from splatnode.extras.evaluate.rivals.colmap import (
 from splatnode.extras.evaluate.stability.perturbations import Sampler, TrialImage
 from splatnode.extras.jobs import calls
 from splatnode.extras.jobs.calls import now
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius, umeyama
@@ -48,6 +47,7 @@ from splatnode.recon.registration.registration import register
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Bounds, Code, Verdict
+from splatnode.recon.threads import Clock
 from splatnode.recon.verification.evidence import verify
 
 Source = Callable[[], Iterable[Frame | DroppedFrame]]

@@ -70,14 +70,12 @@ from splatnode.extras.evaluate.stability.windows import (
 from splatnode.extras.jobs.calls import Engine, Limits, Task, Work, now, pack_call, work_folder
 from splatnode.extras.jobs.calls import engine as opened
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks
-from splatnode.recon.frames.screening import screen_all
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import load_prior, prepare
-from splatnode.recon.result.export.staged import json_bytes, write_files
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder, json_bytes, write_files
 
 # splatnode's answers to windows: the steps of recon/pipeline.py up to the verdict.
 

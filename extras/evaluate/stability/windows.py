@@ -25,7 +25,7 @@ from splatnode.extras.evaluate.stability.trial import (
     measure_camera_errors,
     measure_set_errors,
 )
-from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
+from splatnode.recon.keyframes import PLAIN, Features, Keyframe
 from splatnode.recon.matching.pair_matching import MatchedPair, TwoView
 from splatnode.recon.matching.view_graph import Matcher, MatchingConfig, Pair, ViewGraph, match_pending
 from splatnode.recon.result.snapshot import CameraEstimate

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
+from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.rasterize.reference import compute_rotations
 from splatnode.recon.scene.scene import Gaussians, concatenate, logit
 

@@ -15,8 +15,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.optimize.control import adaptive
-from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
+from splatnode.recon.optimize.control import GaussianChange, OptimizerStep, adaptive
 from splatnode.recon.scene.scene import Gaussians, concatenate
 
 

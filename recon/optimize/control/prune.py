@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
-from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
+from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
+from splatnode.recon.optimize.regularizers import sample_pseudo_views
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.initialization import REFERENCE_PX, visibility

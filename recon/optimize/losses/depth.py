@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
+from splatnode.recon.optimize.losses import Evaluate, Loss, Schedule
 from splatnode.recon.optimize.regularizers import Supervision, SurfaceTarget, resample_target
 from splatnode.recon.rasterize.reference import Render
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from splatnode.recon.optimize.losses.loss import Evaluate, Loss, Schedule
+from splatnode.recon.optimize.losses import Evaluate, Loss, Schedule
 from splatnode.recon.optimize.regularizers import Supervision, SurfaceTarget, resample_target
 from splatnode.recon.rasterize.reference import Render
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon.optimize.losses.loss import Loss, Schedule
-from splatnode.recon.optimize.losses.perceptual import load_perceptual
+from splatnode.recon.optimize.losses import Loss, Schedule
+from splatnode.recon.optimize.photometric_losses import load_perceptual
 from splatnode.recon.optimize.regularizers import Supervision
 from splatnode.recon.rasterize.reference import Render
 

@@ -18,9 +18,16 @@ from splatnode.capture.process.config import record_in
 from splatnode.capture.process.text import LONGEST_NAME, LONGEST_TEXT, guard_untrusted, is_printable, sanitize_text
 from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES, SceneFileError
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame, encode_matrix, find_frame_problem
 from splatnode.recon.result.snapshot import MAX_COORDINATE, CameraEstimate, GivenCameraPose, find_camera_problem
-from splatnode.recon.result.verdict import RELATIVE, Bounds, Scale
+from splatnode.recon.result.verdict import (
+    RELATIVE,
+    Bounds,
+    FrameName,
+    ReferenceFrame,
+    Scale,
+    encode_matrix,
+    find_frame_problem,
+)
 
 Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Row3: TypeAlias = tuple[Number, Number, Number]

@@ -19,8 +19,7 @@ from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.formats.tum import encode_tum
-from splatnode.recon.result.export.limits import SceneFileError, read_json_file
-from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.limits import SceneFileError, read_json_file, sanitize_gaussians
 from splatnode.recon.result.export.staged import ResultWriteError, explain_error, json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -24,7 +24,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.config import record_in
-from splatnode.capture.process.files import make_folder, sync_folder
+from splatnode.capture.process.files import LockHeld, claim_folder, make_folder, shortage, sync_folder
 from splatnode.capture.process.system import raise_shortage
 
 _MARK = "[0-9a-f]{12}"
@@ -293,3 +293,35 @@ def _list_entries(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
     except OSError as error:
         raise_shortage(error)
         return []
+
+
+# The folder that results are written into: one process at a time, checked before the work, not left behind empty.
+
+
+class FolderInUse(LockHeld):
+    """Another process writes results into this folder."""
+
+    def __init__(self, folder: Path, pid: int | None) -> None:
+        who = f"process {pid}" if pid else "another process"
+        super().__init__(f"{who} writes its results into {folder} already; stop it, or give another --out", pid)
+
+
+@contextlib.contextmanager
+def hold_result_folder(out: Path, needed_bytes: int = 0) -> Iterator[None]:
+    """Holds the folder `out` for this process. Folders that it made and that are empty are removed at the end.
+
+    Raises ResultWriteError where nothing can be written into it or fewer than `needed_bytes` are free, and FolderInUse
+    where another process holds it: all before the work and not after it. What a killed process had begun is finished.
+    """
+    with contextlib.ExitStack() as resources:
+        try:
+            resources.enter_context(claim_folder(out))
+            finish_interrupted_write(out, (path for path in out.iterdir() if path.is_dir() and not path.is_symlink()))
+            why = shortage(out, needed_bytes, "the result")
+        except LockHeld as error:
+            raise FolderInUse(out, error.pid) from error
+        except OSError as error:
+            raise ResultWriteError(error.errno, explain_error(error, out)) from error
+        if why:
+            raise ResultWriteError(errno.ENOSPC, f"{why}. Free some space or choose another folder")
+        yield

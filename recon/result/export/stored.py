@@ -15,8 +15,14 @@ from splatnode.capture.process import plugins
 from splatnode.capture.process.text import guard_untrusted
 from splatnode.recon.result.export import formats
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
-from splatnode.recon.result.export.limits import SceneFileError, read_json_file, read_scene_file
-from splatnode.recon.result.export.prepare import EVERYTHING, Selection, sanitize_gaussians
+from splatnode.recon.result.export.limits import (
+    EVERYTHING,
+    SceneFileError,
+    Selection,
+    read_json_file,
+    read_scene_file,
+    sanitize_gaussians,
+)
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale
 

@@ -11,8 +11,8 @@ import time
 from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.network import RECON_SCENE
 from splatnode.capture.messaging.pubsub import StateClient
-from splatnode.recon.daemon.checkpoint.records import MADE_ANEW
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.trial import (
     VIEWS,

@@ -7,8 +7,8 @@ import subprocess
 import time
 from pathlib import Path
 
-from splatnode.recon.daemon.checkpoint.records import StoredFrame
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import StoredFrame
 from tests.bench.node.shortages import problem_of
 from tests.bench.node.trial import NotTried, Trial, expect, expect_scene, expect_whole, wait_for
 from tests.support.disk_faults import SOURCE, compiled

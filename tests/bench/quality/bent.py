@@ -25,9 +25,8 @@ from splatnode.extras.evaluate.methods import Start, extract_start_config, find_
 from splatnode.extras.evaluate.protocol import PerceptualNetworks
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon.config import preset
-from splatnode.recon.estimation import Reconstruction, estimate_depth
+from splatnode.recon.estimation import Reconstruction, estimate_depth, load_prior
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.preparation import load_prior
 from splatnode.recon.registration.undistortion import corner_shift, undistort_keyframes, undistort_pixels
 from tests.bench.quality.real_sets import last, measure, timed
 

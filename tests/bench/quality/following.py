@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
-from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.estimation import estimate_cameras, prepare
 from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.locating.localize import (
     QUICK,
@@ -23,7 +23,6 @@ from splatnode.recon.locating.localize import (
 )
 from splatnode.recon.locating.outcome import LocalizationBounds, Located, NotLocated
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import prepare
 from splatnode.recon.result.snapshot import Landmarks
 
 Array = npt.NDArray[np.float64]

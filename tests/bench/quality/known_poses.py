@@ -25,13 +25,12 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.estimation import estimate_cameras, load_prior
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.preparation import load_prior
 from splatnode.recon.registration.known_poses import axis_depths
+from splatnode.recon.threads import Clock
 
 Array = npt.NDArray[np.float64]
 

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import EvaluationScene
 from splatnode.extras.evaluate.regions import Surface
-from splatnode.recon.frames.keyframe import resize_image
 from splatnode.recon.geometry import Similarity, transform_to_camera
+from splatnode.recon.keyframes import resize_image
 from splatnode.recon.priors import pointmap, stereo
 from splatnode.recon.priors.pointmap import Pointmap
 

@@ -59,11 +59,10 @@ from splatnode.extras.evaluate.stability.windows import (
     select_keys,
 )
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.estimation import estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks
-from splatnode.recon.frames.screening import screen_all
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching.dynamic_objects import mask_moving_objects
-from splatnode.recon.preparation import load_prior, prepare
 from splatnode.recon.verification.error_model import VerdictModel
 
 STEP_DEG = 12.0

@@ -38,14 +38,13 @@ import numpy.typing as npt
 from splatnode.extras.evaluate.dataset import EvaluationScene, TrueCamera, load_scene, load_split
 from splatnode.recon.config import ReconstructionConfig, preset
 from splatnode.recon.core import set_threads
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks
-from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.keyframes import screen_all
 from splatnode.recon.locating.localize import QUICK, follow, localize_image, localize_query, prepare_query_image
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import load_prior, prepare
 from splatnode.recon.result.npz_files import decode_landmarks, encode_landmarks
 from splatnode.recon.result.snapshot import Landmarks
 from tests.bench.quality.following import SIDE, FollowingFrame, errors_of, nearby, of_frames, placed_near, video

@@ -3,7 +3,7 @@
     python -m tests.bench movers --scenes shared/scenes --out movers.json
 
 The thing is an ellipse of the built-in capture, of one look and another place in each photograph. Held-out photographs
-have none. They are scored whole, and by how many photographs show a pixel beside the thing (`shown.py`): what the thing
+have none. They are scored whole, and by how many photographs show a pixel beside the thing (`regions.py`): what the thing
 hides in all of them can only be guessed. The scene of the photographs as they are is scored on the same pixels.
 """
 
@@ -21,7 +21,7 @@ from splatnode.capture.masks import apply_mask
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.extras.evaluate.regions import Counts, compute_surfaces, count_visibility_by_name
 from splatnode.recon.config import preset
-from splatnode.recon.frames.keyframe import resize_mask
+from splatnode.recon.keyframes import resize_mask
 from splatnode.recon.pipeline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case

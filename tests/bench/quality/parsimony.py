@@ -22,10 +22,9 @@ from msgspec.structs import replace
 from splatnode.extras.evaluate.methods import Start, continue_reconstruction
 from splatnode.extras.evaluate.protocol import Settings
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.optimize.control import prune, relocate
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, prune, relocate
 from splatnode.recon.result.export.formats.spz import encode_spz
-from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.limits import sanitize_gaussians
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.scene import initialization

@@ -22,7 +22,7 @@ from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras, measure_camera_errors
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.frames.keyframe import Keyframe, resize_image
+from splatnode.recon.keyframes import Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import match
 from splatnode.recon.registration import registration as registration_registration

@@ -31,9 +31,9 @@ from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_be
 from splatnode.extras.jobs.calls import Engine, engine
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.rasterize.dispatch import Device, DeviceUnavailable, choose_device, make_rasterizer
-from splatnode.recon.replay_verb import add_device
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.verbs import add_device
 from tests.bench.quality import race_chart
 from tests.bench.quality.parsimony import configurations
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL

@@ -40,10 +40,10 @@ from splatnode.extras.evaluate.stability.windows import (
     select_keys,
     select_moving_scenes,
 )
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import load_prior
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.preparation import load_prior
+from splatnode.recon.threads import Clock
 
 SEEDS = 4
 LENS_ROWS = 31  # of the matrix from this number on: `degradations` has them on more scenes

@@ -20,13 +20,12 @@ import numpy as np
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.terminal import say
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import Reconstruction
-from splatnode.recon.metric.depth_fill import make_depth_view
-from splatnode.recon.metric.depth_fit import DepthFit, fit_depth_images
+from splatnode.recon.metric.depth_fit import DepthFit, fit_depth_images, make_depth_view
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.result.depth_check import DepthCode
+from splatnode.recon.result.snapshot import DepthCode
+from splatnode.recon.threads import Clock
 from tests.support.depth_camera import DepthCamera, add_depths, measure, whitewash
 
 VIEWS, SIZE = 6, (320, 240)

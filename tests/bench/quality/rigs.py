@@ -25,13 +25,12 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.terminal import say
 from splatnode.capture.rig import Rig, RigCamera
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.preparation import load_prior
-from splatnode.recon.rig_choice import DRAWN_SIGMA_DEG, DRAWN_SIGMA_M, hold_rig
+from splatnode.recon.replay_source import DRAWN_SIGMA_DEG, DRAWN_SIGMA_M, hold_rig
+from splatnode.recon.threads import Clock
 from tests.support.rig_walk import RigWalk, make_rig_walk, true_mounts
 
 Array = npt.NDArray[np.float64]

@@ -26,10 +26,10 @@ from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import TrueCamera, load_scene
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, TrialScene
 from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError, list_registered_cameras, score_cameras
-from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import load_prior
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.preparation import load_prior
+from splatnode.recon.threads import Clock
 from tests.bench.quality.lens_assumptions import find_answered, format_answers, window
 
 COUNTS = (6, 9)  # images of a trial

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.geometry import transform_to_camera
-from splatnode.recon.result.export.prepare import select_gaussians
-from splatnode.recon.result.export.quaternions import matrices_from_quats
+from splatnode.recon.result.export.limits import select_gaussians
+from splatnode.recon.result.placement import matrices_from_quats
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.bench.quality.known_surfaces import KnownSurfaces, lines_of_sight

@@ -28,10 +28,9 @@ from splatnode.capture.lenses import unproject
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig, preset
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, prepare
 from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import prepare
 from tests.bench.quality.fisheyes import equidistant
 
 Array = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.geometry import compute_rms_radius
-from splatnode.recon.optimize.pseudo_views import interpolate, order_cameras
+from splatnode.recon.optimize.regularizers import interpolate, order_cameras
 from tests.bench.quality.known_surfaces import KnownView
 
 Array = npt.NDArray[np.float64]

@@ -16,9 +16,8 @@ from pathlib import Path
 import msgspec
 
 from splatnode.extras.cameras import building
-from splatnode.recon.merging.command import write_maps
-from splatnode.recon.merging.merge import Submap
-from splatnode.recon.occupancy.command import read_to_map
+from splatnode.recon.merging import Submap, write_maps
+from splatnode.recon.occupancy.files import read_to_map
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.threads import apply_thread_limit
 from tests.bench.quality.occupancy import room, row

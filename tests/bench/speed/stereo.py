@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.extras.priors.patchmatchnet import WEIGHTS, NetworkStereo, load_network
-from splatnode.recon.frames.keyframe import resize_image
+from splatnode.recon.keyframes import resize_image
 from splatnode.recon.networks.weights import find
 from splatnode.recon.priors.classical import DepthEstimator
 from splatnode.recon.priors.stereo import (

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
-from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.viewer.sources import load_result
 from tests.bench.speed.rasterize import processor_name
 from tests.support.node import processor_s

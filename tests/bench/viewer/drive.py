@@ -22,7 +22,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_SCENE, RECON_STATUS, Network
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
-from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.sources import load_result

@@ -14,7 +14,7 @@ import numpy as np
 from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.recon.result.export.prepare import SH_C0, select_gaussians
+from splatnode.recon.result.export.limits import SH_C0, select_gaussians
 from splatnode.recon.result.message import encode_snapshot
 from splatnode.viewer.sources import load_result
 from splatnode.viewer.state import Moment, scene_pivot

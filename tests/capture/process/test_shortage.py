@@ -26,8 +26,8 @@ from splatnode.capture.process import apart, system
 from splatnode.capture.process.system import is_shortage, may_be_shortage, outlast
 from splatnode.capture.process.terminal import Unfailing
 from splatnode.capture.reader import ReaderState
-from splatnode.recon.daemon.checkpoint.records import read_ledger
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.ledger import read_ledger
 from tests.capture.messaging.test_sockets import wait_for
 from tests.support.starved import no_file, starved
 

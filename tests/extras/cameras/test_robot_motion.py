@@ -13,11 +13,9 @@ from splatnode.capture.frame import Frame
 from splatnode.extras.cameras.mcap import Config, stream
 from splatnode.extras.logged.messages import UnusableMessage
 from splatnode.extras.logged.transforms import parse_imu, parse_odometry, read_robot_motion
-from splatnode.recon.metric.evidence import gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.result.reference_frame import FrameName
-from splatnode.recon.result.verdict import Code
+from splatnode.recon.metric.metres import apply_metric_scale, gather_evidence
+from splatnode.recon.result.verdict import Code, FrameName
 from tests.recon.metric.test_poses import NAMES, TRUE, scene
 from tests.support import mcap_files, ros2
 from tests.support.mcap_files import START_NS

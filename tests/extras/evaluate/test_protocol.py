@@ -29,7 +29,7 @@ from splatnode.extras.evaluate.protocol import (
 )
 from splatnode.extras.evaluate.regions import UNKNOWN
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
-from splatnode.recon.frames import screening
+from splatnode.recon import keyframes
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import encode_cameras
@@ -230,7 +230,7 @@ def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monk
     def below(images):
         return [np.arange(len(image))[:, None] >= np.array([3] * image.shape[1]) for image in images]
 
-    monkeypatch.setattr(screening, "valid_masks", below)
+    monkeypatch.setattr(keyframes, "valid_masks", below)
     row = score(perfect_snapshot(), spoilt / scene_folder.name)
     assert row.psnr is not None and row.psnr > 50
     assert row.psnr_with_rim is not None and row.psnr_with_rim < 20

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 
 from splatnode.capture.process.system import remedy
-from splatnode.recon.result.export.format import export_scene
+from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
 from tests.support.exported import make_gaussians, make_landmarks, make_snapshot, stamped, write
 

@@ -68,7 +68,7 @@ def test_each_call_has_its_answer_or_its_reason(tmp_path):
         )
     assert list(found) == ["good", "raises", "dies", "silent", "greedy", "last"]
     assert found["good"].value() == (3, 1) and found["last"].value() == {usable_cores()[0]}
-    assert "ZeroDivisionError" in found["raises"].reason and "called.py" in found["raises"].reason
+    assert "ZeroDivisionError" in found["raises"].reason and "template.py" in found["raises"].reason
     assert found["dies"].reason == "ended with exit code 9 and said nothing"
     assert found["silent"].reason == "ended with exit code 0 and said nothing"
     assert "MB of memory; --max-memory allows 200" in found["greedy"].reason

@@ -23,7 +23,7 @@ from splatnode.extras.priors.aliked import (
     match_mutual,
     sample_maps,
 )
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from tests.support.generated import generated, generated_images, shapes_of
 
 

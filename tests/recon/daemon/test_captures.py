@@ -24,8 +24,7 @@ from splatnode.capture.process.terminal import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import ingest
-from splatnode.recon.daemon.checkpoint.records import read_frame
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import (
     ArrivedKeyframe,
@@ -35,6 +34,7 @@ from splatnode.recon.daemon.ingest import (
     RemovedFrame,
     WaitingFrame,
 )
+from splatnode.recon.daemon.ledger import read_frame
 from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
 from splatnode.recon.daemon.worker import number_frame_sets
 from tests.capture.messaging.test_sockets import wait_for

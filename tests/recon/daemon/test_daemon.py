@@ -31,7 +31,7 @@ from splatnode.recon.locating.localize import localize_image
 from splatnode.recon.locating.outcome import Located
 from splatnode.recon.optimize import training
 from splatnode.recon.result.export import read_cameras
-from splatnode.recon.result.folder import FolderInUse
+from splatnode.recon.result.export.staged import FolderInUse
 from splatnode.recon.result.message import LiveScene, SceneHeader, decode_snapshot
 from splatnode.recon.result.npz_files import read_depths, read_landmarks
 from splatnode.recon.result.snapshot import format_widest_bounds

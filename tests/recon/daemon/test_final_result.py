@@ -9,7 +9,7 @@ import pytest
 
 from splatnode.capture.messaging.pubsub import Answer
 from splatnode.recon.daemon import submap, worker
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import CAPACITY, Inbox, RemovedFrame
 from splatnode.recon.daemon.node import Daemon, RemoveKeyframe

@@ -20,7 +20,7 @@ from splatnode.capture.messaging.pubsub import Want
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.recon.daemon import node
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.message import MapHeader
+from splatnode.recon.occupancy.grid import MapHeader
 from splatnode.recon.result.message import DepthHeader, SceneHeader
 
 SCHEMAS = [

@@ -11,7 +11,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.daemon import heartbeats
 from splatnode.capture.odometry import make_given_pose
 from splatnode.recon.daemon.output import MetricScaler
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.metric.measurement import MetricConfig as Metric
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.cameras import decode_scale
@@ -91,7 +91,7 @@ def test_poses_against_a_distance_leave_the_scene_relative_with_the_reason(confi
 def test_a_marker_is_looked_for_once_in_a_keyframe(monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "splatnode.recon.metric.evidence.detect_markers",
+        "splatnode.recon.metric.metres.detect_markers",
         lambda frames, _: asked.extend(each.name for each in frames) or [],
     )
     frames = photographs()[:2]

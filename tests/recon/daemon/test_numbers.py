@@ -17,7 +17,7 @@ from splatnode.recon.daemon.node import Daemon
 from splatnode.recon.daemon.output import PublishedSnapshot
 from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.message import MapHeader
+from splatnode.recon.occupancy.grid import MapHeader
 from splatnode.recon.result.message import SceneHeader
 from tests.recon.daemon.test_daemon import config  # noqa: F401
 from tests.support.exported import make_snapshot

@@ -17,16 +17,15 @@ from splatnode.capture.frame import DroppedFrame, Frame, rename_frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, ask
-from splatnode.recon.daemon import finalizer
-from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
-from splatnode.recon.daemon.checkpoint import checkpoint, records
-from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.finalizer import InactiveSubmaps
+from splatnode.recon.daemon import checkpoint, ledger, worker
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Inbox
+from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.node import RemoveKeyframe
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.submap import ActiveSubmap
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
+from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.result.export import read_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import (
@@ -108,7 +107,7 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
     told |= {dropped["name"] for place in (first, second) for dropped in place["frames_dropped"]}
     assert told == {frame.name for frame in frames}
     assert not report(config.out / "scene-0001")["verdict"]["provisional"]
-    assert not (config.out / "scene-0001-provisional").exists() and records.list_left_folders(config.checkpoint) == []
+    assert not (config.out / "scene-0001-provisional").exists() and ledger.list_left_folders(config.checkpoint) == []
 
 
 def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
@@ -121,7 +120,7 @@ def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
         for frame in mirrored:
             peer.server.offer(frame)
         peer.wait(lambda scene: scene.scene_id == "scene-0002" and finished(3)(scene), "another place, finished")
-        wait_for(lambda: records.list_finished_folders(config.checkpoint), PATIENCE_S)
+        wait_for(lambda: ledger.list_finished_folders(config.checkpoint), PATIENCE_S)
         name = here[3].name
         answer = ask(RECON_CONTROL, config.network, RemoveKeyframe(name), Answer)
         assert answer.done and "scene-0001, which the camera has left" in answer.message
@@ -134,8 +133,7 @@ def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
     kept = [camera.name for camera in read_cameras(config.out / "scene-0001" / "cameras.json")]
     assert kept == [frame.name for frame in here[:3]]
     assert (
-        records.list_left_folders(config.checkpoint) == []
-        and len(records.list_finished_folders(config.checkpoint)) == 1
+        ledger.list_left_folders(config.checkpoint) == [] and len(ledger.list_finished_folders(config.checkpoint)) == 1
     )
 
 
@@ -154,11 +152,11 @@ def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, mon
         peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
         peer.wait_for_acknowledgements()
     assert report(moving.out / "scene-0001-provisional")["verdict"]["provisional"]
-    assert index(moving)[0]["state"] == "left" and len(records.list_left_folders(moving.checkpoint)) == 1
+    assert index(moving)[0]["state"] == "left" and len(ledger.list_left_folders(moving.checkpoint)) == 1
 
     with running(replace(moving, idle_finalize_s=0.2, new_submap_after=3)):
         wait_for((moving.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
-        wait_for(lambda: not records.list_left_folders(moving.checkpoint), PATIENCE_S)
+        wait_for(lambda: not ledger.list_left_folders(moving.checkpoint), PATIENCE_S)
     kept = read_cameras(moving.out / "scene-0001" / "cameras.json")
     assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
     assert report(moving.out / "scene-0001")["iterations"] == moving.reconstruction.optimize.iterations
@@ -174,13 +172,13 @@ def test_a_place_whose_finishing_was_killed_is_finished_by_the_next_process(conf
         pytest.raises(AssertionError, match="SystemExit"),
         running(replace(config, new_submap_after=3)),
     ):
-        patch.setattr(finalizer, "_refine_to_end", die)
+        patch.setattr(worker, "_refine_to_end", die)
         offer_when_three_are_shown(peer, frames)
         wait_for(lambda: peer.server.serve(0.02) or heartbeats(config.network, 0.5)["recon"] is None, PATIENCE_S)
     assert (config.out / "scene-0001-provisional").exists() and not (config.out / "scene-0001").exists()
 
     with running(replace(config, new_submap_after=3)):
-        wait_for(lambda: not records.list_left_folders(config.checkpoint), PATIENCE_S)
+        wait_for(lambda: not ledger.list_left_folders(config.checkpoint), PATIENCE_S)
     assert [(place["state"], place["provisional"]) for place in index(config)] == [("finished", False), ("here", False)]
 
 
@@ -189,7 +187,7 @@ def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, mo
         raise ArithmeticError("for the test")
 
     frames = places(seeds=(0, 1))
-    monkeypatch.setattr(finalizer, "_refine_to_end", fail)
+    monkeypatch.setattr(worker, "_refine_to_end", fail)
     with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, frames)
         wait_for(
@@ -203,7 +201,7 @@ def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, mo
 
 def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer, monkeypatch):
     begun, shown = threading.Event(), threading.Event()
-    last = finalizer._refine_to_end
+    last = worker._refine_to_end
 
     def slow(work, recipe, pause):
         begun.set()
@@ -212,7 +210,7 @@ def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer
             time.sleep(0.01)
         return last(work, recipe, pause)
 
-    monkeypatch.setattr(finalizer, "_refine_to_end", slow)
+    monkeypatch.setattr(worker, "_refine_to_end", slow)
     frames = places(msgspec.structs.replace(SMALL, views=8))
     with running(replace(config, new_submap_after=3)):
         offer_when_three_are_shown(peer, [*frames[:3], *frames[4:7]])
@@ -257,7 +255,7 @@ def test_a_scene_that_is_full_goes_on_as_the_next_one_and_both_are_linked(config
                     lambda scene, frame=frame: frame.name in {each.name for each in scene.snapshot.cameras}, frame.name
                 )
         peer.wait_for_acknowledgements()
-        wait_for(lambda: not records.list_left_folders(config.checkpoint) and final(config) == 2, PATIENCE_S)
+        wait_for(lambda: not ledger.list_left_folders(config.checkpoint) and final(config) == 2, PATIENCE_S)
     first, second = index(config)
     names = [frame.name for frame in frames]
     assert set(first["frames_used"]) | set(second["frames_used"]) == set(names)
@@ -302,7 +300,7 @@ def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, pee
     with closing(Store(moving.checkpoint)) as store:
         assert store.scene_id == "scene-0002" and store.names == {frame.name for frame in ours[3:]}
         assert checkpoint.restore(store, moving.reconstruction).work.find_reconstruction() is not None
-    with closing(Store(records.find_folder(moving.checkpoint, "scene-0001"))) as store:
+    with closing(Store(ledger.find_folder(moving.checkpoint, "scene-0001"))) as store:
         assert "stranger.png" in store.names
 
 
@@ -317,7 +315,7 @@ def test_a_place_that_turns_out_to_be_two_becomes_two(config):
         atlas = LoopDetector(store.directory, config.reconstruction, output.places)
         waiting = InactiveSubmaps(store, config.reconstruction, output, atlas)
         assert waiting.verify_next(lambda: None)
-        first, part = [folder.name for folder in records.list_left_folders(config.checkpoint)]
+        first, part = [folder.name for folder in ledger.list_left_folders(config.checkpoint)]
         ours, other = by_id(config)
         assert first == ours["scene_id"] == "scene-0001" and part == other["scene_id"] and ours["judged"]
         assert {each["reason"] for each in ours["frames_dropped"]} == {f"it shows another place: {part}"}

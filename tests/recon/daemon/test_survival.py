@@ -21,9 +21,8 @@ from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, Publisher, ask
 from splatnode.capture.process.terminal import Problems
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
-from splatnode.recon.daemon import ingest, relocalization
-from splatnode.recon.daemon.checkpoint import checkpoint
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon import checkpoint, ingest, relocalization
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, Intake, RemovedFrame
 from splatnode.recon.daemon.node import RemoveKeyframe
 from splatnode.recon.daemon.relocalization import FinalScene, Watcher

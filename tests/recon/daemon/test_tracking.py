@@ -19,7 +19,7 @@ from splatnode.recon.daemon.relocalization import (
     localize,
     measure_motion,
 )
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

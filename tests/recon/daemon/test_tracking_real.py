@@ -13,9 +13,9 @@ from splatnode.extras.evaluate.dataset import load_scene, load_split
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.relocalization import Tracker, compute_landmarks, scale_intrinsics
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
+from splatnode.recon.estimation import prepare
 from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.preparation import prepare
 
 QUICK = replace(ReconstructionConfig(), size=256, optimize=training.RefinementConfig(iterations=10))
 

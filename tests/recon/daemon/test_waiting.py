@@ -17,18 +17,17 @@ from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.recon import incremental
 from splatnode.recon.config import ReconstructionConfig as Recipe
-from splatnode.recon.daemon.atlas.loop_closure import LoopDetector
-from splatnode.recon.daemon.checkpoint import checkpoint, records
-from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.finalizer import InactiveSubmaps
+from splatnode.recon.daemon import checkpoint, ledger
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Inbox
+from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap import ActiveSubmap
-from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.daemon.worker import InactiveSubmaps, Worker
+from splatnode.recon.estimation import prepare
 from splatnode.recon.fallbacks import make_fallback_key
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.preparation import prepare
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, index, running
 from tests.support.synthetic import SMALL, photographs, places
@@ -90,7 +89,7 @@ def test_keyframes_of_several_places_that_come_together_after_a_scene_begin_one_
         assert node.place.owed == node.place.under_way == []
         assert (store.scene_id, store.names) == ("scene-0003", {frame.name for frame in frames[6:]})
     for at, scene in enumerate(("scene-0001", "scene-0002")):
-        with closing(Store(records.find_folder(config.checkpoint, scene))) as store:
+        with closing(Store(ledger.find_folder(config.checkpoint, scene))) as store:
             assert store.names == {frame.name for frame in frames[3 * at : 3 * at + 3]}
 
 
@@ -108,7 +107,7 @@ def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(
         here = store.names
         assert sorted(here) in (names[:4], names[4:])
     with closing(Store(config.checkpoint)) as store:  # the next process
-        (part,) = records.list_left_folders(config.checkpoint)
+        (part,) = ledger.list_left_folders(config.checkpoint)
         assert store.names == here and part.name.startswith("scene-0001-")
         output = Output(config, store, lambda _: None, pytest.fail)
         waiting = InactiveSubmaps(

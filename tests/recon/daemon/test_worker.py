@@ -13,10 +13,10 @@ from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.recon.config import FallbackConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.daemon import worker
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
-from splatnode.recon.preparation import prepare
+from splatnode.recon.estimation import prepare
 
 
 @pytest.mark.parametrize(("asked", "seconds"), [(None, worker.LADDER_S), (20.0, 20.0)])

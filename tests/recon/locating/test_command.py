@@ -15,8 +15,7 @@ from splatnode.command_line import main
 from splatnode.recon.locating.localize import stream_query_frames as named
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
-from splatnode.recon.result.verdict import Scale
+from splatnode.recon.result.verdict import FrameName, ReferenceFrame, Scale
 from tests.support.located import PLACE, known_place, photograph
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.geometry import project
-from splatnode.recon.locating import landmarks as locating_landmarks
+from splatnode.recon.locating import localize as locating_landmarks
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.keyframes import Features
 from splatnode.recon.locating import pose_refinement
 from splatnode.recon.locating.localize import follow, localize_image, prepare_query_image
 from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason
@@ -24,7 +24,7 @@ from splatnode.recon.locating.pose_refinement import (
 )
 from splatnode.recon.locating.verification import LensChoice, QueryContext, choose_lens, search_cameras
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
-from splatnode.recon.verification import consistency
+from splatnode.recon.verification import evidence
 from tests.bench.quality.query_warps import WARPS, Query
 from tests.support.located import PLACE, errors, known_place, photograph
 
@@ -131,9 +131,7 @@ def symmetric(landmarks: Landmarks, share: float) -> Landmarks:
         landmarks,
         points=np.concatenate([landmarks.points, landmarks.points[twice] @ MIRROR]),
         covariances=np.concatenate([landmarks.covariances, MIRROR @ landmarks.covariances[twice] @ MIRROR]),
-        descriptors=np.concatenate(
-            [landmarks.descriptors, consistency.mirror_descriptors(landmarks.descriptors[kept])]
-        ),
+        descriptors=np.concatenate([landmarks.descriptors, evidence.mirror_descriptors(landmarks.descriptors[kept])]),
         point_of=np.concatenate([landmarks.point_of, number[landmarks.point_of[kept]]]),
         photograph_of=np.concatenate([landmarks.photograph_of, len(landmarks.names) + landmarks.photograph_of[kept]]),
         names=landmarks.names + tuple(f"mirrored {name}" for name in landmarks.names),
@@ -158,11 +156,10 @@ def test_the_gain_of_mirroring_is_above_0_for_mirrored_images_alone():
     image, _ = photograph(2)
     features = prepare_query_image(image).features
     turned = Features(
-        features.points, consistency.mirror_descriptors(features.descriptors), features.point_of, features.tilt
+        features.points, evidence.mirror_descriptors(features.descriptors), features.point_of, features.tilt
     )
     gains = [
-        measure_mirror_gain(each, known_place().landmarks, consistency.ReflectionConfig())
-        for each in (features, turned)
+        measure_mirror_gain(each, known_place().landmarks, evidence.ReflectionConfig()) for each in (features, turned)
     ]
     assert gains[0] < -0.3 and gains[1] == pytest.approx(-gains[0])
 

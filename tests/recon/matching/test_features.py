@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import TwoView

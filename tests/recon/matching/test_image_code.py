@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.keyframes import Features
 from splatnode.recon.matching.features import (
     FeatureConfig,
     add_affine_features,

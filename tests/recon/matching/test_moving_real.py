@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from splatnode.extras.evaluate.dataset import load_scene
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import prepare
 from splatnode.recon.matching import dynamic_objects
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import prepare
 
 NAMES = ("0007.jpg", "0009.jpg", "0012.jpg", "0029.jpg", "0031.jpg", "0033.jpg", "0035.jpg")
 

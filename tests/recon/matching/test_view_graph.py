@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import MatchedPair

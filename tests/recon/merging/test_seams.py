@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.merging.merge import (
+from splatnode.recon.merging import (
     NOBODY,
     REGION_PX,
     Submap,
@@ -19,7 +19,7 @@ from splatnode.recon.merging.merge import (
     resolve_seams,
     surface_views,
 )
-from splatnode.recon.result.export.prepare import select_gaussians
+from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.recon.result.levels_of_detail import concatenate_gaussians
 from splatnode.recon.result.rendering import render_arrays
 from tests.support.walk import WalkScene, walk, without

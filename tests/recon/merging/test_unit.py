@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.command_line import main
-from splatnode.recon.merging.merge import scale_and_up
+from splatnode.recon.merging import scale_and_up
 from splatnode.recon.result.placement import IDENTITY, Placement
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEdge, SubmapEntry, read_map_set
 from splatnode.recon.result.verdict import Scale, Up

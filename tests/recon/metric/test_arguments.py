@@ -17,7 +17,7 @@ from splatnode.recon.metric.arguments import (
     collect_metric_changes,
     trusts_poses,
 )
-from splatnode.recon.result.reference_frame import FrameChoice, parse_frame_name
+from splatnode.recon.result.verdict import FrameChoice, parse_frame_name
 
 
 def configured(*options: str):

@@ -11,16 +11,27 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.depth_image import DepthImage, make_depth_image
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.metric.depth_fill import MeasuredDepth, fuse_depth, warp_depth
-from splatnode.recon.metric.depth_fit import DepthFit, DepthView, describe_doubtful_units, fit_depth_images
-from splatnode.recon.metric.depth_scale import estimate_scale_from_depth
-from splatnode.recon.metric.depth_smoothing import smooth_depth
-from splatnode.recon.metric.evidence import CameraDepth, Evidence, gather_evidence
+from splatnode.recon.metric.depth_fit import (
+    DepthFit,
+    DepthView,
+    MeasuredDepth,
+    describe_doubtful_units,
+    fit_depth_images,
+    fuse_depth,
+    smooth_depth,
+    warp_depth,
+)
 from splatnode.recon.metric.measurement import Measurement, MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import (
+    CameraDepth,
+    Evidence,
+    apply_metric_scale,
+    estimate_scale_from_depth,
+    gather_evidence,
+)
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.result.depth_check import DepthCode
 from splatnode.recon.result.report import build_report
+from splatnode.recon.result.snapshot import DepthCode
 from tests.recon.metric import test_stereo
 from tests.support import synthetic as support
 from tests.support.depth_camera import DepthCamera, add_depths, measure

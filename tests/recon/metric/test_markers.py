@@ -12,10 +12,9 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lenses import project, undistort_frame
-from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.markers import MarkerDetection, detect_markers, estimate_scale_from_markers
 from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig, MetricView
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.recon.result.test_preview import snapshot as ball_snapshot
 from tests.support import marked

@@ -13,9 +13,8 @@ import pytest
 from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import ReconstructionConfig as ReconConfig
 from splatnode.recon.config import apply_changes
-from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import Evidence, apply_metric_scale
 from splatnode.recon.metric.stereo import MetricDepth, estimate_scale_from_network
 from splatnode.recon.networks.vit import crop
 from splatnode.recon.result.export import export_scene

@@ -11,9 +11,8 @@ import pytest
 from splatnode.capture.diorama import Config as Odometry
 from splatnode.capture.diorama import odometry
 from splatnode.capture.odometry import Gravity, Motion
-from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView, make_metric_views
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import Evidence, apply_metric_scale
 from splatnode.recon.metric.odometry import estimate_scale_from_motions, estimate_up
 from tests.recon.metric.test_poses import NAMES, TRUE, UNIT, scene
 

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.odometry import make_given_pose
-from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.measurement import Baseline, MetricConfig, MetricView, make_metric_views
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.metric.odometry import PoseAlignment, PoseSigmas, align_to_poses
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from tests.recon.result.test_preview import snapshot as ball_snapshot

@@ -13,19 +13,24 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.diorama import look_at
 from splatnode.capture.odometry import Gravity, Motion, make_given_pose
-from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.measurement import Baseline, MetricConfig
-from splatnode.recon.metric.metres import apply_metric_scale
-from splatnode.recon.metric.reference_frame import UnknownFrame, check_frame, make_upright_frame, transform_rigidly
+from splatnode.recon.metric.metres import (
+    NOTHING,
+    Evidence,
+    UnknownFrame,
+    apply_metric_scale,
+    check_frame,
+    make_upright_frame,
+    transform_rigidly,
+)
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import make_scale_record, parse_scale
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame, encode_matrix, parse_frame_name
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
-from splatnode.recon.result.verdict import Code, Scale
+from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale, encode_matrix, parse_frame_name
 from tests.recon.metric.test_poses import NAMES, TRUE, UNIT, scene
 from tests.recon.occupancy.test_floor import room
 

@@ -14,9 +14,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lenses import undistort_frame
-from splatnode.recon.metric.evidence import Evidence, gather_evidence
 from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView
-from splatnode.recon.metric.metres import apply_metric_scale
+from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.metric.stereo import StereoPair, estimate_scale_from_stereo, make_pairs, stream_right_images
 from splatnode.recon.result.snapshot import CameraEstimate, KnownLenses, Landmarks, Snapshot
 from tests.recon.result.test_preview import snapshot as ball_snapshot

@@ -22,8 +22,8 @@ from splatnode.recon.networks.depth_anything import (
 )
 from splatnode.recon.networks.vit import Dinov2, crop
 from splatnode.recon.networks.vit import Size as VitSize
-from splatnode.recon.optimize.losses.dino import DinoFeatures, load_dino
-from splatnode.recon.optimize.losses.dino import load_network as load_dinov2
+from splatnode.recon.optimize.losses.semantic import DinoFeatures, load_dino
+from splatnode.recon.optimize.losses.semantic import load_network as load_dinov2
 from splatnode.recon.priors.monocular import fit_monocular_depth
 from splatnode.recon.priors.pointmap import Pointmap
 from tests.support.generated import generated_images, generated_weights, shapes_of

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.metric.reference_frame import transform_rigidly
-from splatnode.recon.occupancy.formats.nav2 import encode_nav2
+from splatnode.recon.metric.metres import transform_rigidly
+from splatnode.recon.occupancy.files import encode_nav2
 from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
-from splatnode.recon.result.reference_frame import FrameName, ReferenceFrame
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.verdict import Code, Scale
+from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale
 from tests.support.exported import make_snapshot
 from tests.support.occupied import WALL, room_snapshot
 

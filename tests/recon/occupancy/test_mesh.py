@@ -9,9 +9,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from splatnode.recon.occupancy.formats.glb import encode_glb
-from splatnode.recon.occupancy.formats.ply import encode_ply_mesh
-from splatnode.recon.occupancy.mesh import Mesh, surface_mesh
+from splatnode.recon.occupancy.files import Mesh, encode_glb, encode_ply_mesh, surface_mesh
 from splatnode.recon.result.verdict import RELATIVE
 from tests.support.occupied import small_map
 

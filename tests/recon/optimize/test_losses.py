@@ -9,10 +9,9 @@ import torch
 
 from splatnode.recon.networks.lpips import load_lpips
 from splatnode.recon.optimize.losses.depth import local_depth_loss, pearson, tiles
-from splatnode.recon.optimize.losses.dino import DinoFeatures
 from splatnode.recon.optimize.losses.normal import normal_loss
-from splatnode.recon.optimize.losses.perceptual import LpipsDistance, MultiScaleGradient, load_perceptual
-from splatnode.recon.optimize.losses.semantic import semantic_loss
+from splatnode.recon.optimize.losses.semantic import DinoFeatures, semantic_loss
+from splatnode.recon.optimize.photometric_losses import LpipsDistance, MultiScaleGradient, load_perceptual
 
 
 def image(seed: int, height: int = 64, width: int = 72) -> torch.Tensor:

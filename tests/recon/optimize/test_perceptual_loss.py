@@ -9,11 +9,9 @@ from msgspec import structs
 
 from splatnode.recon.networks.lpips import Layer, Lpips
 from splatnode.recon.optimize import photometric_losses
-from splatnode.recon.optimize.losses.perceptual import LpipsDistance
-from splatnode.recon.optimize.photometric_losses import PerceptualLossConfig
+from splatnode.recon.optimize.photometric_losses import LpipsDistance, PerceptualLossConfig, make_training_image
 from splatnode.recon.optimize.training import RefinementConfig as Refinement
 from splatnode.recon.optimize.training import refine
-from splatnode.recon.optimize.training_image import make_training_image
 from splatnode.recon.scene.scene import Exposure, TrainingView
 from tests.support.known_scene import disturbed, photographed
 

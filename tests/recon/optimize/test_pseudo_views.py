@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.optimize.pseudo_views import interpolate, order_cameras, pseudo_views
+from splatnode.recon.optimize.regularizers import interpolate, order_cameras, pseudo_views
 
 
 def camera(x: float, yaw_deg: float = 0.0) -> np.ndarray:

@@ -16,9 +16,8 @@ from msgspec import structs
 
 from splatnode.recon.optimize import ensemble, fit, regularizers, training
 from splatnode.recon.optimize.fit import Trainer
-from splatnode.recon.optimize.losses import normal
-from splatnode.recon.optimize.losses.loss import LossChoice
-from splatnode.recon.optimize.pseudo_views import PseudoView
+from splatnode.recon.optimize.losses import LossChoice, normal
+from splatnode.recon.optimize.regularizers import PseudoView
 from splatnode.recon.optimize.training import LearningRates, RefinementConfig, refine
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import SHELL

@@ -13,8 +13,7 @@ from splatnode.extras.evaluate.methods import CONFIGS
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.networks.vit import Crop
 from splatnode.recon.optimize import losses
-from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularizers import Regularizer, RegularizerConfig
+from splatnode.recon.optimize.regularizers import PseudoView, Regularizer, RegularizerConfig
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.reference import Render
 
@@ -228,7 +227,7 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
 
 
 BRIGHTNESS = """
-from splatnode.recon.optimize.losses.loss import Loss, Schedule
+from splatnode.recon.optimize.losses import Loss, Schedule
 
 class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     wanted: float = 1.0

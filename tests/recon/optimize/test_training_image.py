@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.optimize.training_image import make_training_image
+from splatnode.recon.optimize.photometric_losses import make_training_image
 from splatnode.recon.scene.scene import Exposure, TrainingView
 
 HEIGHT, WIDTH = 24, 40

@@ -12,7 +12,7 @@ import torch
 
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.protocol import compare_cameras
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.networks.vit import crop

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.clock import OutOfTime
 from splatnode.recon.core import library, set_threads
 from splatnode.recon.priors import stereo
 from splatnode.recon.priors.stereo import (
@@ -25,6 +24,7 @@ from splatnode.recon.priors.stereo import (
     rank_partners,
     select_sources,
 )
+from splatnode.recon.threads import OutOfTime
 from tests.bench.speed import stereo as bench
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0

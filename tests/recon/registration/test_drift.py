@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.recon.registration import bundle_adjustment
 from splatnode.recon.registration.known_poses import Drift, compute_drift_covariance
-from splatnode.recon.registration.posed import compute_scale_sigma
+from splatnode.recon.registration.posed_mapping import compute_scale_sigma
 
 DRIFT = Drift(0.02, 0.3)
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.odometry import make_given_pose
-from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
-from splatnode.recon.registration import guided
+from splatnode.recon.keyframes import PLAIN, Features, Keyframe
+from splatnode.recon.registration import known_poses
 from splatnode.recon.registration.known_poses import collect_known_poses
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 350.0
@@ -40,7 +40,7 @@ def test_features_along_the_lines_match_and_nothing_beside_them_does() -> None:
     both = keyframes(shared=150)
     given = collect_known_poses(both)
     assert given is not None
-    found = guided.add_guided_matches(both, {}, given)[0, 1]
+    found = known_poses.add_guided_matches(both, {}, given)[0, 1]
     right = found.matches[:, 0] == found.matches[:, 1]
     assert len(found.matches) > 130 and right.mean() > 0.9
 
@@ -49,4 +49,4 @@ def test_images_that_share_nothing_get_no_matches() -> None:
     both = keyframes(shared=0)
     given = collect_known_poses(both)
     assert given is not None
-    assert guided.add_guided_matches(both, {}, given) == {}
+    assert known_poses.add_guided_matches(both, {}, given) == {}

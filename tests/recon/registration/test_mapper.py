@@ -13,11 +13,10 @@ from splatnode.recon.matching import pair_matching
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
     bundle_adjustment,
-    epipolar,
     incremental_mapper,
-    resection,
+    mapping_problem,
+    multiview_geometry,
     self_calibration,
-    triangulation,
 )
 from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
 
@@ -237,7 +236,7 @@ def test_a_view_that_shares_a_handful_of_points_is_placed_by_its_pair():
     taken = photographed(num_views=3, num_points=600)
     point = np.arange(600)
     seen = taken.visible & np.stack([point < 310, point >= 0, point >= 290])
-    assert 5 <= seen.all(0).sum() < resection.ResectionConfig().min_points
+    assert 5 <= seen.all(0).sum() < mapping_problem.ResectionConfig().min_points
     apart = Photographed(taken.rotations, taken.translations, taken.pixels, seen)
     chain = {key: pair for key, pair in compared(apart, share_wrong=0.0).items() if key != (0, 2)}
     found = built(taken, chain, (FOCAL,))
@@ -255,21 +254,21 @@ def test_a_view_is_placed_as_well_through_a_lens_that_is_known_to_bend_lines(rad
     bare = bundle_adjustment.make_empty_problem(np.eye(3)[None], still, np.zeros(1, int), *lens)
     prior = bundle_adjustment.focal_prior(lens[0], np.ones(1))
     partial = PartialMap((), replace(bare, points=points), prior, np.arange(400))
-    observed = triangulation.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
+    observed = multiview_geometry.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
     problem = MapperInput((), (), {}, np.ones(1), observed, observed)
-    found = resection.resect(problem, partial, 0, resection.ResectionConfig())
+    found = mapping_problem.resect(problem, partial, 0, mapping_problem.ResectionConfig())
     assert found is not None and found.inlier_ratio > 0.99
     assert np.linalg.norm(found.rotation.T @ found.translation + taken.Ts_world_camera[0, :3, 3]) < 0.02
 
 
 def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
     found = built(taken, pairs, (FOCAL,))
-    ahead = epipolar.sampson_errors(found.estimate, (0, 3), pairs[0, 3])
+    ahead = multiview_geometry.sampson_errors(found.estimate, (0, 3), pairs[0, 3])
     assert np.median(ahead) == pytest.approx(0.67 * NOISE_PX, rel=0.4)
     rotations, translations = found.estimate.rotations, found.estimate.translations
     towards = rotations[3] @ rotations[0].T @ translations[0]
     flipped = bundle_adjustment.replace_pose(found.estimate, 3, rotations[3], 2 * towards - translations[3])
-    behind = epipolar.sampson_errors(flipped, (0, 3), pairs[0, 3])
+    behind = multiview_geometry.sampson_errors(flipped, (0, 3), pairs[0, 3])
     assert np.isinf(behind).mean() > 0.9
 
 
@@ -286,13 +285,13 @@ def test_tracks_join_matches_and_drop_what_contradicts_itself():
         return TwoView(index, points[0][index[:, 0]], points[0][index[:, 1]], 0, 0.0, 0, 0, 1.0, 1.0)
 
     matched = {(0, 1): pair((0, 0), (1, 1), (2, 2)), (1, 2): pair((0, 0), (1, 3)), (0, 2): pair((1, 1))}
-    joined = triangulation.build(points, matched)
+    joined = multiview_geometry.build(points, matched)
     members = [
         {int(camera) for camera in joined.camera_of[joined.track_of == track]} for track in range(joined.num_tracks)
     ]
     # 0-0-0 is whole; 1-1 reaches two features of view 2, which both go; 2-2 is seen twice.
     assert sorted(map(sorted, members)) == [[0, 1], [0, 1], [0, 1, 2]]
-    thinned = triangulation.thin(joined, per_camera=1)
+    thinned = multiview_geometry.thin(joined, per_camera=1)
     assert thinned.num_tracks == 1
     assert sorted(thinned.camera_of) == [0, 1, 2]
 
@@ -309,9 +308,9 @@ def test_points_that_two_cameras_see_under_less_than_a_degree_are_not_kept():
     )
     depths = np.array([1.0, 1.3])
     pixels = np.array([[500 * (0.01 - x) / depth, 0.0] for depth in depths for x in (0.0, 0.02)])
-    tracks = triangulation.Tracks(np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]), pixels, 2)
-    config = triangulation.TriangulationConfig()
-    found, kept = triangulation.retriangulate(state, tracks, (0, 1), np.ones(2), config, 1.0)
+    tracks = multiview_geometry.Tracks(np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]), pixels, 2)
+    config = multiview_geometry.TriangulationConfig()
+    found, kept = multiview_geometry.retriangulate(state, tracks, (0, 1), np.ones(2), config, 1.0)
     assert kept.tolist() == [0]
     np.testing.assert_allclose(found.points, [[0.01, 0.0, 1.0]], atol=1e-9)
 
@@ -322,11 +321,11 @@ def test_triangulated_points_are_where_they_were(taken):
     camera, track = np.tile(np.arange(5), 2), np.repeat(np.arange(2), 5)
     in_camera = np.einsum("oij,oj->oi", taken.rotations[camera], world[track]) + taken.translations[camera]
     rays = in_camera[:, :2] / in_camera[:, 2:]
-    points = triangulation.triangulate(state_matrices, rays, camera, track, num_tracks=3)
+    points = multiview_geometry.triangulate(state_matrices, rays, camera, track, num_tracks=3)
     np.testing.assert_allclose(points[:2], world, atol=1e-9)
     assert np.isnan(points[2]).all()
     centres = -np.einsum("cji,cj->ci", taken.rotations, taken.translations)
-    widest = triangulation.largest_angles(centres, points[:2], camera, track)
+    widest = multiview_geometry.largest_angles(centres, points[:2], camera, track)
     first, last = centres[0] - world[0], centres[4] - world[0]
     expected = np.degrees(np.arccos(first @ last / np.linalg.norm(first) / np.linalg.norm(last)))
     assert widest[0] == pytest.approx(expected, abs=1e-6)
@@ -340,5 +339,5 @@ def test_wrong_matches_do_not_hide_how_far_a_pair_moved():
     moved = turned + 0.7 * direction
     rays = moved[:, :2] / moved[:, 2:]
     rays[8:, 1] += generator.choice([-1.0, 1.0], 17) * generator.uniform(0.05, 0.3, 17)
-    assert resection._length(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
-    assert resection._length(turned, direction, rays, 0.002, min_points=9) is None
+    assert mapping_problem._length(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
+    assert mapping_problem._length(turned, direction, rays, 0.002, min_points=9) is None

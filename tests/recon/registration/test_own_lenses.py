@@ -17,7 +17,7 @@ from splatnode.extras.evaluate.stability.perturbations import TrialImage
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras, make_frames, make_world, score_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.registration import bundle_adjustment, self_calibration
 from splatnode.recon.registration.registration import register
 from tests.support.synthetic import view_graph

@@ -10,7 +10,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import match

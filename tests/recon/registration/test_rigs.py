@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Clock as StampClock
 from splatnode.capture.frame import Frame, Stamp
 from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera
-from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment, rigs
+from splatnode.recon.registration.bundle_adjustment import RigConstraint
 from splatnode.recon.registration.incremental_mapper import Map
-from splatnode.recon.registration.rig_constraint import RigConstraint
 from splatnode.recon.registration.rigs import Mount, RigEstimate, adjust_with_rig
 from tests.recon.registration.test_bundle import problem
 

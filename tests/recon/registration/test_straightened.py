@@ -10,7 +10,7 @@ import pytest
 from splatnode.capture import lenses
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import undistort_frame
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import Registration

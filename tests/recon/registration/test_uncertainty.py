@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.geometry import Similarity, umeyama
-from splatnode.recon.registration import bundle_adjustment, incremental_mapper, own_lenses, registration
+from splatnode.recon.registration import bundle_adjustment, incremental_mapper, registration, self_calibration
 from splatnode.recon.registration.registration import make_registration
 from splatnode.recon.result.verdict import compute_axes
 from tests.recon.registration.test_bundle import NOISE_PX, PRIOR, problem
@@ -91,7 +91,7 @@ def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
         points=turn(true.points),
     )
     keyframes = graph_of(4).keyframes
-    sure = own_lenses.OwnLensesConfig(focal_sigma=0.0, shift_sigma=0.0, radial_sigma=0.0)
+    sure = self_calibration.OwnLensesConfig(focal_sigma=0.0, shift_sigma=0.0, radial_sigma=0.0)
     config = registration.RegistrationConfig(mapper=incremental_mapper.MapperConfig(own_lenses=sure))
     one, other = (
         make_registration(

@@ -10,7 +10,6 @@ import pytest
 
 from splatnode.capture.frame import Clock, DroppedFrame, Intrinsics, Stamp
 from splatnode.capture.messaging.messages import Message, Numbering, WireError, decode, encode, make_jpeg_array
-from splatnode.recon.result.depth_check import DepthCheck, DepthCode
 from splatnode.recon.result.message import (
     CameraRecord,
     SceneHeader,
@@ -18,7 +17,7 @@ from splatnode.recon.result.message import (
     encode_snapshot,
     make_camera_record,
 )
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, DepthCheck, DepthCode, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import RELATIVE, Bounds, Code, Scale, Verdict
 from tests.support.schemas import without
 

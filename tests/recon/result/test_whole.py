@@ -12,10 +12,9 @@ import torch
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.cameras import encode_cameras
-from splatnode.recon.result.placement import Placement
+from splatnode.recon.result.placement import Placement, compute_sh_basis, compute_sh_terms, rotate_sh
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.recon.result.spherical_harmonics import compute_sh_basis, compute_sh_terms, rotate_sh
 from splatnode.recon.result.stored_snapshot import SHELL_PIECE, find_pieces, has_scene
 from splatnode.recon.result.submap_index import is_map_set, read_map_set
 from tests.support.exported import make_camera, make_gaussians

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from splatnode.capture.process.config import parse_config
+from splatnode.recon import keyframes
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.frames import screening
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import decode_frame_id
 from splatnode.recon.scene import background, initialization
@@ -65,7 +65,7 @@ def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_sh
 @pytest.mark.parametrize("by_pixel", [None, initialization.PixelwiseConfig()])
 def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkeypatch):
     right = np.broadcast_to(np.arange(WIDTH) >= 8, (HEIGHT, WIDTH))
-    monkeypatch.setattr(screening, "valid_masks", lambda images: [right] * len(images))
+    monkeypatch.setattr(keyframes, "valid_masks", lambda images: [right] * len(images))
     scene = begun(by_pixel=by_pixel)
     for view in scene.views:
         assert view.pointmap is not None and not view.pointmap.depth[~right].any()

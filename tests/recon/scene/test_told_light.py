@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import ExposureSettings, Frame
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.scene.exposure import compute_exposure_priors
 from tests.support.row_of_views import NO_FEATURES
 

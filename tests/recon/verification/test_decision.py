@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.keyframes import Rejected
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification.consistency import Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
-from splatnode.recon.verification.evidence import WeakestLink
+from splatnode.recon.verification.evidence import Reflection, WeakestLink
 from splatnode.recon.verification.refit import Distortion, FreedLens
 from tests.support.verdicts import (
     all_pairs,

@@ -13,7 +13,8 @@ import pytest
 
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification import consistency, error_model, refit
+from splatnode.recon.verification import error_model, refit
+from splatnode.recon.verification import evidence as consistency
 from splatnode.recon.verification import evidence as verification_evidence
 from splatnode.recon.verification.decision import CHECKS, WORDS, DecisionConfig, VerificationCase, check_finite, decide
 from splatnode.recon.verification.evidence import Evidence, find_non_finite

@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import matches_look_alike

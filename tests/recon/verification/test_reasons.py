@@ -10,9 +10,9 @@ import pytest
 from splatnode.extras.evaluate.stability.fitting import FOR
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification.consistency import CycleConsistency, Reflection
 from splatnode.recon.verification.decision import DecisionConfig, decide
 from splatnode.recon.verification.error_model import OddsModel, VerdictModels, predict_bounds
+from splatnode.recon.verification.evidence import CycleConsistency, Reflection
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.refit import Errors
 from tests.support.verdicts import (

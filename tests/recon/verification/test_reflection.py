@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
-from splatnode.recon.verification import consistency
+from splatnode.recon.verification import evidence
 from tests.support.synthetic import photographs
 
 FEATURES = features.FeatureConfig(max_num_features=1500)
-CONFIG = consistency.ReflectionConfig()
+CONFIG = evidence.ReflectionConfig()
 PAIRS = set(itertools.combinations(range(5), 2))
 
 
@@ -27,7 +27,7 @@ def keyframes(mirrored: tuple[int, ...] = (), count: int = 5) -> list[Keyframe]:
 
 def test_mirrored_descriptors_are_those_of_the_mirrored_image():
     (plain,), (seen,) = keyframes(count=1), keyframes((0,), count=1)
-    turned = consistency.mirror_descriptors(plain.features.descriptors)
+    turned = evidence.mirror_descriptors(plain.features.descriptors)
     match = features.match(turned, seen.features.descriptors, features.NearestNeighbourConfig())
     places = plain.features.points[match[:, 0]]
     places[:, 0] = plain.frame.width - places[:, 0]
@@ -36,30 +36,30 @@ def test_mirrored_descriptors_are_those_of_the_mirrored_image():
 
 
 def test_frames_that_were_mirrored_are_found():
-    found = consistency.measure_reflection(keyframes((1, 4)), PAIRS, CONFIG)
+    found = evidence.measure_reflection(keyframes((1, 4)), PAIRS, CONFIG)
     assert found.frames == tuple(photographs()[number].name for number in (1, 4))
     assert found.gain > 0.4
 
 
 def test_a_further_frame_is_compared_with_known_ones():
     plain, mirrored = keyframes(), keyframes((4,))
-    assert consistency.measure_further(plain[4], plain[:3], CONFIG).gain < 0.0
-    found = consistency.measure_further(mirrored[4], plain[:3], CONFIG)
+    assert evidence.measure_further(plain[4], plain[:3], CONFIG).gain < 0.0
+    found = evidence.measure_further(mirrored[4], plain[:3], CONFIG)
     assert found.frames == (photographs()[4].name,) and found.gain > CONFIG.max_further_gain
 
 
 def test_the_strongest_is_one_that_is_not_a_number_where_there_is_one():
-    found = [consistency.Reflection((name,), gain) for name, gain in (("a", 0.3), ("b", np.nan), ("c", 0.5))]
-    assert consistency.select_strongest_reflection(found).frames == ("b",) and consistency.select_strongest_reflection(
+    found = [evidence.Reflection((name,), gain) for name, gain in (("a", 0.3), ("b", np.nan), ("c", 0.5))]
+    assert evidence.select_strongest_reflection(found).frames == ("b",) and evidence.select_strongest_reflection(
         [found[0], found[2]]
     ).frames == ("c",)
 
 
 def test_plain_frames_fit_better_as_they_are():
-    assert consistency.measure_reflection(keyframes(), PAIRS, CONFIG).gain < 0.0
+    assert evidence.measure_reflection(keyframes(), PAIRS, CONFIG).gain < 0.0
 
 
 def test_pairs_that_are_not_compared_say_nothing():
-    found = consistency.measure_reflection(keyframes((1, 4)), PAIRS - {(0, 1), (2, 4), (1, 4)}, CONFIG)
+    found = evidence.measure_reflection(keyframes((1, 4)), PAIRS - {(0, 1), (2, 4), (1, 4)}, CONFIG)
     assert found.frames and set(found.frames) <= {photographs()[number].name for number in (1, 4)}
     assert found.gain > 0.4

@@ -31,13 +31,13 @@ from splatnode.capture.messaging.network import REQUEST_LIMITS
 from splatnode.capture.messaging.pubsub import Answer, Want
 from splatnode.capture.process.config import ConfigError, load_config
 from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
-from splatnode.recon.daemon.checkpoint.records import CheckpointError, Ledger
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
+from splatnode.recon.daemon.ledger import CheckpointError, Ledger
 from splatnode.recon.daemon.node import Command
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.message import MapHeader
-from splatnode.recon.occupancy.message import decode_map as map_from
+from splatnode.recon.occupancy.grid import MapHeader
+from splatnode.recon.occupancy.grid import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
@@ -214,7 +214,7 @@ _RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
 _YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.capture.process.config"))
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
 _SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
-_CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))
+_CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint",))
 _KEYS = Reader((network.KeyFileError,), (f"{_MESSAGING}.keys",))
 
 

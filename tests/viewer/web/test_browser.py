@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export.prepare import SH_C0
+from splatnode.recon.result.export.limits import SH_C0
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.viewer.shapes import paint_gaussians
 from splatnode.viewer.sources import FixedSource

@@ -15,9 +15,9 @@ from struct import pack
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.prepare import compute_base_rgb, format_number_row, format_text_file
-from splatnode.recon.result.export.quaternions import quats_from_matrices
+from splatnode.recon.result.export.limits import compute_base_rgb, format_number_row, format_text_file
 from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.placement import quats_from_matrices
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale
 

@@ -25,8 +25,7 @@ from splatnode.capture.image_file import (
 from splatnode.capture.lenses import undistort_image
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
-from splatnode.recon.result.export.limits import SceneFileError
-from splatnode.recon.result.export.prepare import compute_base_rgb
+from splatnode.recon.result.export.limits import SceneFileError, compute_base_rgb
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.result.stored_snapshot import find_image, list_image_folders

@@ -10,8 +10,7 @@ import re
 
 import numpy as np
 
-from splatnode.recon.result.export.limits import SceneFileError, check_count
-from splatnode.recon.result.export.prepare import make_unknown_source
+from splatnode.recon.result.export.limits import SceneFileError, check_count, make_unknown_source
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.result.verdict import RELATIVE, Scale

@@ -8,8 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatnode.recon.result.export.limits import SceneFileError, check_count
-from splatnode.recon.result.export.prepare import SH_C0, compute_base_rgb, make_unknown_source, select_gaussians
+from splatnode.recon.result.export.limits import (
+    SH_C0,
+    SceneFileError,
+    check_count,
+    compute_base_rgb,
+    make_unknown_source,
+    select_gaussians,
+)
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
 

@@ -19,8 +19,13 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.limits import SceneFileError, check_count
-from splatnode.recon.result.export.prepare import make_unknown_source, minimize_rotations, select_gaussians
+from splatnode.recon.result.export.limits import (
+    SceneFileError,
+    check_count,
+    make_unknown_source,
+    minimize_rotations,
+    select_gaussians,
+)
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from splatnode.capture.frame import Stamp
-from splatnode.recon.result.export.prepare import format_number_row, format_text_file
-from splatnode.recon.result.export.quaternions import quats_from_matrices
+from splatnode.recon.result.export.limits import format_number_row, format_text_file
 from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.placement import quats_from_matrices
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import RELATIVE, Scale
 

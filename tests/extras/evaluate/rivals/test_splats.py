@@ -18,10 +18,9 @@ from splatnode.extras.evaluate import methods
 from splatnode.extras.evaluate.protocol import psnr
 from splatnode.extras.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs
 from splatnode.extras.evaluate.rivals.colmap import reconstruct_sparse_model
-from splatnode.recon.frames.keyframe import resize_image
+from splatnode.recon.keyframes import resize_image
 from splatnode.recon.optimize import training
-from splatnode.recon.optimize.control import adaptive, proximity
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice, adaptive, proximity
 from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support.synthetic import errors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from splatnode.recon.occupancy.formats.nav2 import encode_nav2
+from splatnode.recon.occupancy.files import encode_nav2
 from splatnode.recon.result.verdict import Scale
 from tests.support.occupied import small_map
 

@@ -7,7 +7,7 @@ import io
 import numpy as np
 import pytest
 
-from splatnode.recon.occupancy.formats.octomap import encode_octomap
+from splatnode.recon.occupancy.files import encode_octomap
 from tests.support.occupied import small_map
 
 LEVELS, MIDDLE = 16, 32768

@@ -8,10 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splatnode.recon.optimize.control import adaptive, proximity
-from splatnode.recon.optimize.control.control import OptimizerStep
-from splatnode.recon.optimize.photometric_losses import PhotometricLoss
-from splatnode.recon.optimize.training_image import TrainingImage
+from splatnode.recon.optimize.control import OptimizerStep, adaptive, proximity
+from splatnode.recon.optimize.photometric_losses import PhotometricLoss, TrainingImage
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.scene.scene import Gaussians
 from tests.support.synthetic import tiny_scene

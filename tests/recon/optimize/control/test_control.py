@@ -9,7 +9,7 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize.control.control import GaussianChange, OptimizerStep
+from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.training import refine
 from splatnode.recon.scene.scene import Scene
 from tests.recon.optimize.test_refinement import plain, truth  # noqa: F401  a fixture

@@ -9,11 +9,11 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize.control.control import ControlChoice, OptimizerStep
+from splatnode.recon.optimize.control import ControlChoice, OptimizerStep
 from splatnode.recon.optimize.control.prune import Config, estimate_removal_changes, load, select_most_worthwhile
-from splatnode.recon.optimize.pseudo_views import sample_pseudo_views
+from splatnode.recon.optimize.photometric_losses import TrainingImage, make_training_image
+from splatnode.recon.optimize.regularizers import sample_pseudo_views
 from splatnode.recon.optimize.training import refine
-from splatnode.recon.optimize.training_image import TrainingImage, make_training_image
 from splatnode.recon.rasterize.dispatch import Camera
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.initialization import visibility

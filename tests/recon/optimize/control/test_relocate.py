@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.control import ControlChoice
 from splatnode.recon.optimize.control.relocate import Config, add_noise, relocate_dead, split_opacity
 from splatnode.recon.optimize.training import RefinementConfig as Optimising
 from splatnode.recon.optimize.training import refine

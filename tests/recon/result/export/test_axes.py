@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatnode.recon.result.export.prepare import minimize_rotations
-from splatnode.recon.result.export.quaternions import matrices_from_quats
+from splatnode.recon.result.export.limits import minimize_rotations
+from splatnode.recon.result.placement import matrices_from_quats
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians
 

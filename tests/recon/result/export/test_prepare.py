@@ -12,7 +12,7 @@ from splatnode.recon.result.export.formats.splat import decode as decode_splat
 from splatnode.recon.result.export.formats.splat import encode_splat
 from splatnode.recon.result.export.formats.spz import decode as decode_spz
 from splatnode.recon.result.export.formats.spz import encode_spz
-from splatnode.recon.result.export.prepare import sanitize_gaussians
+from splatnode.recon.result.export.limits import sanitize_gaussians
 from tests.support.exported import make_gaussians
 
 

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from splatnode.recon.result.export.quaternions import matrices_from_quats, quats_from_matrices
+from splatnode.recon.result.placement import matrices_from_quats, quats_from_matrices
 
 
 def test_quaternions_and_matrices_agree_for_every_largest_component():

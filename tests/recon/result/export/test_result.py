@@ -24,7 +24,7 @@ from splatnode.recon.result.export import (
 )
 from splatnode.recon.result.export import staged as staged_module
 from splatnode.recon.result.export.formats.ply import encode_ply
-from splatnode.recon.result.folder import hold_result_folder
+from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.verdict import Code
 from tests.support.exported import make_gaussians, make_snapshot, write

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians
-from splatnode.recon.result.export.prepare import Box, Selection
+from splatnode.recon.result.export.limits import Box, Selection
 from splatnode.recon.result.export.stored import SOURCES
 from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.report import write_result_folder

@@ -29,9 +29,9 @@ from splatnode.extras.evaluate.stability.windows import (
 from splatnode.extras.jobs.calls import usable_cores
 from splatnode.recon import estimation
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.estimation import prepare
 from splatnode.recon.matching import pair_matching
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.preparation import prepare
 from splatnode.recon.result.verdict import Code, Verdict
 
 PLACE = synthetic.Config(views=6, width=320, height=240)

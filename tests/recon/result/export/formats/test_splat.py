@@ -8,7 +8,7 @@ import pytest
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.formats.splat import decode as decode_splat
 from splatnode.recon.result.export.formats.splat import encode_splat
-from splatnode.recon.result.export.prepare import SH_C0
+from splatnode.recon.result.export.limits import SH_C0
 from tests.support.exported import make_gaussians, same_rotations
 
 

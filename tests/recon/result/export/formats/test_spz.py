@@ -12,7 +12,7 @@ import pytest
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.formats.spz import decode as decode_spz
 from splatnode.recon.result.export.formats.spz import encode_spz
-from splatnode.recon.result.export.prepare import minimize_rotations, select_gaussians
+from splatnode.recon.result.export.limits import minimize_rotations, select_gaussians
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians, same_rotations

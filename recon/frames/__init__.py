@@ -1,1 +1,0 @@
-"""Single frames: keyframes with their features, screening, black borders."""

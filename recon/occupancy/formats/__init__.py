@@ -1,1 +1,0 @@
-"""The files that a map of three states is written as, one a module."""
