@@ -18,13 +18,6 @@ if TYPE_CHECKING:
     from splatnode.viewer.sources import Source
 
 
-# What the flags of the viewer's verb were called in the release before; they are read in this one.
-
-FORMER_FLAGS = {
-    "view": {"--photographs": "--images", "--pictures": "--num-frames", "--until-final": "--exit-when-final"},
-}
-
-
 def add_nothing(parser: argparse.ArgumentParser) -> None:
     """Adds no option: the flag says it all."""
 

@@ -3,8 +3,8 @@
     python -m tests.bench movers --scenes shared/scenes --out movers.json
 
 The thing is an ellipse of the built-in capture, of one look and another place in each photograph. Held-out photographs
-have none. They are scored whole, and by how many photographs show a pixel beside the thing (`regions.py`): what the thing
-hides in all of them can only be guessed. The scene of the photographs as they are is scored on the same pixels.
+have none. They are scored whole, and by how many photographs show a pixel beside the thing (`regions.py`): what the
+thing hides in all of them can only be guessed. The scene of the photographs as they are is scored on the same pixels.
 """
 
 from __future__ import annotations
