@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture import former_names, keyframe_selection, reader
-from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image
+from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image, rigid_problem
 from splatnode.capture.keyframe_selection import Limits
 from splatnode.capture.masks import mask_frames, open_single_mask
 from splatnode.capture.messaging import keyframe_queue
@@ -29,7 +29,6 @@ from splatnode.capture.messaging.messages import (
     make_jpeg_array,
 )
 from splatnode.capture.messaging.network import CaptureId, Network
-from splatnode.capture.odometry import rigid_problem
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text

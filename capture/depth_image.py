@@ -17,9 +17,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import LARGEST_SIDE, Intrinsics
+from splatnode.capture.frame import LARGEST_SIDE, Intrinsics, rigid_problem
 from splatnode.capture.image_file import UnusableImage, decode_values, read_image_file
-from splatnode.capture.odometry import rigid_problem
 from splatnode.capture.process.library_lines import ignore_file_warnings
 from splatnode.capture.process.terminal import notify
 from splatnode.capture.process.text import guard_untrusted, sanitize_text

@@ -16,9 +16,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture import textures as paint
-from splatnode.capture.frame import Intrinsics
+from splatnode.capture.frame import Gravity, Intrinsics, Motion
 from splatnode.capture.lenses import unproject
-from splatnode.capture.odometry import Gravity, Motion
 
 # Boxes, ellipsoids and cylinders, and where rays meet them.
 #

@@ -26,7 +26,7 @@ from splatnode.capture import image_header
 from splatnode.capture.frame import ExposureSettings, Intrinsics, Stamp
 from splatnode.capture.image_header import MAX_SIDE, ImageHeader, UnusableImage, exif_time, read_header
 from splatnode.capture.pi_heif import HEADER
-from splatnode.capture.process import apart, python
+from splatnode.capture.process import python
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.library_lines import catch_library_lines
 from splatnode.capture.process.system import outlast, remedy
@@ -88,7 +88,7 @@ def decode_heif(data: bytes, max_pixels: int) -> HeifImage:
         raise UnusableImage(f"HEIC and AVIF need a further package. {needed}")
     check_whole_heif(data)
     command = python.command("splatnode.capture.pi_heif", str(max_pixels))
-    with apart.start_process(command, subprocess.PIPE) as child:
+    with python.start_process(command, subprocess.PIPE) as child:
         return _receive_image(child, data, max_pixels)
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Clock, ExposureSettings, Intrinsics, Stamp, parse_exposure
-from splatnode.capture.process import apart
+from splatnode.capture.process import python
 
 IMAGE_WIDTH, IMAGE_LENGTH = 0x0100, 0x0101
 EXIF_IFD = 0x8769
@@ -611,7 +611,7 @@ def decode(data: bytes, max_pixels: int) -> npt.NDArray[np.uint8]:
     if width * height > max_pixels:
         raise UnusableImage(f"{width} x {height}: more than {max_pixels} pixels; make it smaller")
     wanted = _SIZE.size + 3 * width * height
-    answer, code = apart.answer("splatnode.capture.image_header", data, wanted, str(width * height))
+    answer, code = python.answer("splatnode.capture.image_header", data, wanted, str(width * height))
     if len(answer) < wanted or _SIZE.unpack_from(answer) != (width, height):
         raise UnusableImage(f"damaged, or of an unknown kind: its decoder ended ({code})")
     return np.frombuffer(answer, np.uint8, offset=_SIZE.size).reshape(height, width, 3)
@@ -623,7 +623,7 @@ def main() -> None:
 
     data, pixels = sys.stdin.buffer.read(), int(sys.argv[1])
     resource.setrlimit(resource.RLIMIT_CPU, (_DECODING_S, _DECODING_S))
-    apart.limit_memory(_BASE_BYTES + _BYTES_A_PIXEL * pixels)
+    python.limit_memory(_BASE_BYTES + _BYTES_A_PIXEL * pixels)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise SystemExit(1)

@@ -10,7 +10,7 @@ import resource
 import struct
 import sys
 
-from splatnode.capture.process.apart import limit_memory
+from splatnode.capture.process.python import limit_memory
 
 HEADER = struct.Struct("<III")  # width, height, bytes of EXIF; then EXIF and pixels, none where these are too many
 BASE_BYTES = 300_000_000  # of memory for the decoder, whatever the size of an image

@@ -17,8 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from splatnode.capture.frame import Clock, DroppedFrame, Frame
-from splatnode.capture.odometry import LARGEST_M, are_rigid, rigid_problem
+from splatnode.capture.frame import LARGEST_M, Clock, DroppedFrame, Frame, are_rigid, rigid_problem
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.text import guard_untrusted, sanitize_text

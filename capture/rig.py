@@ -14,9 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.frame import Intrinsics, Stamp
+from splatnode.capture.frame import LARGEST_M, LEAST_SIGMA, Intrinsics, Stamp, rigid_problem
 from splatnode.capture.lenses import UnusableLens, read_lenses
-from splatnode.capture.odometry import LARGEST_M, LEAST_SIGMA, rigid_problem
 from splatnode.capture.process.config import MAX_BYTES, ConfigError, parse_yaml, record_of
 from splatnode.capture.process.files import read_text
 from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, sanitize_text

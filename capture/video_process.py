@@ -18,7 +18,7 @@ from typing import IO
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process import apart, python
+from splatnode.capture.process import python
 
 MAX_VIDEO_PIXELS = 36_000_000  # of a frame: 8192 x 4320
 BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, in colour, and what it refers to
@@ -65,7 +65,7 @@ def decode_video(file: Path, every: int, max_pixels: int, span: Span = Span()) -
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
     command = python.command("splatnode.capture.video_process", os.fsdecode(file.absolute()), *map(str, numbers))
-    with apart.start_process(command, subprocess.DEVNULL) as child:
+    with python.start_process(command, subprocess.DEVNULL) as child:
         assert child.stdout is not None
         has_ended = yield from _receive_frames(child.stdout, max_pixels)
         if child.wait() != 0 or not has_ended:
@@ -105,7 +105,7 @@ def main() -> None:
     from splatnode.capture.av import NoPictures, NotReadable, TooLarge, Video
 
     file, every, max_pixels, from_ns, to_ns = sys.argv[1], *map(int, sys.argv[2:])
-    apart.limit_memory(BASE_BYTES + BYTES_A_PIXEL * max_pixels)
+    python.limit_memory(BASE_BYTES + BYTES_A_PIXEL * max_pixels)
     out = sys.stdout.buffer
     try:
         video = Video(Path(file), threads=min(_MAX_THREADS, os.cpu_count() or 1))

@@ -27,8 +27,7 @@ from splatnode.capture.process.system import raise_shortage, remedy
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.recording import is_recording
-from splatnode.extras import lerobot
-from splatnode.extras.batch import batch
+from splatnode.extras import batch, lerobot
 from splatnode.extras.cameras.mcap import SUFFIX as MCAP
 from splatnode.recon.geometry import angles_deg, cross_matrix
 from splatnode.recon.locating.localize import (

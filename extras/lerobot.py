@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process import apart
+from splatnode.capture.process import python
 from splatnode.capture.process.config import decoder_of, record_in
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
@@ -111,7 +111,7 @@ def _answer(written: tuple[_Written, ...], names: tuple[str, ...]) -> tuple[byte
     """The kind of an answer, and what comes with it."""
     request = msgspec.msgpack.encode(Request(tuple(file for file, *_ in written), names))
     most = _HEAD.size + max(_MOST_SAID, MOST_ROWS * len(names) * 8)
-    answer, code = apart.answer("splatnode.extras.pyarrow", request, most)
+    answer, code = python.answer("splatnode.extras.pyarrow", request, most)
     if len(answer) >= _HEAD.size:
         kind, count = _HEAD.unpack_from(answer)
         if len(answer) == _HEAD.size + count * (len(names) * 8 if kind == COLUMNS else 1):

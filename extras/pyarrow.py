@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from splatnode.capture.process import apart
+from splatnode.capture.process import python
 from splatnode.capture.process.config import decoder_of
 from splatnode.capture.process.files import open_regular
 from splatnode.extras.lerobot import LOST, MOST_ROWS, REFUSED, Columns, Lost, Request, encode_columns, encode_refusal
@@ -70,7 +70,7 @@ def limit() -> None:
     pa.set_memory_pool(pa.system_memory_pool())  # the others take address space in advance
     pa.set_cpu_count(1)
     resource.setrlimit(resource.RLIMIT_CPU, (_READING_S, _READING_S))
-    apart.limit_memory(MEMORY_BYTES)
+    python.limit_memory(MEMORY_BYTES)
 
 
 def _answer(request: Request) -> bytes:

@@ -27,12 +27,11 @@ from splatnode.capture.cameras.folder import find_photographs
 from splatnode.capture.depth_image import DepthImage, find_depth_files, read_depth_file
 from splatnode.capture.film import ALL as EVERY_CAMERA
 from splatnode.capture.film import CameraSet, select_cameras
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, make_given_pose
 from splatnode.capture.image_file import UnusableImage, encode_png
 from splatnode.capture.keyframe_selection import THINNED, Choice, Config, Limits, choose, group_frame_sets
 from splatnode.capture.lenses import Lenses, describe_image
 from splatnode.capture.masks import Find, mask_frames, open_masks
-from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.terminal import Tell, ignore_progress, notify, report_items
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera, form_frame_sets, read_rig

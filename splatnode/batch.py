@@ -24,7 +24,7 @@ def recordings(
     Sources are folders of photographs, videos, MCAP files, LeRobot data sets, folders that hold such, and lists (.txt).
     What lies in the folder `results`, if one is given, is none. Raises FileNotFoundError, ValueError.
     """
-    from splatnode.extras.batch.batch import recordings as found
+    from splatnode.extras.batch import recordings as found
 
     there = found([Path(source) for source in sources], None if results is None else Path(results))
     return [{"name": each.name, "source": each.source} for each in there]
@@ -49,10 +49,10 @@ def reconstruct_dataset(
     Each row takes one core. Like all of Ray Data this is lazy: the work begins when the rows are read. What fails is a
     row with the verdict FAILED. Raises ModuleNotFoundError without ray.
     """
-    from splatnode.extras.batch import batch
-    from splatnode.extras.batch.batch import Job
+    from splatnode.extras import batch
+    from splatnode.extras.batch import Job
     from splatnode.extras.batch.command import replay
-    from splatnode.extras.jobs.calls import Limits, own_version
+    from splatnode.extras.jobs import Limits, own_version
 
     where = str(results) if "://" in str(results) else str(Path(results).resolve())
     job = Job(partial(replay, tuple(options)), where, Limits(max_memory_mb, timeout_s), own_version())

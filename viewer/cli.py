@@ -40,7 +40,7 @@ from splatnode.recon.result.rendering import use_threads
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.stored_snapshot import load_images
 from splatnode.recon.result.submap_index import is_map_set
-from splatnode.viewer import text
+from splatnode.viewer import session, web
 from splatnode.viewer.analysis import Analysis, analyse
 from splatnode.viewer.probe import open3d_installed, probe_window, splash
 from splatnode.viewer.session import Session
@@ -59,7 +59,6 @@ from splatnode.viewer.shapes import (
 from splatnode.viewer.sources import BUDGET, FixedSource, LiveSource, Maps, MapSource, Source, load_result, map_moment
 from splatnode.viewer.state import Moment, ViewerState, Viewpoint, look_at, move_to_camera, overview
 from splatnode.viewer.verbs import find_chosen, load_viewers
-from splatnode.viewer.web import server as web
 
 # A tour that swings around the scene, inside the arc from which it was photographed and above the ground.
 
@@ -217,13 +216,13 @@ def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
         legend(view, width, height, moment.snapshot.scale),
     )
     image = paint(moment.snapshot.gaussians, shown, view, state, width, height)
-    said = [*text.verdict_lines(moment), f"Next view: {text.advice_line(analysis.advice, moment)}"]
+    said = [*session.verdict_lines(moment), f"Next view: {session.advice_line(analysis.advice, moment)}"]
     said += [
-        *text.bounds_lines(moment),
-        *text.depth_lines(moment),
-        *text.place_lines(moment),
-        *text.count_lines(moment),
-        *text.rejection_lines(moment),
+        *session.bounds_lines(moment),
+        *session.depth_lines(moment),
+        *session.place_lines(moment),
+        *session.count_lines(moment),
+        *session.rejection_lines(moment),
     ]
     return add_caption(image, said)
 
@@ -239,7 +238,7 @@ def update_picture(
         started = time.perf_counter()
         picture = overview_picture(analyse(moment), width, height)
         write_files(folder, {LIVE_PICTURE: encode_png(picture)})
-        line = text.verdict_lines(moment)[0]
+        line = session.verdict_lines(moment)[0]
         say(f"{folder / LIVE_PICTURE}: {line} ({time.perf_counter() - started:.1f} s)")
         if until_final and moment.snapshot.final:
             return
@@ -256,7 +255,7 @@ def _wait_for_moments(source: Source, say: Callable[[str], None]) -> Iterator[Mo
         elif source.age_s is None:
             return
         else:
-            line = text.waiting_line(source.age_s if source.age_s == math.inf else 0.0)
+            line = session.waiting_line(source.age_s if source.age_s == math.inf else 0.0)
             if not came and line != told and time.monotonic() - began_s >= _PATIENCE_S:
                 told = line
                 say(line)

@@ -21,8 +21,8 @@ from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.result.export import ResultWriteError, write_files
 from splatnode.recon.result.verdict import Code
-from splatnode.viewer import text
-from splatnode.viewer import text as viewer_text
+from splatnode.viewer import session
+from splatnode.viewer import session as viewer_text
 from splatnode.viewer.session import EditError, Session, edit_lines
 from splatnode.viewer.shapes import measurement_lines
 from splatnode.viewer.stage import Image, WindowStage
@@ -566,7 +566,7 @@ class _Window:
         self._words_at = time.monotonic()
         state = self._session.state
         refused = state.engine is Engine.OPEN3D and not open3d_draws(state, self._software)
-        self._panel.show(self._session, self._stage.paint_time_s, text.NO_SPLATS if refused else self._notice)
+        self._panel.show(self._session, self._stage.paint_time_s, session.NO_SPLATS if refused else self._notice)
         self._help.show(self._session.state.help)
 
     def _layout(self, context: gui.LayoutContext) -> None:

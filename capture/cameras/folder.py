@@ -18,7 +18,10 @@ import numpy.typing as npt
 from splatnode.capture import image_file, recording
 from splatnode.capture.depth_image import DepthImage, check_unit, describe_few_pairs, is_few, read_depth_file
 from splatnode.capture.frame import (
+    LARGEST_M,
     LONGEST_M,
+    POSE_SIGMA_DEG,
+    POSE_SIGMA_M,
     SIGMA_M,
     Baseline,
     DroppedFrame,
@@ -29,6 +32,7 @@ from splatnode.capture.frame import (
     RightImage,
     grey,
     make_frame,
+    make_given_pose,
     pace_frames,
     partners,
     rename_frame,
@@ -47,9 +51,6 @@ from splatnode.capture.image_file import (
 from splatnode.capture.image_header import image_kind, name_time
 from splatnode.capture.lenses import same_aspect
 from splatnode.capture.masks import Mask, apply_mask
-from splatnode.capture.odometry import LARGEST_M, make_given_pose
-from splatnode.capture.odometry import SIGMA_DEG as POSE_SIGMA_DEG
-from splatnode.capture.odometry import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.system import outlast, raise_shortage

@@ -18,8 +18,18 @@ import numpy.typing as npt
 
 from splatnode.capture.diorama import Camera, Matrix, Solid, cast, cast_through, look_at, odometry, place
 from splatnode.capture.diorama import Config as Odometry
-from splatnode.capture.frame import Baseline, Clock, Frame, FramesPerSecond, Intrinsics, RightImage, Stamp, grey
-from splatnode.capture.odometry import Gravity, Motion
+from splatnode.capture.frame import (
+    Baseline,
+    Clock,
+    Frame,
+    FramesPerSecond,
+    Gravity,
+    Intrinsics,
+    Motion,
+    RightImage,
+    Stamp,
+    grey,
+)
 from splatnode.capture.process.config import Internal
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres

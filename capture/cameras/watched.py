@@ -17,8 +17,12 @@ from splatnode.capture.frame import (
     DroppedFrame,
     ExposureSettings,
     Frame,
+    GivenPose,
+    Gravity,
     Intrinsics,
     KeepAlive,
+    Motion,
+    MountNumbers,
     Stamp,
     make_frame,
     nearest_stamp,
@@ -37,7 +41,6 @@ from splatnode.capture.image_file import (
 )
 from splatnode.capture.image_header import name_time
 from splatnode.capture.lenses import assign_lens, check_fits, same_aspect
-from splatnode.capture.odometry import GivenPose, Gravity, Motion, MountNumbers
 from splatnode.capture.process.config import Internal, record_in
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.system import is_shortage, outlast

@@ -42,7 +42,7 @@ from splatnode.capture.process.terminal import (
 )
 from splatnode.capture.process.text import cell, escape_text, sanitize_text
 from splatnode.extras import lerobot
-from splatnode.extras.batch.batch import (
+from splatnode.extras.batch import (
     FAILED,
     LEDGER,
     OWN_SUFFIX,
@@ -59,11 +59,11 @@ from splatnode.extras.batch.batch import (
     shortage,
 )
 from splatnode.extras.cameras.mcap import SUFFIX as MCAP
-from splatnode.extras.formats.mcap import Message, make_calibration, make_pose, make_time
-from splatnode.extras.jobs.calls import Limits, chosen_cores, own_version
+from splatnode.extras.jobs import Limits, chosen_cores, own_version
 from splatnode.extras.logged.mcap import topics
 from splatnode.extras.logged.messages import read_times
 from splatnode.extras.verbs import replay_options
+from splatnode.extras.viewers.mcap import Message, make_calibration, make_pose, make_time
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.snapshot import CameraEstimate, format_rounded_up

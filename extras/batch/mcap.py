@@ -13,8 +13,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
-from splatnode.extras.formats.mcap import Message, add_messages, encode_mcap
 from splatnode.extras.logged.mcap import UnusableLog, unpack_chunks
+from splatnode.extras.viewers.mcap import Message, add_messages, encode_mcap
 
 
 def encode_messages(messages: Sequence[Message], schemas: Mapping[str, str]) -> bytes:

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
-from splatnode.extras.batch.batch import Outcome
+from splatnode.extras.batch import Outcome
 from splatnode.extras.lerobot import UnusableDataSet, check_whole
 from splatnode.extras.pyarrow import open_bounded_table
 

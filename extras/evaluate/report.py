@@ -28,7 +28,7 @@ from splatnode.extras.evaluate import methods as evaluate_methods
 from splatnode.extras.evaluate.dataset import Split, read_json
 from splatnode.extras.evaluate.methods import is_variant
 from splatnode.extras.evaluate.protocol import FAILED, Row, Settings, compute_mean
-from splatnode.extras.jobs.calls import ALONE, Moment, now, others_share
+from splatnode.extras.jobs import ALONE, Moment, now, others_share
 from splatnode.recon.config import PRESETS
 from splatnode.recon.core import instruction_sets
 from splatnode.recon.result.export.staged import json_bytes, write_files

@@ -72,7 +72,7 @@ from splatnode.extras.evaluate.report import (
     read_bench,
     redraw,
 )
-from splatnode.extras.jobs.calls import (
+from splatnode.extras.jobs import (
     Answer,
     Engine,
     Limits,
@@ -83,8 +83,8 @@ from splatnode.extras.jobs.calls import (
     pack_call,
     work_folder,
 )
-from splatnode.extras.jobs.calls import Moment as Since
-from splatnode.extras.jobs.calls import engine as opened
+from splatnode.extras.jobs import Moment as Since
+from splatnode.extras.jobs import engine as opened
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.pipeline import run as run_pipeline
 from splatnode.recon.rasterize import dispatch

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, NoReturn
 
 from splatnode.capture.process.files import check_owner_only
-from splatnode.extras.jobs.calls import ANSWER, CALL, ERROR, LOG
+from splatnode.extras.jobs import ANSWER, CALL, ERROR, LOG
 from splatnode.extras.jobs.launch import end_with
 
 RAISED = 1  # the exit code where the function raised

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from splatnode.capture.odometry import GRAVITY_SIGMA_DEG, LARGEST_M, GivenPose, Gravity, make_given_pose
+from splatnode.capture.frame import GRAVITY_SIGMA_DEG, LARGEST_M, GivenPose, Gravity, make_given_pose
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import guard_untrusted, sanitize_text

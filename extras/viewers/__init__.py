@@ -1,1 +1,1 @@
-"""Viewers beside the window and the page: rerun and viser. Each is a flag of `splatnode view`."""
+"""Viewers beside the window and the page: Foxglove, rerun and viser. Files for them, and flags of `splatnode view`."""

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from splatnode.viewer.sources import Source
 
 if TYPE_CHECKING:
-    from splatnode.extras.formats.rerun import RerunRecording
+    from splatnode.extras.viewers.rerun import RerunRecording
 
 URL = "rerun+http://127.0.0.1:9876/proxy"  # where rerun listens on this machine
 _PORT = 9876
@@ -31,7 +31,7 @@ def stream(source: Source, url: str = URL) -> None:
     Raises ModuleNotFoundError without rerun, ValueError where `url` is none of a rerun viewer, NoRerunViewer, and what
     the source raises.
     """
-    from splatnode.extras.formats import rerun  # takes a second, and is an extra
+    from splatnode.extras.viewers import rerun  # takes a second, and is an extra
 
     _check_listening(url)
     with contextlib.closing(source):
@@ -44,7 +44,7 @@ def stream(source: Source, url: str = URL) -> None:
 
 def follow(source: Source, recording: RerunRecording) -> None:
     """Each moment, and each move of the live camera, is a step; returns when nothing more will come."""
-    from splatnode.extras.formats import rerun
+    from splatnode.extras.viewers import rerun
 
     step, tracked, drawn = 0, None, frozenset()
     while True:

@@ -31,7 +31,7 @@ from splatnode.viewer.analysis import camera_colours
 from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, draw_given_pose, frustum_depth
 from splatnode.viewer.sources import Source
 from splatnode.viewer.state import BACKGROUND, Moment, Viewpoint, move_to_camera, overview
-from splatnode.viewer.web.server import LOOPBACK, Access
+from splatnode.viewer.web import LOOPBACK, Access
 
 _LIVE = "/live camera"
 _NEAR = 0.01  # world units, of what is drawn

@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_image import DepthImage
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, GivenPose, Gravity, Motion, make_rigid
 from splatnode.capture.lenses import straighten_depth
-from splatnode.capture.odometry import GivenPose, Gravity, Motion, make_rigid
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.odometry import Gravity, Motion
+from splatnode.capture.frame import Gravity, Motion
 from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius
 from splatnode.recon.metric.measurement import TWO_SIDED_95, Measurement, MetricView
 from splatnode.recon.result.verdict import Up

@@ -14,22 +14,22 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.depth_image import DepthImage, describe_doubtful_unit, make_depth_image, read_depth_file
-from splatnode.capture.frame import Intrinsics
-from splatnode.capture.image_file import UnusableImage
-from splatnode.capture.messaging.network import CAMERA_ID
-from splatnode.capture.odometry import (
+from splatnode.capture.frame import (
     GRAVITY_SIGMA_DEG,
     MOTION_DRIFT,
     MOTION_SIGMA_DEG,
     MOTION_SIGMA_M,
-    SIGMA_DEG,
-    SIGMA_M,
+    POSE_SIGMA_DEG,
+    POSE_SIGMA_M,
     GivenPose,
     Gravity,
+    Intrinsics,
     Motion,
     make_given_pose,
     rigid_problem,
 )
+from splatnode.capture.image_file import UnusableImage
+from splatnode.capture.messaging.network import CAMERA_ID
 from splatnode.capture.process.terminal import give_warnings, notify
 from splatnode.capture.process.text import LONGEST_NAME, is_printable, sanitize_lines
 
@@ -89,7 +89,7 @@ def make_intrinsics(lens: Lens, width: int, height: int) -> Intrinsics:
 
 
 def make_pose(
-    pose: npt.ArrayLike | None, sigma: Sigmas | None, usual: Sigmas = (SIGMA_M, SIGMA_DEG)
+    pose: npt.ArrayLike | None, sigma: Sigmas | None, usual: Sigmas = (POSE_SIGMA_M, POSE_SIGMA_DEG)
 ) -> GivenPose | None:
     """Returns the pose T_world_camera (4, 4), metres, of an image; None without one. `sigma` None: as `usual`.
 

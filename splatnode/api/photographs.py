@@ -15,7 +15,7 @@ import numpy.typing as npt
 from splatnode.api.arguments import DepthOf, Lens, check_camera_id, make_intrinsics, parse_optional_depth
 from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
 from splatnode.capture.depth_image import DepthImage, find_depth_files
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp, rigid_problem
 from splatnode.capture.image_file import (
     ORIENTATION,
     Extent,
@@ -28,7 +28,6 @@ from splatnode.capture.image_file import (
 from splatnode.capture.image_header import exif_exposure, exif_intrinsics, exif_time, read_tags
 from splatnode.capture.lenses import ALL, Lenses, find_key
 from splatnode.capture.masks import Find, Mask, apply_mask, open_masks, parse_mask, read_mask
-from splatnode.capture.odometry import rigid_problem
 from splatnode.capture.process.terminal import Tell, ignore_progress, notify
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.rig import TOLERANCE_S

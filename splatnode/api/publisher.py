@@ -36,6 +36,9 @@ from splatnode.capture.frame import (
     Clock,
     DroppedFrame,
     Frame,
+    GivenPose,
+    Gravity,
+    Motion,
     Stamp,
     nearest_stamp,
     wall_clock,
@@ -44,7 +47,6 @@ from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.lenses import assign_lens, check_fits
 from splatnode.capture.masks import apply_mask, parse_mask
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolFull
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.process.config import merge_config, parse_config, read_yaml
 from splatnode.capture.process.files import LockHeld
 from splatnode.capture.process.terminal import Unfailing

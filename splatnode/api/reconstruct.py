@@ -49,11 +49,10 @@ from splatnode.api.photographs import (
 from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Baseline as Apart
-from splatnode.capture.frame import DroppedFrame, Frame, RightImage, Stamp, grey
+from splatnode.capture.frame import DroppedFrame, Frame, Motion, RightImage, Stamp, grey
 from splatnode.capture.keyframe_selection import Config as Selection
 from splatnode.capture.keyframe_selection import Limits, Selector
 from splatnode.capture.lenses import assign_lens, check_fits
-from splatnode.capture.odometry import Motion
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import Tell, ignore_progress, notify

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from splatnode.capture import film
+from splatnode.extras import batch
 from splatnode.extras.audit import Film, find_recordings
-from splatnode.extras.batch import batch
-from splatnode.extras.batch.batch import Outcome
+from splatnode.extras.batch import Outcome
 from splatnode.extras.batch.command import write_back
 from tests.support.clips import level_images, write_clip
 

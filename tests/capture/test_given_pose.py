@@ -6,9 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import Frame, rename_frame
+from splatnode.capture.frame import LARGEST_M, Frame, GivenPose, make_given_pose, rename_frame
 from splatnode.capture.messaging.messages import FrameHeader, Numbering, decode, encode_frame
-from splatnode.capture.odometry import LARGEST_M, GivenPose, make_given_pose
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.capture.rig import RigCamera
 from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame

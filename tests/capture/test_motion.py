@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.frame import Frame, rename_frame
+from splatnode.capture.frame import Frame, Gravity, Motion, rename_frame
 from splatnode.capture.messaging.messages import FrameHeader, Numbering, WireError, decode, encode, encode_frame
-from splatnode.capture.odometry import Gravity, Motion
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.recon.daemon.ledger import file_name, read_frame, write_frame
 

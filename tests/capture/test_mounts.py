@@ -10,9 +10,8 @@ import pytest
 
 from splatnode.capture import cli, recording
 from splatnode.capture.config import CaptureConfig, camera_opener, mount_camera
-from splatnode.capture.frame import DroppedFrame, Frame, make_frame
+from splatnode.capture.frame import DroppedFrame, Frame, make_frame, make_rigid
 from splatnode.capture.messaging.messages import FrameHeader, arrays_of, describe_stored_frame, frame_in
-from splatnode.capture.odometry import make_rigid
 from splatnode.capture.process.config import ConfigError, parse_config
 from splatnode.capture.rig import Rig, RigCamera, UnusableRig, read_rig
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture import pose_files
-from splatnode.capture.frame import Clock, Frame, Stamp
-from splatnode.capture.odometry import are_rigid, rigid_problem
+from splatnode.capture.frame import Clock, Frame, Stamp, are_rigid, rigid_problem
 from splatnode.capture.pose_files import PosesFileError, Trajectory, each_line, poses_of, read_poses
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.report import write_result_folder

@@ -11,8 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.frame import Frame, Intrinsics, make_given_pose
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_depth, load_prior
 from splatnode.recon.matching.view_graph import ViewGraph

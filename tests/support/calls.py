@@ -8,7 +8,7 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-from splatnode.extras.jobs.calls import NOT_RUN, Answer, Engine, Limits, Take, usable_cores
+from splatnode.extras.jobs import NOT_RUN, Answer, Engine, Limits, Take, usable_cores
 from splatnode.extras.jobs.template import module_of
 
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatnode.extras.batch.batch import BatchRecording
+from splatnode.extras.batch import BatchRecording
 
 REPORT = {
     "verdict": {"code": "OK", "message": "All 3 photographs were placed.", "advice": "", "publishable": True},

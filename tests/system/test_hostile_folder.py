@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.extras.batch.batch import BatchRecording
+from splatnode.extras.batch import BatchRecording
 from splatnode.extras.batch.command import replay
-from splatnode.extras.jobs.calls import Child, Limits, Task, engine, own_version, pack_call, run_here, wait_for_end
+from splatnode.extras.jobs import Child, Limits, Task, engine, own_version, pack_call, run_here, wait_for_end
 from splatnode.viewer.probe import probe_window, splash
 from tests.conftest import ROOT
 from tests.support.hostile_folder import make_hostile, program, variables

@@ -10,9 +10,8 @@ import yaml
 
 from splatnode.capture.config import PreviewHeader
 from splatnode.capture.daemon import CaptureStatus
-from splatnode.capture.frame import ExposureSettings, Intrinsics
+from splatnode.capture.frame import ExposureSettings, GivenPose, Gravity, Intrinsics, Motion
 from splatnode.capture.messaging import messages, network, pubsub
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.occupancy.grid import MapHeader, MapRecord

@@ -21,7 +21,7 @@ STARTS = {
     "recon/core/release.py",  # the Python of a clean environment, isolated
 }
 UNPICKLES = {
-    "extras/jobs/calls.py",  # from a folder of this user alone, or from Ray
+    "extras/jobs/__init__.py",  # from a folder of this user alone, or from Ray
     "extras/jobs/template.py",  # from a folder of this user alone
     "extras/evaluate/runner.py",  # from a temporary folder of this user alone
     "extras/evaluate/stability/window_campaign.py",  # arguments of a call

@@ -13,7 +13,7 @@ from splatnode.command_line import main
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.stored_snapshot import find_pieces
 from splatnode.recon.result.submap_index import read_map_set
-from splatnode.viewer import text
+from splatnode.viewer import session
 from splatnode.viewer.session import Session
 from splatnode.viewer.shapes import CHAIN_COLOUR, LOOP_COLOUR, RETRACTED_COLOUR, shapes
 from splatnode.viewer.sources import FOCAL_PX, Extent, MapLoader, Maps, MapSource, choose_levels, map_moment
@@ -131,13 +131,13 @@ def test_links_are_drawn_by_kind_and_places_are_listed(out):
     assert drawn[CHAIN_COLOUR] == 1 and drawn[LOOP_COLOUR] == 1 and drawn[RETRACTED_COLOUR] > 4  # dashes
     hidden = shapes(moment, press(ViewerState(cameras=False, path=False), (), "8"), None)
     assert not hidden.lines
-    said = "\n".join(text.place_lines(moment))
+    said = "\n".join(session.place_lines(moment))
     for phrase in (
         "map 1 of 2", "splatnode merge", "scene-0001 OK: ", "full detail", "scene-0003 NO_PARALLAX: no scene",
         "loop scene-0001 to scene-0002, taken back: the cycle does not close",
     ):  # fmt: skip
         assert phrase in said
-    assert "several scenes" in text.advice_line(None, moment)
+    assert "several scenes" in session.advice_line(None, moment)
 
 
 def test_the_list_of_places_is_bounded_and_dashes_leave_gaps():

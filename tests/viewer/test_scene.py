@@ -11,7 +11,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.recon.result.export.limits import compute_base_rgb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Bounds, Code, Scale, Verdict, make_ball
-from splatnode.viewer import text
+from splatnode.viewer import session
 from splatnode.viewer.analysis import (
     GOOD_ANGLE_DEG,
     UNKNOWN,
@@ -171,45 +171,45 @@ def test_the_camera_that_is_looked_through_is_told_or_else_the_widest_of_all():
     second = replace(camera(0.5, frame_id=1), bounds=Bounds(0.2, 0.03, 3.0, 0.8, make_ball(0.03)))
     there = moment(wall(3), first, second, camera(1.0, frame_id=2), scale=Scale(True, "a ruler"))
     positions = "of the distance to the scene"
-    assert text.bounds_lines(there, first) == [
+    assert session.bounds_lines(there, first) == [
         f"0.png: direction to 0.3 degrees, position to 1 % {positions} (1 cm), focal length to 0.8 % (95 % bounds)"
     ]
     best = "focal length to 0.8 % (95 % bounds)"
     of_all = f"Cameras: directions to 0.3 degrees, positions to 3 % {positions} (3 cm), {best}"
-    assert text.bounds_lines(there) == text.bounds_lines(there, there.snapshot.cameras[2]) == [of_all]
-    assert text.bounds_lines(moment(wall(3), camera(0.0))) == []
+    assert session.bounds_lines(there) == session.bounds_lines(there, there.snapshot.cameras[2]) == [of_all]
+    assert session.bounds_lines(moment(wall(3), camera(0.0))) == []
 
 
 def test_words_are_plain():
     dropped = tuple(DroppedFrame(f"{i}.png", "blurred") for i in range(8))
     there = moment(wall(3), camera(0.0), dropped=dropped, seconds={"poses": 1.24, "total": 3.0})
     refusal = Verdict(Code.NO_PARALLAX, "The camera only turned.", "Take a step to the side.", ("0.png",))
-    assert text.verdict_lines(replace(there, snapshot=replace(there.snapshot, verdict=refusal))) == [
+    assert session.verdict_lines(replace(there, snapshot=replace(there.snapshot, verdict=refusal))) == [
         "NO_PARALLAX: The camera only turned.",
         "What to do: Take a step to the side.",
         "About: 0.png",
     ]
-    assert text.count_lines(there) == ["9 Gaussians, 1 camera", "3.0 s (poses 1.2)", "10 iterations"]
-    assert text.rejection_lines(there)[0] == "2 photographs were left out before:"
-    assert text.rejection_lines(there)[-1] == "left out 7.png: blurred"
-    assert text.feed_line(None, True) == "a finished result"
-    assert "nothing has come" in text.waiting_line(float("inf")) and "is there" in text.waiting_line(1.0)
-    assert "STALE" in text.waiting_line(12.0)
-    assert "STALE" in text.feed_line(12.0, False) and text.feed_line(1.0, False) == "live"
-    assert text.advice_line(None, moment(wall(3), verdict=refusal)) == "Take a step to the side."
+    assert session.count_lines(there) == ["9 Gaussians, 1 camera", "3.0 s (poses 1.2)", "10 iterations"]
+    assert session.rejection_lines(there)[0] == "2 photographs were left out before:"
+    assert session.rejection_lines(there)[-1] == "left out 7.png: blurred"
+    assert session.feed_line(None, True) == "a finished result"
+    assert "nothing has come" in session.waiting_line(float("inf")) and "is there" in session.waiting_line(1.0)
+    assert "STALE" in session.waiting_line(12.0)
+    assert "STALE" in session.feed_line(12.0, False) and session.feed_line(1.0, False) == "live"
+    assert session.advice_line(None, moment(wall(3), verdict=refusal)) == "Take a step to the side."
     file = moment(wall(3))
-    assert "file" in text.advice_line(None, replace(file, snapshot=replace(file.snapshot, cameras=(), final=True)))
-    assert text.time_line(ViewerState(), (there,)) == "snapshot 1 of 1, the newest"
+    assert "file" in session.advice_line(None, replace(file, snapshot=replace(file.snapshot, cameras=(), final=True)))
+    assert session.time_line(ViewerState(), (there,)) == "snapshot 1 of 1, the newest"
 
 
 def test_the_panel_tells_how_much_depth_other_views_confirm_of_a_view_and_of_all():
     shares = (0.8, 0.35, 0.5)
     cameras = [replace(camera(0.1 * n, frame_id=n), consistent_depth=share) for n, share in enumerate(shares)]
     there = moment(wall(3), *cameras)
-    (of_all,) = text.depth_lines(there)
+    (of_all,) = session.depth_lines(there)
     assert of_all == "Depth: other views confirm it in 55 % of the pixels, least in 1.png: 35 %"
-    assert text.depth_lines(there, cameras[2]) == ["2.png: other views confirm 50 % of its depth"]
-    assert text.view_depth_lines(there, 2) == ["1.png: 35 %", "2.png: 50 %", "1 more, with larger shares"]
+    assert session.depth_lines(there, cameras[2]) == ["2.png: other views confirm 50 % of its depth"]
+    assert session.view_depth_lines(there, 2) == ["1.png: 35 %", "2.png: 50 %", "1 more, with larger shares"]
     unknown = moment(wall(3), camera(0.0))
-    assert text.depth_lines(unknown) == text.depth_lines(unknown, unknown.snapshot.cameras[0]) == []
-    assert text.view_depth_lines(unknown, 2) == []
+    assert session.depth_lines(unknown) == session.depth_lines(unknown, unknown.snapshot.cameras[0]) == []
+    assert session.view_depth_lines(unknown, 2) == []

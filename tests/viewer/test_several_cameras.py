@@ -11,11 +11,11 @@ from splatnode.capture.messaging.messages import Message
 from splatnode.recon.result.message import decode_snapshot, encode_snapshot
 from splatnode.recon.result.snapshot import GivenCameraPose
 from splatnode.recon.result.verdict import Scale
-from splatnode.viewer import text
+from splatnode.viewer import session
 from splatnode.viewer.analysis import camera_colours, source_colour
 from splatnode.viewer.shapes import shapes
 from splatnode.viewer.state import ViewerState
-from splatnode.viewer.web.server import Content
+from splatnode.viewer.web import Content
 from tests.viewer.test_scene import camera, moment, wall
 
 
@@ -46,8 +46,8 @@ def test_a_given_pose_is_a_thin_frustum_with_a_line_to_the_estimated_one():
     assert np.allclose(lines.ends[-1], [first.given.T_world_camera[:3, 3], first.T_world_camera[:3, 3]])
     assert np.allclose(lines.ends[0, 0], first.given.T_world_camera[:3, 3])
     assert shapes(there, replace(only, given=False), None).lines == ()
-    assert text.bounds_lines(there) == ["Given poses: 1, at most 5 cm and 0 degrees off (0.png)"]
-    assert text.describe_given_poses(there, make_cameras()[1]) == []
+    assert session.bounds_lines(there) == ["Given poses: 1, at most 5 cm and 0 degrees off (0.png)"]
+    assert session.describe_given_poses(there, make_cameras()[1]) == []
 
 
 def test_the_web_page_gets_both():

@@ -34,8 +34,8 @@ from splatnode.extras.evaluate.stability.trial import (
     run_trial,
 )
 from splatnode.extras.evaluate.stability.window_campaign import run_windows_verb
-from splatnode.extras.jobs.calls import Engine, Limits, Task, pack_call, work_folder
-from splatnode.extras.jobs.calls import engine as opened
+from splatnode.extras.jobs import Engine, Limits, Task, pack_call, work_folder
+from splatnode.extras.jobs import engine as opened
 from splatnode.recon.result.export.staged import hold_result_folder, json_bytes, write_files
 
 # The trials counted: how often a wrong scene was published, how often a right one refused.

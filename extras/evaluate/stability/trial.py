@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.extras import jobs
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split, TrueCamera
 from splatnode.extras.evaluate.methods import make_verdict
 from splatnode.extras.evaluate.protocol import (
@@ -36,8 +37,7 @@ from splatnode.extras.evaluate.rivals.colmap import (
     reconstruct_sparse_model,
 )
 from splatnode.extras.evaluate.stability.perturbations import Sampler, TrialImage
-from splatnode.extras.jobs import calls
-from splatnode.extras.jobs.calls import now
+from splatnode.extras.jobs import now
 from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius, umeyama
@@ -477,7 +477,7 @@ class TrialResult:
     measured: ProbeResult | None
 
 
-def judge_trial(case: TrialCase, row: int, name: str, seed: int, method: str, answer: calls.Answer) -> Trial:
+def judge_trial(case: TrialCase, row: int, name: str, seed: int, method: str, answer: jobs.Answer) -> Trial:
     """The trial of a case that `run_trial` was called for; its photographs are not looked at."""
     head = {
         "row": row,

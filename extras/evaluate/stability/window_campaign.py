@@ -67,8 +67,8 @@ from splatnode.extras.evaluate.stability.windows import (
     select_keys,
     select_moving_scenes,
 )
-from splatnode.extras.jobs.calls import Engine, Limits, Task, Work, now, pack_call, work_folder
-from splatnode.extras.jobs.calls import engine as opened
+from splatnode.extras.jobs import Engine, Limits, Task, Work, now, pack_call, work_folder
+from splatnode.extras.jobs import engine as opened
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks

@@ -34,7 +34,7 @@ from typing import Any
 import msgspec
 
 from splatnode.capture.process.terminal import say
-from splatnode.extras.batch.batch import LEDGER
+from splatnode.extras.batch import LEDGER
 from tests.bench.node.batch_simulation import lines, verdict, verdicts
 from tests.bench.node.simulated_batch import OUT, TALLY, end_of, recordings
 from tests.bench.node.trial import expect

@@ -22,7 +22,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from splatnode.extras.batch.batch import FAILED, LEDGER
+from splatnode.extras.batch import FAILED, LEDGER
 from splatnode.extras.batch.command import CSV, EXIT_SOME_FAILED
 from tests.bench.node.simulated_batch import OUT, TALLY, end_of, recordings
 from tests.bench.node.trial import expect

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from splatnode.extras.batch.batch import BatchRecording
+from splatnode.extras.batch import BatchRecording
 from splatnode.extras.batch.command import run_batch
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 

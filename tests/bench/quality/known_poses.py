@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.frame import make_given_pose
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.config import apply_changes, preset

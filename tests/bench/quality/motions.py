@@ -26,7 +26,7 @@ import numpy as np
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama import Config as Odometry
 from splatnode.capture.diorama import odometry
-from splatnode.capture.odometry import Motion
+from splatnode.capture.frame import Motion
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView, make_metric_views

@@ -28,7 +28,7 @@ from splatnode.extras.evaluate.methods import Start, continue_reconstruction, ex
 from splatnode.extras.evaluate.protocol import INTERPOLATED_START, PerceptualNetworks, Settings, load_networks
 from splatnode.extras.evaluate.report import Bench, redraw
 from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
-from splatnode.extras.jobs.calls import Engine, engine
+from splatnode.extras.jobs import Engine, engine
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.rasterize.dispatch import Device, DeviceUnavailable, choose_device, make_rasterizer
 from splatnode.recon.result.export.staged import write_files

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import folder
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import LARGEST_M, DroppedFrame, Frame, GivenPose
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.messaging.messages import FrameHeader, Numbering, decode, encode_frame
-from splatnode.capture.odometry import LARGEST_M, GivenPose
 
 NAMES = ("1341847980.722988.png", "1341847981.000000.png", "1341847982.500000.png")
 

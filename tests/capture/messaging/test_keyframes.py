@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zmq
 
-from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp
+from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp, make_given_pose
 from splatnode.capture.messaging.keyframe_queue import (
     KeyframeClient,
     KeyframeServer,
@@ -37,7 +37,6 @@ from splatnode.capture.messaging.messages import (
     encode,
 )
 from splatnode.capture.messaging.network import CAPTURE_KEYFRAMES, AlreadyRunning, Network, runtime_directory
-from splatnode.capture.odometry import make_given_pose
 from splatnode.capture.process.files import LockHeld
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT

@@ -9,8 +9,8 @@ import subprocess
 
 import pytest
 
-from splatnode.capture.process import apart, library_lines, python
-from splatnode.capture.process.apart import start_process
+from splatnode.capture.process import library_lines, python
+from splatnode.capture.process.python import start_process
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "memfd_create"), reason="heard where there are files in memory")
 
@@ -72,4 +72,4 @@ def test_nothing_stays_open():
     with pytest.raises(OSError), start_process(["/no/such/decoder"], subprocess.DEVNULL):
         pass
     assert len(os.listdir("/proc/self/fd")) == before
-    assert apart.answer("json.tool", b"[1]", 100)[0].split() == [b"[", b"1", b"]"]
+    assert python.answer("json.tool", b"[1]", 100)[0].split() == [b"[", b"1", b"]"]

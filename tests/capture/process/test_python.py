@@ -53,6 +53,6 @@ def test_python_m_leaves_the_current_folder_before_it_imports_anything(tmp_path,
 
 
 def test_a_module_is_found_where_its_package_lies():
-    assert python.place_of("splatnode.extras.jobs.calls") is None
+    assert python.place_of("splatnode.extras.jobs") is None
     assert python.place_of(__name__) == os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(__file__))))
     assert python.place_of("tomllib_that_is_not_there") is None

@@ -22,7 +22,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_header import UnusableImage
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.network import AllowList, Network, allow, create_keys
-from splatnode.capture.process import apart, system
+from splatnode.capture.process import python, system
 from splatnode.capture.process.system import is_shortage, may_be_shortage, outlast
 from splatnode.capture.process.terminal import Unfailing
 from splatnode.capture.reader import ReaderState
@@ -159,9 +159,9 @@ def test_no_further_process_is_a_shortage(monkeypatch):
     def none(*_, **__):
         raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(apart.subprocess, "Popen", none)
+    monkeypatch.setattr(python.subprocess, "Popen", none)
     with pytest.raises(OSError) as raised:
-        apart.answer("json", b"", 10)
+        python.answer("json", b"", 10)
     assert is_shortage(raised.value)
 
 

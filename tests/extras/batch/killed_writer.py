@@ -18,8 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from splatnode.extras.batch import command
-from splatnode.extras.batch.batch import BatchRecording, recordings
+from splatnode.extras.batch import BatchRecording, command, recordings
 from splatnode.extras.batch.command import WriteBackOutcome, write_back
 from tests.support.recordings import options
 

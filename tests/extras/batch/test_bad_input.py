@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
-from splatnode.extras.batch.batch import FAILED
+from splatnode.extras.batch import FAILED
 from splatnode.extras.batch.command import EXIT_SOME_FAILED
 from tests.support import lerobot_sets
 from tests.support.synthetic import photographs

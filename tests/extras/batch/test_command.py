@@ -13,9 +13,9 @@ import pytest
 import splatnode.extras.batch
 from splatnode import command_line
 from splatnode.capture.process.text import cell
-from splatnode.extras.batch.batch import LEDGER, BatchRecording, Ledger, OtherBatch, make_failed_outcome
+from splatnode.extras.batch import LEDGER, BatchRecording, Ledger, OtherBatch, make_failed_outcome
 from splatnode.extras.batch.command import CSV, EXIT_GOOD, EXIT_SOME_FAILED, run_batch, write_csv
-from splatnode.extras.jobs.calls import NOT_RUN
+from splatnode.extras.jobs import NOT_RUN
 from splatnode.extras.verbs import replay_options
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs

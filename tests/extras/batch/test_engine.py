@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process.system import SHORT_OF_MEMORY
-from splatnode.extras.batch.batch import LOG, BatchRecording, Plan, make_failed_outcome, run_all
-from splatnode.extras.jobs.calls import NOT_RUN, Limits
+from splatnode.extras.batch import LOG, BatchRecording, Plan, make_failed_outcome, run_all
+from splatnode.extras.jobs import NOT_RUN, Limits
 from tests.conftest import ROOT
 from tests.support.recordings import GOOD, REFUSED, simulated
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from splatnode.extras.batch.batch import LEDGER, BatchRecording, Ledger, OtherBatch
+from splatnode.extras.batch import LEDGER, BatchRecording, Ledger, OtherBatch
 
 ROW = {"name": "a", "source": "/a", "verdict": "OK", "message": "", "published": True, "photographs": 3}
 ROW |= {"left_out": 0, "rotation_deg": 0.1, "centre_percent": 0.1, "focal_percent": 0.1, "gaussians": 10}

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from splatnode.batch import reconstruct_dataset, recordings
-from splatnode.extras.batch.batch import BatchRecording, Job, run_recording
+from splatnode.extras.batch import BatchRecording, Job, run_recording
 from splatnode.extras.batch.command import EXIT_SOME_FAILED, run_batch
-from splatnode.extras.jobs.calls import Limits, Task, engine, pack_call
+from splatnode.extras.jobs import Limits, Task, engine, pack_call
 from tests.support.hostile_folder import make_hostile
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.extras.batch import command
-from splatnode.extras.batch.batch import BatchRecording, Job, run_recording
-from splatnode.extras.jobs.calls import Limits, free_core, own_version
+from splatnode.extras.batch import BatchRecording, Job, command, run_recording
+from splatnode.extras.jobs import Limits, free_core, own_version
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 
 

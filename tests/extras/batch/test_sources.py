@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.extras.batch import batch
-from splatnode.extras.batch.batch import recordings
+from splatnode.extras import batch
+from splatnode.extras.batch import recordings
 from tests.support import lerobot_sets
 from tests.support.mcap_files import as_json, compressed, write
 

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 from splatnode import command_line
 from splatnode.capture.frame import Clock, Stamp
 from splatnode.capture.image_file import encode_png
-from splatnode.extras.batch.batch import BatchRecording, recordings
+from splatnode.extras.batch import BatchRecording, recordings
 from splatnode.extras.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
 from splatnode.extras.lerobot import list_parts
 from splatnode.recon.result.export.cameras import encode_cameras

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 
 from splatnode.capture import film
-from splatnode.extras.batch.batch import recordings
+from splatnode.extras.batch import recordings
 from splatnode.extras.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
 from tests.extras.batch.test_write_back import PICTURE, data_set, drive, placed  # noqa: F401  fixtures
 from tests.support import mcap_files

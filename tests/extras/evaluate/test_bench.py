@@ -21,7 +21,7 @@ from splatnode.extras.evaluate.methods import Start, continue_reconstruction, ex
 from splatnode.extras.evaluate.protocol import Row, Settings, create_empty_networks
 from splatnode.extras.evaluate.report import explain_missing_seconds
 from splatnode.extras.evaluate.runner import MethodRunner, Plan, PlannedRun, Scoring, format_run, run_bench
-from splatnode.extras.jobs.calls import ALONE, Engine, Limits, engine, usable_cores
+from splatnode.extras.jobs import ALONE, Engine, Limits, engine, usable_cores
 from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.optimize.training import RefinementConfig as Optimize
 from splatnode.recon.pipeline import reconstruct as pipeline

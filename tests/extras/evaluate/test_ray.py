@@ -10,7 +10,7 @@ from splatnode.extras.evaluate.protocol import create_empty_networks
 from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
 from splatnode.extras.evaluate.stability import campaign
 from splatnode.extras.evaluate.stability.perturbations import ScenesByMotion
-from splatnode.extras.jobs.calls import engine
+from splatnode.extras.jobs import engine
 from splatnode.recon.rasterize.cpu import rasterize
 from tests.extras.evaluate import test_bench
 from tests.extras.evaluate.stability.test_campaign import six_views

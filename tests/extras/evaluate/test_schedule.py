@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from splatnode.extras.evaluate.runner import PlannedRun, Prerequisite, run_schedule
-from splatnode.extras.jobs.calls import Engine, Limits
+from splatnode.extras.jobs import Engine, Limits
 from tests.support.calls import in_this_process
 
 

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from splatnode.extras.jobs.calls import ALONE, Moment, add_sibling_cores, now, others_share, usable_cores
+from splatnode.extras.jobs import ALONE, Moment, add_sibling_cores, now, others_share, usable_cores
 
 SPINS = "import os, sys\nos.sched_setaffinity(0, {int(sys.argv[1])})\nprint(flush=True)\nwhile True: pass"
 

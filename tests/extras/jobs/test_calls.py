@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process import python
-from splatnode.extras.jobs.calls import (
+from splatnode.extras.jobs import (
     ANSWER,
     CALL,
     NOT_RUN,

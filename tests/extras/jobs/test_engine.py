@@ -6,7 +6,7 @@ import os
 import sys
 from collections import deque
 
-from splatnode.extras.jobs.calls import Child, Limits, run_processes
+from splatnode.extras.jobs import Child, Limits, run_processes
 
 CORES = tuple(sorted(os.sched_getaffinity(0)))
 

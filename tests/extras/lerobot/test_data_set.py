@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture import film
-from splatnode.capture.process import apart
+from splatnode.capture.process import python
 from splatnode.capture.video_process import VideoFrame
 from splatnode.command_line import main
 from splatnode.extras import lerobot as data_set
@@ -160,8 +160,8 @@ def test_without_pyarrow_it_says_what_pyarrow_is_needed_for(copy, monkeypatch, c
 
 
 def test_tables_are_read_once_until_they_change(copy, monkeypatch):
-    answer, asked = apart.answer, []
-    monkeypatch.setattr(apart, "answer", lambda *given: asked.append(given) or answer(*given))
+    answer, asked = python.answer, []
+    monkeypatch.setattr(python, "answer", lambda *given: asked.append(given) or answer(*given))
     for number in (0, 1, 2, 0):
         data_set.film(copy, f"{number}/{TOP}")
     assert len(asked) == 1

@@ -13,11 +13,10 @@ from msgspec import inspect
 
 from splatnode.capture import config, daemon
 from splatnode.capture.depth_image import DepthNoise
-from splatnode.capture.frame import Baseline, ExposureSettings, Intrinsics
+from splatnode.capture.frame import Baseline, ExposureSettings, GivenPose, Gravity, Intrinsics, Motion
 from splatnode.capture.messaging import messages, pubsub
 from splatnode.capture.messaging.messages import Header
 from splatnode.capture.messaging.pubsub import Want
-from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.recon.daemon import node
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.occupancy.grid import MapHeader

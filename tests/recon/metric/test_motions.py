@@ -10,7 +10,7 @@ import pytest
 
 from splatnode.capture.diorama import Config as Odometry
 from splatnode.capture.diorama import odometry
-from splatnode.capture.odometry import Gravity, Motion
+from splatnode.capture.frame import Gravity, Motion
 from splatnode.recon.metric.measurement import Measurement, MetricConfig, MetricView, make_metric_views
 from splatnode.recon.metric.metres import Evidence, apply_metric_scale
 from splatnode.recon.metric.odometry import estimate_scale_from_motions, estimate_up

@@ -9,8 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.frame import Frame
-from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.frame import Frame, make_given_pose
 from splatnode.recon.metric.measurement import Baseline, MetricConfig, MetricView, make_metric_views
 from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.metric.odometry import PoseAlignment, PoseSigmas, align_to_poses

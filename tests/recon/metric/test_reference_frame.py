@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.diorama import look_at
-from splatnode.capture.odometry import Gravity, Motion, make_given_pose
+from splatnode.capture.frame import Gravity, Motion, make_given_pose
 from splatnode.recon.metric.measurement import Baseline, MetricConfig
 from splatnode.recon.metric.metres import (
     NOTHING,

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.odometry import make_given_pose
+from splatnode.capture.frame import Frame, Intrinsics, make_given_pose
 from splatnode.recon.keyframes import PLAIN, Features, Keyframe
 from splatnode.recon.registration import known_poses
 from splatnode.recon.registration.known_poses import collect_known_poses

@@ -26,21 +26,21 @@ from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.capture.process.text import is_printable, sanitize_name
 from splatnode.command_line import build_parser
-from splatnode.extras.batch import batch
-from splatnode.extras.batch.batch import BatchRecording, read_list
-from splatnode.extras.jobs.calls import End
+from splatnode.extras import batch
+from splatnode.extras.batch import BatchRecording, read_list
+from splatnode.extras.jobs import End
 from splatnode.recon.result import submap_index
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.export.result import read_digests
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.viewer import text as viewer_text
+from splatnode.viewer import session as viewer_text
+from splatnode.viewer import web
 from splatnode.viewer.shapes import ground
 from splatnode.viewer.sources import _sanitize_snapshot
 from splatnode.viewer.state import Moment
-from splatnode.viewer.web import server as web
-from splatnode.viewer.web.server import Board, Content, load_or_create_key
+from splatnode.viewer.web import Board, Content, load_or_create_key
 from tests.support.adversary import documents, edges, images, messages, requests, stored
 from tests.support.adversary.boundary import Boundary, Reader
 from tests.support.adversary.schema_values import value
@@ -309,7 +309,7 @@ _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))
 _NAMES = Reader((ValueError,), ("splatnode.capture.image_header", "splatnode.capture.film"))
 _ARGUMENTS = Reader((Refused,), ("splatnode.capture.process.arguments", "splatnode.capture.process.text"))
 _REQUESTS = Reader((Refused,), (f"{_WEB}.server", f"{_WEB}.access"))
-_SHOWN = Reader((ValueError,), (f"{_WEB}.content", "splatnode.viewer.text"))
+_SHOWN = Reader((ValueError,), (f"{_WEB}.content", "splatnode.viewer.session"))
 _KEYS = Reader((ValueError, NotOwnerOnly), (f"{_WEB}.access",))
 
 DOCUMENTS = (

@@ -9,7 +9,7 @@ import stat
 import pytest
 
 from splatnode.capture.process.files import NotOwnerOnly
-from splatnode.viewer.web.server import Access, invitation, load_or_create_key, new_key, resolve_address
+from splatnode.viewer.web import Access, invitation, load_or_create_key, new_key, resolve_address
 
 KEY = "k" * 43
 

@@ -15,7 +15,7 @@ from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.viewer.shapes import paint_gaussians
 from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import BACKGROUND, ViewerState, Viewpoint, look_at, move_to_camera, orbit, pan, zoom
-from splatnode.viewer.web.server import ListenAddress, describe_session, make_content, open_server
+from splatnode.viewer.web import ListenAddress, describe_session, make_content, open_server
 from tests.bench.viewer.drive_web import WINDOW, drive, fact, settle, watched
 from tests.support.chromium import NAMES, browser, chromium
 from tests.viewer.test_scene import camera, moment, wall

@@ -18,18 +18,10 @@ import pytest
 from splatnode.capture.frame import DroppedFrame
 from splatnode.recon.result.export.formats.splat import decode
 from splatnode.recon.result.verdict import Bounds, Code, Scale, Verdict, make_ball
+from splatnode.viewer import web as server_module
 from splatnode.viewer.sources import FixedSource
 from splatnode.viewer.state import Moment
-from splatnode.viewer.web import server as server_module
-from splatnode.viewer.web.server import (
-    Board,
-    Content,
-    ListenAddress,
-    Server,
-    describe_session,
-    make_content,
-    open_server,
-)
+from splatnode.viewer.web import Board, Content, ListenAddress, Server, describe_session, make_content, open_server
 from tests.capture.messaging.test_sockets import wait_for
 from tests.viewer.test_scene import camera, moment, wall
 

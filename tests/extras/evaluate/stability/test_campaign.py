@@ -20,7 +20,7 @@ from splatnode.command_line import build_parser
 from splatnode.extras.evaluate.stability.campaign import Plan, run_campaign
 from splatnode.extras.evaluate.stability.perturbations import ScenesByMotion, TrialImage
 from splatnode.extras.evaluate.stability.trial import Demand, MatrixRow, TrialCase, find_method, make_accept_case
-from splatnode.extras.jobs.calls import engine, usable_cores
+from splatnode.extras.jobs import engine, usable_cores
 from splatnode.recon.result.verdict import Code
 from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places
@@ -122,7 +122,7 @@ def test_one_core_and_two_give_the_same(tmp_path, places):
 DRIVER = """
 import sys
 from pathlib import Path
-from splatnode.extras.jobs.calls import engine
+from splatnode.extras.jobs import engine
 from tests.extras.evaluate.stability.test_campaign import noted
 with engine(1, None) as on:
     noted(Path(sys.argv[1]), on)

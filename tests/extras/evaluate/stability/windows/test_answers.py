@@ -26,7 +26,7 @@ from splatnode.extras.evaluate.stability.windows import (
     judge_window,
     select_keys,
 )
-from splatnode.extras.jobs.calls import usable_cores
+from splatnode.extras.jobs import usable_cores
 from splatnode.recon import estimation
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import prepare

@@ -31,7 +31,7 @@ from splatnode.extras.evaluate.stability.window_campaign import (
     tally_rows,
 )
 from splatnode.extras.evaluate.stability.windows import Window, WindowAnswer, WindowOutcome, WindowRow
-from splatnode.extras.jobs.calls import engine, usable_cores
+from splatnode.extras.jobs import engine, usable_cores
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places
@@ -193,7 +193,7 @@ def test_a_window_that_fails_costs_only_itself(tmp_path, monkeypatch, capsys):
 DRIVER = """
 import sys
 from pathlib import Path
-from splatnode.extras.jobs.calls import engine
+from splatnode.extras.jobs import engine
 from tests.extras.evaluate.stability.windows.test_campaign import third_slow_at_first
 with engine(1, None) as on:
     third_slow_at_first(Path(sys.argv[1]), on)

@@ -39,7 +39,7 @@ def read(path) -> dict[str, dict[str, Any]]:
 
 def test_without_rerun_it_says_what_to_install(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.delitem(sys.modules, "splatnode.extras.formats.rerun", raising=False)
+    monkeypatch.delitem(sys.modules, "splatnode.extras.viewers.rerun", raising=False)
     monkeypatch.delattr(export, "rerun", raising=False)  # a test that ran before may have loaded it
     with pytest.raises(ModuleNotFoundError) as lacking:
         export_scene(folder, "rrd", tmp_path / "scene.rrd")

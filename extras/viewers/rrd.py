@@ -10,6 +10,6 @@ DEFAULT_NAME = "scene.rrd"
 
 def export(result: StoredResult) -> bytes:
     """Raises ModuleNotFoundError without rerun."""
-    from splatnode.extras.formats import rerun  # takes a second, and is an extra
+    from splatnode.extras.viewers import rerun  # takes a second, and is an extra
 
     return rerun.encode_recording(load_full_snapshot(result))

@@ -1,1 +1,0 @@
-"""Export formats of other viewers: Foxglove and rerun."""
