@@ -13,10 +13,10 @@ import msgspec
 from splatnode.capture.process.config_keys import Internal
 from splatnode.recon.result.verdict import Code, Verdict
 
-# The limits of the verdict. Those without a measurement behind them say so.
-
 
 class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The limits of the verdict. Those without a measurement behind them say so."""
+
     # Before registration: frames and their pairs.
     min_cameras: Internal[int] = 2  # fewest cameras of a scene
     min_features: Internal[int] = 150  # fewest features of a frame that has enough texture

@@ -425,7 +425,7 @@ MUTANTS = (
         ),
         (
             "held out: the rim counts",
-            "shown = screening.valid_rectangle(valid)",
+            "shown = keyframes.valid_rectangle(valid)",
             "shown = (slice(0, valid.shape[0]), slice(0, valid.shape[1]))",
         ),
         (

@@ -69,7 +69,6 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.recon.former_names",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.verbs",
-        "splatnode.recon.verbs",
         "splatnode.viewer.former_names",
         "splatnode.viewer.verbs",
     ]
@@ -89,7 +88,6 @@ def test_a_verb_of_the_core_loads_no_plug_in():
     loaded = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).split()
     assert loaded == [
         "splatnode.capture.verbs",
-        "splatnode.recon.verbs",
         "splatnode.recon.verbs",
         "splatnode.viewer.verbs",
     ]
