@@ -22,7 +22,6 @@ from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, report_items
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import threads
-from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import (
     Reconstruction,
@@ -36,13 +35,13 @@ from splatnode.recon.estimation import (
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import screen_all
-from splatnode.recon.matching.dynamic_objects import mask_moving_objects
-from splatnode.recon.matching.view_graph import ViewGraph, match
+from splatnode.recon.matching.view_graph import ViewGraph, mask_moving_objects, match
 from splatnode.recon.metric.depth_fit import describe_doubtful_units
 from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, check_frame, gather_evidence
 from splatnode.recon.modelling import (
     create_coarse_preview,
     create_initial_scene,
+    find_budget_hits,
     prepare_scene_for_display,
     refine_scene,
     snapshot,

@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians, write_files
-from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.limits import Box, Selection
-from splatnode.recon.result.export.stored import SOURCES, encode_sources
+from splatnode.recon.result.export.stored import SOURCES, encode_cameras, encode_sources
 from splatnode.recon.result.snapshot import SHELL, GaussianArrays, find_confirmed
 from splatnode.viewer.shapes import Colour, Lines
 from splatnode.viewer.state import Moment, Span

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from splatnode.recon.result.npz_files import format_percent
 from splatnode.recon.result.snapshot import CameraEstimate, format_camera_bounds, format_widest_bounds
+from splatnode.recon.result.stored_snapshot import format_percent
 from splatnode.viewer.analysis import Advice
 from splatnode.viewer.shapes import Ground, format_length
 from splatnode.viewer.state import History, Moment, ViewerState, moment_index

@@ -48,8 +48,8 @@ from splatnode.recon.registration import bundle_adjustment, multiview_geometry
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.npz_files import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS, read_landmarks
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
+from splatnode.recon.result.stored_snapshot import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS, read_landmarks
 from splatnode.recon.result.verdict import Bounds
 
 # The landmarks of a scene: gathered from its matches and its verified cameras.

@@ -18,7 +18,6 @@ from splatnode.recon import core
 from splatnode.recon.result.export.limits import sanitize_gaussians
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.export.staged import hold_result_folder
-from splatnode.recon.result.npz_files import LANDMARKS, read_depths, read_landmarks
 from splatnode.recon.result.placement import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import (
@@ -28,7 +27,7 @@ from splatnode.recon.result.snapshot import (
     find_camera_problem,
     find_confirmed,
 )
-from splatnode.recon.result.stored_snapshot import read_result
+from splatnode.recon.result.stored_snapshot import LANDMARKS, read_depths, read_landmarks, read_result
 from splatnode.recon.result.submap_index import is_map_set
 from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict, compute_covariance
 

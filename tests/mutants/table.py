@@ -588,7 +588,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/free_space.py",
+        "recon/daemon/relocalization.py",
         ("a map of a lost robot is told", "        if state is ReconState.LOST:\n            return LOST\n", ""),
     ),
     *_list_mutants(
@@ -686,7 +686,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "export",
-        "recon/result/export/cameras.py",
+        "recon/result/export/stored.py",
         (
             "two cameras of one name are read",
             "if len({camera.name for camera in cameras}) < len(cameras):",

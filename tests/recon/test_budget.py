@@ -6,8 +6,8 @@ import msgspec
 import pytest
 import torch
 
-from splatnode.recon.budget import STAYS, find_budget_hits, loss_fall
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.modelling import STAYS, find_budget_hits, loss_fall
 from splatnode.recon.optimize import training
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.scene.scene import Gaussians, Scene

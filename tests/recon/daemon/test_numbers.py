@@ -11,11 +11,10 @@ from msgspec.structs import replace
 
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
 from splatnode.capture.messaging.wire import WireError
-from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
-from splatnode.recon.daemon.free_space import OccupancyResult
 from splatnode.recon.daemon.node import Daemon
 from splatnode.recon.daemon.output import PublishedSnapshot
-from splatnode.recon.daemon.relocalization import FinalScene
+from splatnode.recon.daemon.relocalization import FinalScene, OccupancyResult
+from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.occupancy.grid import MapHeader
 from splatnode.recon.result.message import SceneHeader
