@@ -40,10 +40,9 @@ from splatnode.recon.modelling import (
     snapshot,
 )
 from splatnode.recon.optimize import training
-from splatnode.recon.priors.pointmap import Pointmap, apply_image_masks
+from splatnode.recon.priors import Pointmap, apply_image_masks
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene import growth
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene, growth
 from splatnode.recon.threads import Clock, OutOfTime, Timer
 
 REMEMBERED = 8  # estimates: a keyframe that is tried with each of several others, and taken back

@@ -66,8 +66,8 @@ from splatnode.recon.result.stored_snapshot import (
 )
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry, group_edges, read_map_set, walk_edges
 from splatnode.recon.result.verdict import SURE, TWO_SIDED_95, Code, ReferenceFrame, Scale, Up, Verdict
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.scene.background import SHELL
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,18 +19,17 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.keyframes import valid_masks
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.training import examine, single_torch_thread, start_watch
-from splatnode.recon.priors.pointmap import Pointmap, compute_consistent_depths
+from splatnode.recon.priors import Pointmap, compute_consistent_depths
 from splatnode.recon.rasterize.dispatch import choose_device
 from splatnode.recon.registration.registration import undistort_keyframes
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, InGivenWorld, OnRig, Snapshot
 from splatnode.recon.result.stored_snapshot import append_consistent_depth
 from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.scene import Scene, growth, transients
 from splatnode.recon.scene import exposure as scene_exposure
-from splatnode.recon.scene import growth, transients
 from splatnode.recon.scene.exposure import compute_exposure_priors
 from splatnode.recon.scene.initialization import create_coarse_scene, initialize_scene
-from splatnode.recon.scene.scene import Scene
 
 # Budgets: which of the limits that were asked for bound a scene, and what more would buy.
 

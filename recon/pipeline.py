@@ -46,12 +46,12 @@ from splatnode.recon.modelling import (
     refine_scene,
     snapshot,
 )
-from splatnode.recon.priors.pointmap import Prior
+from splatnode.recon.priors import Prior
 from splatnode.recon.replay_source import IMAGES, Source
 from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from splatnode.recon.threads import Clock
 
 log = logging.getLogger(__name__)

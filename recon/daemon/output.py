@@ -22,7 +22,7 @@ from splatnode.capture.process.logs import event
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage, raise_shortage, resident_mb
 from splatnode.capture.process.text import guard_untrusted
-from splatnode.recon.daemon import checkpoint
+from splatnode.recon.daemon import SubmapStatus, checkpoint
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.pose_graph import (
@@ -35,13 +35,12 @@ from splatnode.recon.daemon.pose_graph import (
     transfer_edge,
 )
 from splatnode.recon.daemon.relocalization import NOT_FINAL, OccupancyResult
-from splatnode.recon.daemon.status import SubmapStatus
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.occupancy.grid import encode_map, no_map
+from splatnode.recon.occupancy import encode_map, no_map
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import SceneFileError, read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file

@@ -31,11 +31,11 @@ from splatnode.capture.process.config_keys import Internal
 from splatnode.capture.process.logs import Problems, event, is_logged
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon import poselib
-from splatnode.recon.daemon.status import ReconState
+from splatnode.recon.daemon import ReconState
 from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera
 from splatnode.recon.keyframes import PLAIN, Keyframe
 from splatnode.recon.matching import features
-from splatnode.recon.occupancy.grid import OccupancyMap, occupancy_map
+from splatnode.recon.occupancy import OccupancyMap, occupancy_map
 from splatnode.recon.registration.registration import undistort_pixels
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.rendering import render_arrays

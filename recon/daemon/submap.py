@@ -20,14 +20,13 @@ from splatnode.capture.process.system import is_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import checkpoint
+from splatnode.recon.daemon import ReconState, checkpoint
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
 from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output, SubmapState
 from splatnode.recon.daemon.relocalization import FinalScene
-from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore_cancel
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph

@@ -21,7 +21,7 @@ from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage, raise
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import checkpoint, ledger, submap
+from splatnode.recon.daemon import PLACES, SubmapStatus, checkpoint, ledger, submap
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
@@ -30,7 +30,6 @@ from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output, PublishedSnapshot, SubmapState
 from splatnode.recon.daemon.pose_graph import EdgeKind
 from splatnode.recon.daemon.relocalization import OccupancyMapper, OccupancyResult
-from splatnode.recon.daemon.status import PLACES, SubmapStatus
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
 from splatnode.recon.keyframes import Keyframe

@@ -24,8 +24,7 @@ from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.terminal import say
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
-from splatnode.recon.locating import pose_refinement, verification
-from splatnode.recon.locating.outcome import Located, NotLocated, Reason
+from splatnode.recon.locating import Located, NotLocated, Reason, pose_refinement, verification
 from splatnode.recon.locating.pose_refinement import (
     CameraModel,
     Correspondences,

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.terminal import say, show_waiting
-from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState, occupancy_map
+from splatnode.recon.occupancy import OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.result.export.result import MAPS, OF_A_MAP, make_entries, read_digests
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot

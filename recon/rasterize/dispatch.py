@@ -20,7 +20,7 @@ from splatnode.recon.result.rendering import (
     make_raster_input,
     raster_forward,
 )
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 
 # The rasteriser on the processor: autograd around the compiled core (recon/core).
 #

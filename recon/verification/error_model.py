@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from splatnode.capture.process.text import sanitize_text
+from splatnode.recon import verification
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.known_poses import Deviation, GivenWorld
 from splatnode.recon.registration.registration import Registration
@@ -32,10 +33,9 @@ from splatnode.recon.result.verdict import (
     find_widest,
     make_ball,
 )
-from splatnode.recon.verification import rejections
+from splatnode.recon.verification import DecisionConfig, refuse
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.refit import Errors
-from splatnode.recon.verification.rejections import DecisionConfig, refuse
 
 MIN_INLIER_RATIO = 0.05  # a camera with fewer counts as this: a logarithm is taken
 # At least so many times what the focal length leaves open within one standard error: two standard errors.
@@ -351,7 +351,7 @@ def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld
         raise ValueError("there must be a camera to be judged")
     if config.max_position_error_percent is not None and worst.centre_percent > config.max_position_error_percent:
         found = worst.centre_percent
-        return refuse(rejections.ROUGHER, sorted(bounds), found=found, needed=config.max_position_error_percent)
+        return refuse(verification.ROUGHER, sorted(bounds), found=found, needed=config.max_position_error_percent)
     placed = {camera.index for camera in registration.cameras}
     left_out = tuple(name for index, name in enumerate(graph.names) if index not in placed)
     count = f"{'All' if not left_out else f'{len(placed)} of'} {len(graph.names)} photographs were placed"

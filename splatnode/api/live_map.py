@@ -10,7 +10,7 @@ from splatnode.capture.messaging.network import RECON_MAP, Network
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.messaging.wire import WireError
 from splatnode.capture.process.logs import Problems, is_logged
-from splatnode.recon.occupancy.grid import MapHeader, OccupancyMap, decode_map
+from splatnode.recon.occupancy import MapHeader, OccupancyMap, decode_map
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from splatnode.api.photographs import Lens, Picture, apply_lens, load_frames
 from splatnode.capture.frame import Frame
 from splatnode.capture.odometry import rigid_problem
 from splatnode.capture.process.terminal import ignore_progress
+from splatnode.recon.locating import Located, NotLocated
 from splatnode.recon.locating.localize import follow, localize_image
-from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.result.snapshot import Landmarks
 
 Near: TypeAlias = "Located | NotLocated | npt.ArrayLike | None"

@@ -146,8 +146,8 @@ def _size(size: tuple[int, int]) -> tuple[int, int]:
 if TYPE_CHECKING:
     from splatnode.api.photographs import Lens, Picture
     from splatnode.api.window import Viewer
-    from splatnode.recon.locating.outcome import Located, NotLocated
-    from splatnode.recon.occupancy.grid import OccupancyMap
+    from splatnode.recon.locating import Located, NotLocated
+    from splatnode.recon.occupancy import OccupancyMap
     from splatnode.recon.result.snapshot import DepthCheck
 
 
@@ -291,7 +291,7 @@ class Result:
         direction of up in the world; None: the floor tells it, or the cameras, as `upright.source` says. Raises
         ValueError where no map can be made of the result, with the reason, or these are no size and no direction.
         """
-        from splatnode.recon.occupancy.grid import occupancy_map  # brings what carves
+        from splatnode.recon.occupancy import occupancy_map  # brings what carves
 
         return occupancy_map(self._snapshot, voxel, None if up is None else np.asarray(up, np.float64))
 

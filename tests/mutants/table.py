@@ -239,7 +239,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "depth",
-        "recon/priors/pointmap.py",
+        "recon/priors/__init__.py",
         (
             "world points are half a pixel off",
             "    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)\n    rays",

@@ -13,9 +13,9 @@ from splatnode.capture.frame import ExposureSettings, Intrinsics
 from splatnode.capture.messaging import messages, network, pubsub, wire
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.status import CaptureStatus
+from splatnode.recon.daemon import ReconState, ReconStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
-from splatnode.recon.daemon.status import ReconState, ReconStatus
-from splatnode.recon.occupancy.grid import MapHeader, MapRecord
+from splatnode.recon.occupancy import MapHeader, MapRecord
 from splatnode.recon.result.export import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code

@@ -13,11 +13,10 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.scene import background
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene, background
 from splatnode.recon.threads import Clock
 
 MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method

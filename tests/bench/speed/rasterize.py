@@ -32,7 +32,7 @@ from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.reference import CHANNELS
-from splatnode.recon.scene.scene import SH_C0
+from splatnode.recon.scene import SH_C0
 
 FLOPS_PER_PAIR = 117
 LRS = {"means": 1.6e-3, "quats": 1e-2, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh": 1e-1, "twist": 1e-4}

@@ -28,8 +28,8 @@ from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.node import Answer, Daemon, RemoveKeyframe
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.locating import Located
 from splatnode.recon.locating.localize import localize_image
-from splatnode.recon.locating.outcome import Located
 from splatnode.recon.optimize import training
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.staged import FolderInUse

@@ -10,11 +10,10 @@ import pytest
 from msgspec.structs import replace
 
 import splatnode
-from splatnode.recon.daemon import relocalization
+from splatnode.recon.daemon import ReconState, relocalization
 from splatnode.recon.daemon.relocalization import NOT_FINAL, FinalScene, OccupancyConfig, OccupancyMapper
-from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap import Abandoned
-from splatnode.recon.occupancy.grid import OccupancyMap
+from splatnode.recon.occupancy import OccupancyMap
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.recon.daemon.test_daemon import PATIENCE_S, Peer, config, finished, peer, running  # noqa: F401
 from tests.support.occupied import room_snapshot

@@ -18,9 +18,8 @@ from splatnode.capture.messaging import messages, pubsub
 from splatnode.capture.messaging.pubsub import Want
 from splatnode.capture.messaging.wire import Header
 from splatnode.capture.odometry import GivenPose, Gravity, Motion
-from splatnode.recon.daemon import node
-from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.grid import MapHeader
+from splatnode.recon.daemon import ReconStatus, node
+from splatnode.recon.occupancy import MapHeader
 from splatnode.recon.result.message import DepthHeader, SceneHeader
 
 SCHEMAS = [

@@ -46,7 +46,8 @@ def test_rasters_are_given_back():
     """The core keeps two idle rasters; many renders must not grow the process."""
     script = (
         "import resource, torch\n"
-        "from splatnode.recon.rasterize.dispatch import rasterize_on_cpu\nfrom tests.support.rasterize_cases import random_case\n"
+        "from splatnode.recon.rasterize.dispatch import rasterize_on_cpu\n"
+        "from tests.support.rasterize_cases import random_case\n"
         "tensors = random_case(0, count=2000).tensors(torch.float32)\n"
         "def peak():\n"
         "    for _ in range(30): rasterize_on_cpu(*tensors, width=640, height=480).rgb.mean().backward()\n"

@@ -11,7 +11,7 @@ import torch
 from splatnode.recon.optimize.control import OptimizerStep, adaptive, proximity
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss, TrainingImage
 from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 from tests.support.synthetic import tiny_scene
 
 K = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
