@@ -471,7 +471,7 @@ class SightingFailure:
     """Why it is not known where a camera stood."""
 
     photograph: str
-    code: str  # a Reason of recon/locating/outcome.py, MOVING or UNREADABLE
+    code: str  # a Reason of recon/locating/__init__.py, MOVING or UNREADABLE
     message: str
 
 

@@ -21,7 +21,7 @@ from splatnode.extras.audit import (
 from splatnode.extras.audit import audit as audited
 from splatnode.recon.locating.localize import check_lens
 from splatnode.recon.result.export.staged import json_bytes, write_file
-from splatnode.recon.result.npz_files import read_landmarks
+from splatnode.recon.result.stored_snapshot import read_landmarks
 
 _MOST_LINES = 3  # of one camera for one reason; of more recordings the first is told, and how many there are
 _MOST_NAMES = 8  # of cameras, in one line

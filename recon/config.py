@@ -19,7 +19,7 @@ from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.registration import registration
-from splatnode.recon.result import npz_files
+from splatnode.recon.result import stored_snapshot
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians
 from splatnode.recon.scene import background as scene_background
 from splatnode.recon.scene import exposure, initialization, transients
@@ -86,7 +86,7 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     # Images of several cameras were taken together, as a frame set, where their times are no further apart; seconds
     frame_set_tolerance_s: Annotated[float, Meta(gt=0, le=10)] = TOLERANCE_S
     # From how much depth that other views confirm a scene counts as seen, also away from the cameras
-    consistent_depth: Internal[npz_files.ConsistentDepthConfig] = npz_files.ConsistentDepthConfig()
+    consistent_depth: Internal[stored_snapshot.ConsistentDepthConfig] = stored_snapshot.ConsistentDepthConfig()
     # At most so many in the scene; None: as many as it calls for
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets

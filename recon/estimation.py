@@ -18,22 +18,24 @@ from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.depth_fit import fill_measured_depth
-from splatnode.recon.priors.pointmap import Pointmap, Prior, apply_image_masks
+from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
 from splatnode.recon.rasterize.dispatch import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
 from splatnode.recon.registration.posed_mapping import offset_of, register_posed
-from splatnode.recon.registration.registration import Registration, register
+from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
-from splatnode.recon.registration.undistortion import undistort_keyframes
 from splatnode.recon.result.snapshot import Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Verdict
 from splatnode.recon.threads import make_deadline_pause
-from splatnode.recon.verification.claims import compute_placed_bounds, compute_posed_bounds, decide_posed, describe_rig
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.error_model import (
     compute_log_odds,
+    compute_placed_bounds,
+    compute_posed_bounds,
+    decide_posed,
+    describe_rig,
     make_evidence_record,
     predict_bounds,
     shape_bounds,

@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import (
     Reconstruction,
@@ -29,22 +28,21 @@ from splatnode.recon.estimation import (
 )
 from splatnode.recon.fallbacks import make_fallback_key, run_fallbacks
 from splatnode.recon.keyframes import Keyframe, Rejected, ScreeningState
-from splatnode.recon.matching.dynamic_objects import mask_moving_objects
-from splatnode.recon.matching.view_graph import ViewGraph, match_newest, match_pending
+from splatnode.recon.matching.view_graph import ViewGraph, mask_moving_objects, match_newest, match_pending
 from splatnode.recon.metric.depth_fit import fill_measured_depth
 from splatnode.recon.modelling import (
     SceneWithVerdict,
     create_initial_scene,
+    find_budget_hits,
     format_snapshot,
     prepare_scene_for_display,
     refine_scene,
     snapshot,
 )
 from splatnode.recon.optimize import training
-from splatnode.recon.priors.pointmap import Pointmap, apply_image_masks
+from splatnode.recon.priors import Pointmap, apply_image_masks
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene import growth
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene, growth
 from splatnode.recon.threads import Clock, OutOfTime, Timer
 
 REMEMBERED = 8  # estimates: a keyframe that is tried with each of several others, and taken back

@@ -45,7 +45,6 @@ from splatnode.recon.result.levels_of_detail import (
     make_detail_levels,
     make_levels_record,
 )
-from splatnode.recon.result.npz_files import DEPTHS, encode_depths, read_depths
 from splatnode.recon.result.placement import Placement, matrices_from_quats
 from splatnode.recon.result.rendering import NEAR, render_arrays
 from splatnode.recon.result.report import (
@@ -56,11 +55,19 @@ from splatnode.recon.result.report import (
     render_camera,
 )
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, format_rounded_up
-from splatnode.recon.result.stored_snapshot import SHELL_PIECE, make_merged_path, make_piece_name, read_up
+from splatnode.recon.result.stored_snapshot import (
+    DEPTHS,
+    SHELL_PIECE,
+    encode_depths,
+    make_merged_path,
+    make_piece_name,
+    read_depths,
+    read_up,
+)
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry, group_edges, read_map_set, walk_edges
 from splatnode.recon.result.verdict import SURE, TWO_SIDED_95, Code, ReferenceFrame, Scale, Up, Verdict
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.scene.background import SHELL
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 
 
 @dataclass(frozen=True, eq=False)

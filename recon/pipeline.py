@@ -21,7 +21,6 @@ from splatnode.capture.lenses import is_resampled
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, notify, report_items
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import threads
-from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import (
     Reconstruction,
@@ -35,23 +34,23 @@ from splatnode.recon.estimation import (
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import screen_all
-from splatnode.recon.matching.dynamic_objects import mask_moving_objects
-from splatnode.recon.matching.view_graph import ViewGraph, match
+from splatnode.recon.matching.view_graph import ViewGraph, mask_moving_objects, match
 from splatnode.recon.metric.depth_fit import describe_doubtful_units
 from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, check_frame, gather_evidence
 from splatnode.recon.modelling import (
     create_coarse_preview,
     create_initial_scene,
+    find_budget_hits,
     prepare_scene_for_display,
     refine_scene,
     snapshot,
 )
-from splatnode.recon.priors.pointmap import Prior
+from splatnode.recon.priors import Prior
 from splatnode.recon.replay_source import IMAGES, Source
 from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from splatnode.recon.threads import Clock
 
 log = logging.getLogger(__name__)

@@ -20,9 +20,9 @@ from splatnode.capture.process.terminal import Tell, ignore_progress
 from splatnode.recon import core
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.locating import Located, NotLocated
 from splatnode.recon.locating.localize import localize_image
-from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.occupancy.grid import NoMap, occupancy_map
+from splatnode.recon.occupancy import NoMap, occupancy_map
 from splatnode.recon.pipeline import rebuild_from_scratch
 from splatnode.recon.result.snapshot import Landmarks
 

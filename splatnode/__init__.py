@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from splatnode.capture.depth_image import DepthImage, DepthNoise, make_depth_image
     from splatnode.capture.frame import Intrinsics
     from splatnode.capture.process.terminal import InputWarning
-    from splatnode.recon.locating.outcome import Located, NotLocated
-    from splatnode.recon.occupancy.grid import OccupancyMap
+    from splatnode.recon.locating import Located, NotLocated
+    from splatnode.recon.occupancy import OccupancyMap
     from splatnode.recon.result.verdict import Verdict
 
 __all__ = [
@@ -53,13 +53,13 @@ _MODULES = {
     "DepthNoise": "splatnode.capture.depth_image",
     "InputWarning": "splatnode.capture.process.terminal",
     "Intrinsics": "splatnode.capture.frame",
-    "Located": "splatnode.recon.locating.outcome",
+    "Located": "splatnode.recon.locating",
     "Marker": "splatnode.api.reconstruct",
     "Node": "splatnode.api.node",
     "NodeMap": "splatnode.api.node",
     "NodeUpdate": "splatnode.api.node",
-    "NotLocated": "splatnode.recon.locating.outcome",
-    "OccupancyMap": "splatnode.recon.occupancy.grid",
+    "NotLocated": "splatnode.recon.locating",
+    "OccupancyMap": "splatnode.recon.occupancy",
     "Published": "splatnode.api.publisher",
     "Publisher": "splatnode.api.publisher",
     "RefusedImage": "splatnode.api.publisher",

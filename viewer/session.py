@@ -10,11 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians, write_files
-from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.limits import Box, Selection
-from splatnode.recon.result.export.stored import SOURCES, encode_sources
-from splatnode.recon.result.npz_files import format_percent
+from splatnode.recon.result.export.stored import SOURCES, encode_cameras, encode_sources
 from splatnode.recon.result.snapshot import (
     SHELL,
     CameraEstimate,
@@ -23,6 +21,7 @@ from splatnode.recon.result.snapshot import (
     format_camera_bounds,
     format_widest_bounds,
 )
+from splatnode.recon.result.stored_snapshot import format_percent
 from splatnode.viewer.analysis import Advice, Analysis, Analyst, Support, colour_gaussians
 from splatnode.viewer.shapes import (
     Colour,

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from splatnode.capture.messaging.network import RECON_DEPTH, RECON_SCENE, RECON_STATUS, Network
 from splatnode.capture.messaging.pubsub import StateClient, Subscriber
 from splatnode.capture.process.terminal import Problems, is_logged
-from splatnode.recon.daemon.status import ReconStatus
+from splatnode.recon.daemon import ReconStatus
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians
 from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.recon.result.levels_of_detail import concatenate_gaussians, find_far_shell, make_detail_levels

@@ -36,8 +36,8 @@ from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import read_bounded
 from splatnode.capture.process.text import LONGEST_TEXT, guard_untrusted, sanitize_text
 from splatnode.recon.result.export import read_cameras
-from splatnode.recon.result.export.cameras import Number, Row3, Row4, encode_cameras
 from splatnode.recon.result.export.staged import write_files
+from splatnode.recon.result.export.stored import Number, Row3, Row4, encode_cameras
 from splatnode.recon.result.placement import matrices_from_quats
 from splatnode.recon.result.snapshot import CameraEstimate, find_camera_problem
 from splatnode.recon.threads import map_parallel

@@ -20,13 +20,12 @@ from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize import ensemble, regularizers, training
 from splatnode.recon.optimize.losses import LossChoice, depth, normal, point_render, semantic
 from splatnode.recon.pipeline import estimate_frames, model_scene, reconstruct
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.rasterize.dispatch import Device
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.scene import background, initialization
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene, background, initialization
 from splatnode.recon.threads import Clock
 
 # The methods that a benchmark compares, by name: our presets, and others as configurations of the same engine.

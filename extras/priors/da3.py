@@ -42,8 +42,7 @@ from splatnode.recon.networks.vit import (
     normalize_image,
 )
 from splatnode.recon.networks.weights import find
-from splatnode.recon.priors.monocular import make_registered_pointmap
-from splatnode.recon.priors.pointmap import Pointmap, Prior
+from splatnode.recon.priors import Pointmap, Prior, make_registered_pointmap
 from splatnode.recon.registration.registration import Registration
 
 # Depth Anything 3's transformer: DINOv2, of which every second block of the later ones looks at all views at once.

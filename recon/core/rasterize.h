@@ -38,7 +38,7 @@ enum Channel { kRgb = 1, kDepth = 2, kNormal = 4, kAlpha = 8 };
 // What a splat carries to the pixels: 0-2 colour, 3 depth, 4-6 normal.
 constexpr int kFeatures = 7;
 
-// ---- What crosses the C interface (mirrored in recon/rasterize/native.py) -------------------------------------------
+// ---- What crosses the C interface (mirrored in recon/result/rendering.py) -------------------------------------------
 struct RasterInput {
     int32_t num_gaussians, sh_bases, width, height, antialias, channels;
     float near_plane;

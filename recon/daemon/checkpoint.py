@@ -65,12 +65,11 @@ from splatnode.recon.keyframes import Features, Keyframe, ScreeningState
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import prepare_scene_for_display
-from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.registration.undistortion import undistort_keyframe
+from splatnode.recon.priors import Pointmap
+from splatnode.recon.registration.registration import RegisteredCamera, Registration, undistort_keyframe
 from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.scene import exposure as scene_exposure
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.verification.evidence import Evidence
 
 log = logging.getLogger(__name__)

@@ -10,8 +10,8 @@ import msgspec
 from splatnode.capture.messaging.network import Network
 from splatnode.recon import former_names
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
-from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.ingest import FrameSetConfig
+from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.result.message import MAX_CAMERAS
 

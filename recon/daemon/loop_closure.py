@@ -20,8 +20,8 @@ from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import checkpoint, ledger
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import CheckpointError
+from splatnode.recon.daemon.output import SubmapIndex
 from splatnode.recon.daemon.pose_graph import EdgeKind, PoseGraphEdge, make_loop_edge
-from splatnode.recon.daemon.submap_index import SubmapIndex
 from splatnode.recon.estimation import estimate_cameras, load_prior
 from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching import pair_matching

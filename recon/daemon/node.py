@@ -62,13 +62,12 @@ from splatnode.capture.process.terminal import (
 )
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.config import apply_changes
+from splatnode.recon.daemon import ReconState, ReconStatus
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
-from splatnode.recon.daemon.relocalization import Watcher
-from splatnode.recon.daemon.status import ReconState, ReconStatus
+from splatnode.recon.daemon.relocalization import NOT_FINAL, OccupancyResult, Watcher
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot

@@ -11,7 +11,9 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -26,14 +28,19 @@ from splatnode.capture.messaging.messages import Message
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.process.config import Internal
+from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.recon import poselib
+from splatnode.recon.daemon import ReconState
 from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera
 from splatnode.recon.keyframes import PLAIN, Keyframe
 from splatnode.recon.matching import features
-from splatnode.recon.registration.undistortion import undistort_pixels
+from splatnode.recon.occupancy import OccupancyMap, occupancy_map
+from splatnode.recon.registration.registration import undistort_pixels
+from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.stored_snapshot import read_depths
 
 Array = npt.NDArray[np.float64]
 
@@ -389,3 +396,78 @@ class Watcher:
 def scale_intrinsics(camera: CameraEstimate, width: int, height: int) -> npt.NDArray[np.float64]:
     """(3, 3) intrinsic matrix of the same camera's image resized to `width` x `height`."""
     return np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+
+
+# The map of the present scene: which space is free, occupied, or not seen; made in spare moments, of final scenes.
+
+
+NOT_FINAL = "a map is made of a scene that is final: when no keyframe has come for a while"
+LOST = "the last keyframes do not belong to the scene: where the robot is now is not known"
+
+
+class OccupancyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    live: bool = False  # send the map of each scene that is final, as the service recon.map
+    # Side of a voxel, in the unit of the scene; nothing: as `splatnode occupancy` chooses it
+    voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyResult:
+    """The occupancy map of a scene, or the reason why there is none."""
+
+    of: FinalScene
+    occupancy: OccupancyMap | None
+    why: str = ""  # there is none
+
+
+class OccupancyMapper:
+    """Maps the present scene. `map_scene` is for the thread that works; any thread may ask for `find_current_map`."""
+
+    def __init__(self, config: OccupancyConfig) -> None:
+        self._config = config
+        self._made: OccupancyResult | None = None
+
+    def map_scene(
+        self, finished: FinalScene | None, state: ReconState, folder: Path, pause: Callable[[], None]
+    ) -> bool:
+        """Maps the final scene, of which `folder` is the result; False where there was nothing to do.
+
+        What `pause` raises ends the work.
+        """
+        if not self._config.live or finished is None or state is ReconState.LOST or self._is_map_of(finished):
+            return False
+        try:
+            snapshot = _add_depths(finished.snapshot, folder)
+            occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=pause), ""
+        except ValueError as error:
+            occupancy, why = None, str(error)
+        self._made = OccupancyResult(finished, occupancy, why)
+        shares = {} if occupancy is None else {name: round(share, 4) for name, share in occupancy.shares.items()}
+        event(log, logging.INFO, "map", why=why, **shares)
+        return True
+
+    def find_current_map(self, finished: FinalScene | None, state: ReconState) -> OccupancyResult | str:
+        """The map of this scene as it is now, or why there is none."""
+        if state is ReconState.LOST:
+            return LOST
+        made = self._made
+        return made if made is not None and made.of is finished else NOT_FINAL
+
+    def _is_map_of(self, finished: FinalScene) -> bool:
+        return self._made is not None and self._made.of is finished
+
+
+def _add_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
+    """Adds the multi-view consistent depths, from the result folder if an earlier process made the scene."""
+    if snapshot.depths or not folder.is_dir():
+        return snapshot
+    try:
+        depths, written = read_depths(folder), read_cameras(folder / "cameras.json")
+    except (OSError, ValueError) as error:
+        raise_shortage(error)
+        log.warning("the depths in %s cannot be read: %s", folder, error)
+        return snapshot
+    poses = {camera.name: camera.T_world_camera for camera in written}
+    ours = [(camera.T_world_camera, poses.get(camera.name)) for camera in snapshot.cameras]
+    same = all(pose is not None and np.allclose(shown, pose, rtol=0, atol=1e-6) for shown, pose in ours)
+    return replace(snapshot, depths=depths) if same else snapshot

@@ -20,15 +20,13 @@ from splatnode.capture.process.terminal import event
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import checkpoint, submap_index
+from splatnode.recon.daemon import ReconState, checkpoint
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
 from splatnode.recon.daemon.loop_closure import LoopDetector
-from splatnode.recon.daemon.output import Output
+from splatnode.recon.daemon.output import Output, SubmapState
 from splatnode.recon.daemon.relocalization import FinalScene
-from splatnode.recon.daemon.status import ReconState
-from splatnode.recon.daemon.submap_index import SubmapState
 from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore_cancel
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -437,7 +435,7 @@ class ActiveSubmap:
         before, kept = self._store.scene_id, self._store.names_before(first).union(shared)
         if self._final.names != kept:
             self._output.save(self._store, self._work, final=False)
-            self._export_provisionally(submap_index.SubmapState.LEFT, kept)
+            self._export_provisionally(SubmapState.LEFT, kept)
         else:
             self._output.mark_finished(before)
         self._store.leave_submap(first, shared)
@@ -447,13 +445,13 @@ class ActiveSubmap:
     def export_provisionally(self) -> None:
         """Writes what is shown, unless it was written as final."""
         if not self.retry_write(at_once=True):
-            self._export_provisionally(submap_index.SubmapState.HERE, self._store.names)
+            self._export_provisionally(SubmapState.HERE, self._store.names)
 
     def retry_write(self, at_once: bool = False) -> bool:
         """Writes the finished scene that the disk did not take; False where there is none, or it was tried just now."""
         return self._final.retry_write(self._shown, self._work, at_once)
 
-    def _export_provisionally(self, state: submap_index.SubmapState, names: Collection[str]) -> None:
+    def _export_provisionally(self, state: SubmapState, names: Collection[str]) -> None:
         """`names` are those of the place's keyframes."""
         self._exported_s = time.monotonic()
         if self._shown is None or self._shown.final:
@@ -567,7 +565,7 @@ class ActiveSubmap:
         if shown:
             self._final.write(snapshot, self._work)
         else:
-            self._output.update_index(snapshot, submap_index.SubmapState.HERE, sorted(self._store.names))
+            self._output.update_index(snapshot, SubmapState.HERE, sorted(self._store.names))
         self.state = ReconState.WAITING if not shown else ReconState.LOST if self._find_untracked() else ReconState.IDLE
         give_back_memory()
 

@@ -21,16 +21,15 @@ from splatnode.capture.process.terminal import event
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import checkpoint, ledger, submap, submap_index
+from splatnode.recon.daemon import PLACES, SubmapStatus, checkpoint, ledger, submap
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
 from splatnode.recon.daemon.ledger import CheckpointError
 from splatnode.recon.daemon.loop_closure import LoopDetector
-from splatnode.recon.daemon.output import Output, PublishedSnapshot
+from splatnode.recon.daemon.output import Output, PublishedSnapshot, SubmapState
 from splatnode.recon.daemon.pose_graph import EdgeKind
-from splatnode.recon.daemon.status import PLACES, SubmapStatus
+from splatnode.recon.daemon.relocalization import OccupancyMapper, OccupancyResult
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
 from splatnode.recon.keyframes import Keyframe
@@ -404,7 +403,7 @@ class InactiveSubmaps:
                 return self._finalize(store, found, pause)
             work.update(pause)
             snapshot = work.snapshot(store.frames_dropped, final=False)
-            if not self._output.export(snapshot, work, store, submap_index.SubmapState.LEFT, work.names):
+            if not self._output.export(snapshot, work, store, SubmapState.LEFT, work.names):
                 return False
             self._output.save(store, work, final=False)
         work.release_scene()  # the checkpoint has it, and comparing takes memory, too
@@ -448,7 +447,7 @@ class InactiveSubmaps:
             work.show(_refine_to_end(work, self._config, pause))
             work.estimate_soon(pause)
             snapshot = work.snapshot(store.frames_dropped, final=True)
-            if not self._output.export(snapshot, work, store, submap_index.SubmapState.FINISHED, work.names):
+            if not self._output.export(snapshot, work, store, SubmapState.FINISHED, work.names):
                 return False
             self._output.save(store, work, final=True)
         if work.scene is None:  # one that is refused is of no use later

@@ -23,8 +23,7 @@ from splatnode.capture.lenses import assign_lens, check_fits, read_lens, same_as
 from splatnode.capture.process.terminal import say
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
-from splatnode.recon.locating import pose_refinement, verification
-from splatnode.recon.locating.outcome import Located, NotLocated, Reason
+from splatnode.recon.locating import Located, NotLocated, Reason, pose_refinement, verification
 from splatnode.recon.locating.pose_refinement import (
     CameraModel,
     Correspondences,
@@ -47,8 +46,8 @@ from splatnode.recon.registration import bundle_adjustment, multiview_geometry
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.export.stored import StoredResult
-from splatnode.recon.result.npz_files import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS, read_landmarks
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
+from splatnode.recon.result.stored_snapshot import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS, read_landmarks
 from splatnode.recon.result.verdict import Bounds
 
 # The landmarks of a scene: gathered from its matches and its verified cameras.

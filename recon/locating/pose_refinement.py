@@ -20,7 +20,7 @@ from splatnode.recon import poselib
 from splatnode.recon.geometry import cross_matrix, distortion
 from splatnode.recon.geometry import undistort_rays as straight
 from splatnode.recon.keyframes import PLAIN, Features
-from splatnode.recon.locating.outcome import NORMAL_95, LensSource, Located
+from splatnode.recon.locating import NORMAL_95, LensSource, Located
 from splatnode.recon.matching import features as matching_features
 from splatnode.recon.registration import multiview_geometry
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks

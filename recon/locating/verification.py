@@ -13,8 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.keyframes import REFERENCE_SIDE
-from splatnode.recon.locating import pose_refinement
-from splatnode.recon.locating.outcome import NORMAL_95, LensSource, LocalizationBounds, NotLocated, Reason
+from splatnode.recon.locating import NORMAL_95, LensSource, LocalizationBounds, NotLocated, Reason, pose_refinement
 from splatnode.recon.locating.pose_refinement import (
     POSE,
     CameraFit,

@@ -22,7 +22,7 @@ from splatnode.capture.lenses import project, unproject
 from splatnode.capture.process.text import sanitize_name
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.pointmap import LEAST_CONFIDENCE, Pointmap, compute_depth_normals
+from splatnode.recon.priors import LEAST_CONFIDENCE, Pointmap, compute_depth_normals
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.snapshot import DepthCheck, DepthCode
 from splatnode.recon.threads import map_parallel

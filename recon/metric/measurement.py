@@ -18,7 +18,7 @@ import numpy.typing as npt
 from splatnode.capture.aruco import DICTIONARIES
 from splatnode.capture.frame import MOTION_DRIFT, MOTION_SIGMA_DEG, Gravity
 from splatnode.recon.geometry import distortion, undistort_rays
-from splatnode.recon.registration.undistortion import radial_of
+from splatnode.recon.registration.registration import radial_of
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import TWO_SIDED_95, FrameChoice
 

@@ -42,7 +42,7 @@ from splatnode.recon.metric.stereo import (
     make_own_pair,
 )
 from splatnode.recon.networks.depth_anything import load_metric
-from splatnode.recon.occupancy.grid import TILT, UNSURE_DEG, find_floor, level
+from splatnode.recon.occupancy import TILT, UNSURE_DEG, find_floor, level
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.snapshot import (
     DepthCheck,

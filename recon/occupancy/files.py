@@ -16,12 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.terminal import say, show_waiting
-from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState, occupancy_map
+from splatnode.recon.occupancy import OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.result.export.result import MAPS, OF_A_MAP, make_entries, read_digests
 from splatnode.recon.result.export.staged import json_bytes, write_files
-from splatnode.recon.result.npz_files import read_depths
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.stored_snapshot import read_result
+from splatnode.recon.result.stored_snapshot import read_depths, read_result
 from splatnode.recon.result.submap_index import is_map_set
 from splatnode.recon.result.verdict import RELATIVE, Scale
 

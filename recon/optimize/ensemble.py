@@ -22,7 +22,7 @@ from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import regularizers
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.snapshot import decode_frame_id
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 
 
 class EnsembleConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -25,7 +25,7 @@ from splatnode.recon.optimize.regularizers import PseudoView, Regularizer
 from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.rasterize.reference import Render
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, compute_fit_masks
+from splatnode.recon.scene import Gaussians, Scene, TrainingView, compute_fit_masks
 
 if TYPE_CHECKING:
     from splatnode.recon.optimize.training import RefinementConfig

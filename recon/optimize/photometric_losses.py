@@ -25,7 +25,7 @@ from splatnode.recon.core import library
 from splatnode.recon.networks.lpips import MIN_SIDE, Lpips, load_lpips
 from splatnode.recon.optimize.losses import Schedule
 from splatnode.recon.rasterize import dispatch
-from splatnode.recon.scene.scene import TrainingView
+from splatnode.recon.scene import TrainingView
 
 # Perceptual distance of two images: LPIPS where its weights are present, else image gradients over several scales.
 

@@ -21,11 +21,10 @@ from torch import Tensor
 from splatnode.capture.process.config import Internal
 from splatnode.recon.networks.depth_anything import load_relative
 from splatnode.recon.optimize.losses import Evaluate, Loss, LossChoice, Schedule
-from splatnode.recon.priors.monocular import fit_monocular_depth
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap, fit_monocular_depth
 from splatnode.recon.rasterize.dispatch import Camera
 from splatnode.recon.rasterize.reference import Render
-from splatnode.recon.scene.scene import TrainingView
+from splatnode.recon.scene import TrainingView
 
 # Pseudo views: cameras where no photograph was taken, between the training views.
 

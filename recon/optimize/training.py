@@ -21,18 +21,19 @@ import torch
 from msgspec import Meta
 
 from splatnode.capture.process.config import Internal
+from splatnode.recon import verification
 from splatnode.recon.optimize import ensemble as optimize_ensemble
 from splatnode.recon.optimize import photometric_losses, regularizers
 from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.optimize.fit import PARAMETERS, Trainer
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss, make_training_image, scale_intrinsics
 from splatnode.recon.optimize.regularizers import PointRender, PseudoView, render_points, sample_pseudo_views
-from splatnode.recon.priors.pointmap import compute_world_points
+from splatnode.recon.priors import compute_world_points
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.snapshot import SHELL
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, compute_fit_masks, logit
-from splatnode.recon.verification import decision, rejections
+from splatnode.recon.scene import Gaussians, Scene, TrainingView, compute_fit_masks, logit
+from splatnode.recon.verification import decision
 
 # How many threads torch computes with.
 
@@ -240,7 +241,7 @@ def check_divergence(before: float, scene: Scene) -> Verdict | None:
     if after <= WORSE * before:
         return None
     names = [view.name for view in scene.views]
-    return rejections.refuse(rejections.DIVERGED, names, before=before, after=after)
+    return verification.refuse(verification.DIVERGED, names, before=before, after=after)
 
 
 def compute_photometric_misfit(scene: Scene) -> float:

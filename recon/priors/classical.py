@@ -12,13 +12,13 @@ import numpy.typing as npt
 from splatnode.capture.process.config import Internal
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph
-from splatnode.recon.priors import stereo
-from splatnode.recon.priors.pointmap import (
+from splatnode.recon.priors import (
     Pointmap,
     Prior,
     compute_depth_range,
     compute_modelled_K,
     select_sparse_points,
+    stereo,
 )
 from splatnode.recon.priors.stereo import DepthMap
 from splatnode.recon.registration.registration import Registration

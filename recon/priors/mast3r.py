@@ -53,8 +53,7 @@ from splatnode.recon.networks.vit import (
     split_heads,
 )
 from splatnode.recon.networks.weights import LruCache, find
-from splatnode.recon.priors.monocular import make_registered_pointmap
-from splatnode.recon.priors.pointmap import Pointmap, Prior
+from splatnode.recon.priors import Pointmap, Prior, make_registered_pointmap
 from splatnode.recon.registration.registration import Registration
 
 Array = npt.NDArray[np.float64]

@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from splatnode.recon.geometry import matrices_from_quats
 from splatnode.recon.rasterize.reference import ALPHA_MIN, CHANNELS, GUARD, LOW_PASS, NEAR, Render, check_input
-from splatnode.recon.scene.scene import SH_C0
+from splatnode.recon.scene import SH_C0
 
 _TILE = 16  # pixels, across and down: what gsplat was tested with
 _SIZES = {"rgb": 3, "depth": 1, "normal": 3}  # of a Gaussian's features, in their order

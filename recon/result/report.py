@@ -18,11 +18,9 @@ from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.terminal import say
 from splatnode.capture.rig import format_rig
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.export.cameras import make_camera_dict
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.export.limits import sanitize_gaussians
-from splatnode.recon.result.export.stored import SOURCES, encode_sources
-from splatnode.recon.result.npz_files import DEPTHS, LANDMARKS, encode_depths, encode_landmarks
+from splatnode.recon.result.export.stored import SOURCES, encode_sources, make_camera_dict
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import (
     CameraEstimate,
@@ -31,6 +29,7 @@ from splatnode.recon.result.snapshot import (
     describe_moving,
     format_widest_bounds,
 )
+from splatnode.recon.result.stored_snapshot import DEPTHS, LANDMARKS, encode_depths, encode_landmarks
 from splatnode.recon.result.verdict import FIRST_CAMERA, find_widest
 
 _PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")

@@ -277,7 +277,7 @@ class Snapshot:
     dropped: tuple[DroppedFrame, ...]
     iterations: int
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
-    budget: tuple[Mapping[str, object], ...] = ()  # recon.budget.Hit.record of each limit that bound the final scene
+    budget: tuple[Mapping[str, object], ...] = ()  # recon.modelling.Hit.record of each limit that bound the final scene
     final: bool = False
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
 import math
-from collections.abc import Mapping, Sequence
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import msgspec
@@ -24,17 +27,286 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.process.config import record_in
+from splatnode.capture.process.files import read_bounded
+from splatnode.capture.process.library_lines import ignore_file_warnings
 from splatnode.capture.process.system import outlast, raise_shortage
 from splatnode.capture.process.terminal import notify
-from splatnode.capture.process.text import guard_untrusted, is_printable, sanitize_text
-from splatnode.recon.result.export.cameras import decode_cameras
-from splatnode.recon.result.export.limits import SceneFileError, read_json_file
-from splatnode.recon.result.export.stored import SOURCES, StoredResult, read_cameras, read_gaussians
-from splatnode.recon.result.npz_files import LANDMARKS, read_landmarks
+from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, is_printable, sanitize_text
+from splatnode.recon.result.export.limits import MAX_CAMERAS, SceneFileError, read_json_file
+from splatnode.recon.result.export.stored import SOURCES, StoredResult, decode_cameras, read_cameras, read_gaussians
 from splatnode.recon.result.placement import IDENTITY, Placement
-from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot, StoredDepthCheck
+from splatnode.recon.result.snapshot import (
+    MAX_COORDINATE,
+    CameraEstimate,
+    GaussianArrays,
+    KnownLenses,
+    Landmarks,
+    Snapshot,
+    StoredDepthCheck,
+    find_camera_problem,
+)
 from splatnode.recon.result.submap_index import JoinedMap, MapSet, SubmapEntry
 from splatnode.recon.result.verdict import Code, Up, Verdict
+
+# NumPy's archives of a result folder, read as what strangers may have made: bounded, and of plain arrays alone.
+
+
+@contextlib.contextmanager
+def open_npz(data: bytes, most_bytes: int, name: str, what: str) -> Iterator[Mapping[str, npt.NDArray[Any]]]:
+    """The arrays of an archive, which together have at most so many bytes; each is read when it is asked for.
+
+    Raises SceneFileError, also for an array that is asked for and not there; it calls the file `name`, and its content
+    `what`.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > most_bytes:
+            raise SceneFileError(f"{name} holds {size} bytes; at most {most_bytes} are read")
+        # Sides that no array has overflow when NumPy multiplies them, before it refuses them.
+        with (
+            ignore_file_warnings(),
+            np.load(io.BytesIO(data), allow_pickle=False) as arrays,
+            np.errstate(all="ignore"),
+        ):
+            yield arrays
+    except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+        raise_shortage(error)
+        raise SceneFileError(f"{name} is not a file of {what}, or is damaged: {error}") from error
+
+
+# depth.npz: the file of a result folder that holds the depths that two photographs confirm.
+
+DEPTHS = "depth.npz"  # in the result folder
+MAX_DEPTH_BYTES = 1 << 29  # of the arrays in a file that is read
+_LONGEST_SIDE = 8192  # pixels
+
+Depths = Mapping[str, npt.NDArray[np.float16]]
+
+
+def encode_depths(depths: Depths) -> bytes:
+    """depth.npz: `names` (C,) of the cameras, and for each (h, w) z as `depth_0`, `depth_1` ...; NumPy arrays."""
+    file = io.BytesIO()
+    arrays: dict[str, Any] = {f"depth_{index}": each.astype(np.float16) for index, each in enumerate(depths.values())}
+    np.savez_compressed(file, names=np.array([name.encode() for name in depths], np.bytes_), **arrays)
+    return file.getvalue()
+
+
+def read_depths(folder: Path) -> dict[str, npt.NDArray[np.float16]]:
+    """The depths of the result in `folder`, by camera; none where it holds no such file.
+
+    Raises SceneFileError where the file is damaged or is not ours, OSError.
+    """
+    path = folder / DEPTHS
+    if not path.is_file():
+        return {}
+    with guard_untrusted(SceneFileError, str(path)):
+        return decode_depths(read_bounded(path, MAX_DEPTH_BYTES, SceneFileError, str(path)), str(path))
+
+
+def decode_depths(data: bytes, name: str = DEPTHS) -> dict[str, npt.NDArray[np.float16]]:
+    """Reads depth.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
+    with guard_untrusted(SceneFileError, name):
+        with open_npz(data, MAX_DEPTH_BYTES, name, "depths") as arrays:
+            names = arrays["names"]
+            if names.ndim != 1 or names.dtype.kind != "S" or len(names) > MAX_CAMERAS:
+                raise SceneFileError(f"{name}: names must be those of at most {MAX_CAMERAS} cameras")
+            depths = [arrays[f"depth_{index}"] for index in range(len(names))]
+        for depth in depths:
+            sides = depth.shape if depth.ndim == 2 else (0,)
+            if depth.dtype != np.float16 or not 1 <= min(sides) <= max(sides) <= _LONGEST_SIDE:
+                raise SceneFileError(f"{name}: a depth must be (h, w) float16, got {depth.shape} {depth.dtype}")
+            if not (np.isfinite(depth) & (depth >= 0)).all():
+                raise SceneFileError(f"{name}: depths must be finite, and 0 or more")
+        texts = [sanitize_text(each.decode(), LONGEST_NAME) for each in names.tolist()]
+        return dict(zip(texts, depths, strict=True))
+
+
+# Multi-view consistent depth: how much of a scene was measured by several views, in words of a verdict.
+#
+# Cameras can be right, and most of the scene a guess all the same: where only one view knows a depth, or none, the
+# scene is like the photographs from their cameras, and like nothing in particular from elsewhere.
+
+ADVICE = "Add photographs between these, a short step apart, so that each shows most of what the next one shows."
+
+
+class ConsistentDepthConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Multi-view consistent depth: how much of a scene was measured by several views, in words of a verdict."""
+
+    # Share of the pixels with multi-view consistent depth below which the verdict calls views away from the cameras
+    # guesses. Of 22 sets of real photographs the ten below it reach 18.1 dB on held-out views, at most 21.7, and the
+    # twelve above it 22.8 dB (tests/bench/results/consistent_depth.json). 0: never
+    min_share: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.45
+
+
+def format_percent(share: float) -> str:
+    """A share in percent, rounded down: what is not measured is not claimed."""
+    return f"{int(100 * share + 1e-9)} %"
+
+
+def is_guess(share: float, config: ConsistentDepthConfig) -> bool:
+    """Whether views away from the cameras show guesses, by the `share` of pixels with multi-view consistent depth."""
+    return share < config.min_share
+
+
+def append_consistent_depth(verdict: Verdict, share: float | None, config: ConsistentDepthConfig) -> Verdict:
+    """The verdict with a sentence on the share of multi-view consistent depth, and advice where it is too small."""
+    if share is None or not verdict.publishable:
+        return verdict
+    if not is_guess(share, config):
+        return replace(
+            verdict,
+            message=f"{verdict.message} Other views confirm the depth of {format_percent(share)} of the pixels.",
+        )
+    told = f"Other views confirm the depth of only {format_percent(share)} of the pixels"
+    return replace(
+        verdict,
+        message=f"{verdict.message} {told}: views away from the cameras are guesses.",
+        advice=f"{verdict.advice} {ADVICE}".strip(),
+    )
+
+
+# landmarks.npz: the file of a result folder that holds its landmarks.
+
+LANDMARKS = "landmarks.npz"  # in the result folder
+DESCRIPTORS_A_PHOTOGRAPH = 2000  # kept at most, in the mean: 160 kB of the file
+MOST_DESCRIPTORS = 60_000  # in all: 5 MB
+MAX_LANDMARK_BYTES = 64 << 20  # of the arrays in a file that is read
+_DESCRIPTOR_BYTES = 128
+_MOST_BYTE, _MOST_NORM = 127, 181  # of a descriptor, so that products fit 16 bits: `quantise` makes no others
+_ROWS, _COLUMNS = np.triu_indices(3)  # of a symmetric matrix, which is kept by half
+
+
+def encode_landmarks(landmarks: Landmarks) -> bytes:
+    """landmarks.npz: NumPy arrays, which `numpy.load(..., allow_pickle=False)` reads."""
+    lenses, file = landmarks.lenses, io.BytesIO()
+    arrays: dict[str, Any] = {
+        "points": landmarks.points.astype(np.float32),
+        "covariances": landmarks.covariances[:, _ROWS, _COLUMNS].astype(np.float32),
+        "descriptors": landmarks.descriptors,
+        "point_of": landmarks.point_of.astype(np.uint32),
+        "photograph_of": landmarks.photograph_of.astype(np.uint16),
+        "names": np.array([name.encode() for name in landmarks.names], np.bytes_),
+        "Ts_world_camera": landmarks.Ts_world_camera,
+        "lenses": np.column_stack([lenses.focals, lenses.radials, lenses.shifts, lenses.shapes]),
+        "bounds": np.column_stack([landmarks.rotation_bounds, landmarks.centre_bounds]),
+        "scale": np.array([landmarks.noise_px, landmarks.unit, float(landmarks.metric)]),
+    }
+    if landmarks.focal_bounds is not None:
+        arrays[_FOCAL_BOUNDS] = landmarks.focal_bounds
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def read_landmarks(folder: Path) -> Landmarks:
+    """The landmarks of the result in `folder`.
+
+    Raises FileNotFoundError, which says what to do, where the folder holds none, SceneFileError where the file is
+    damaged or is not ours, OSError.
+    """
+    path = folder / LANDMARKS
+    if not path.is_file():
+        raise FileNotFoundError(_explain_missing(folder))
+    with guard_untrusted(SceneFileError, str(path)):
+        return decode_landmarks(read_bounded(path, MAX_LANDMARK_BYTES, SceneFileError, str(path)), str(path))
+
+
+def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
+    """Reads landmarks.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
+    with guard_untrusted(SceneFileError, name):
+        with open_npz(data, MAX_LANDMARK_BYTES, name, "landmarks") as arrays:
+            found = {key: arrays[key] for key in _SHAPES if key != _FOCAL_BOUNDS or key in arrays}
+        found["lenses"] = _insert_second_radial(found["lenses"])
+        _check(found, name)
+        return _make_landmarks(found)
+
+
+_FOCAL_BOUNDS = "focal_bounds"  # that an earlier splatnode did not write
+_SHAPES: dict[str, tuple[str, str, tuple[int, ...]]] = {  # kind, what its first axis counts, the other axes
+    "points": ("f", "P", (3,)),
+    "covariances": ("f", "P", (6,)),
+    "descriptors": ("u", "D", (_DESCRIPTOR_BYTES,)),
+    "point_of": ("u", "D", ()),
+    "photograph_of": ("u", "D", ()),
+    "names": ("S", "C", ()),
+    "Ts_world_camera": ("f", "C", (4, 4)),
+    "lenses": ("f", "C", (6,)),
+    "bounds": ("f", "C", (2,)),
+    "scale": ("f", "three", ()),
+    _FOCAL_BOUNDS: ("f", "C", ()),
+}
+
+
+def _insert_second_radial(lenses: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(C, 6) of a file from before lenses had a second radial coefficient, which has (C, 5)."""
+    return np.insert(lenses, 2, 0.0, axis=1) if lenses.ndim == 2 and lenses.shape[1] == 5 else lenses
+
+
+def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
+    """Raises SceneFileError where shapes, types or numbers are not those of a file of ours."""
+    counts: dict[str, int] = {"three": 3}
+    for key, array in found.items():
+        kind, count, rest = _SHAPES[key]
+        known = counts.setdefault(count, len(array) if array.ndim else 0)
+        if array.dtype.kind != kind or array.ndim != 1 + len(rest) or array.shape != (known, *rest):
+            raise SceneFileError(f"{name}: {key} must be {('?', *rest)} of kind {kind!r}, got {array.shape}")
+        if kind == "f" and not (np.abs(array.astype(np.float64)) <= MAX_COORDINATE).all():
+            raise SceneFileError(f"{name}: {key} must be finite, within ±{MAX_COORDINATE:g}")
+    if found["descriptors"].dtype != np.uint8 or counts["D"] > MOST_DESCRIPTORS or not counts["C"]:
+        raise SceneFileError(f"{name}: there must be cameras, and at most {MOST_DESCRIPTORS} descriptors of bytes")
+    lengths = np.linalg.norm(found["descriptors"].astype(np.float32), axis=1)
+    if (found["descriptors"] > _MOST_BYTE).any() or (lengths > _MOST_NORM).any():
+        raise SceneFileError(f"{name}: a descriptor has bytes of at most {_MOST_BYTE} and a norm up to {_MOST_NORM}")
+    if (found["point_of"] >= counts["P"]).any() or (found["photograph_of"] >= counts["C"]).any():
+        raise SceneFileError(f"{name}: descriptors must be of its points and photographs")
+    for T_world_camera, lens in zip(found["Ts_world_camera"], found["lenses"], strict=True):
+        problem = find_camera_problem(T_world_camera, np.diag([lens[0], lens[0], 1.0]), 1, 1)
+        if problem:
+            raise SceneFileError(f"{name}: {problem}")
+    bounds = np.column_stack([found["bounds"], found.get(_FOCAL_BOUNDS, np.zeros(counts["C"]))])
+    if (found["lenses"][:, [0, 5]] <= 0).any() or (found["scale"][:2] <= 0).any() or (bounds < 0).any():
+        raise SceneFileError(f"{name}: focal lengths, shapes, bounds and units must be positive")
+
+
+def _make_landmarks(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
+    covariances = np.empty((len(found["points"]), 3, 3))
+    covariances[:, _ROWS, _COLUMNS] = found["covariances"]
+    covariances[:, _COLUMNS, _ROWS] = found["covariances"]
+    values, vectors = np.linalg.eigh(covariances)  # rounding, or a stranger, may have made one negative
+    covariances = (vectors * values.clip(0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    lenses, bounds = found["lenses"], found["bounds"]
+    noise_px, unit, metric = found["scale"].tolist()
+    return Landmarks(
+        found["points"].astype(np.float64),
+        covariances,
+        found["descriptors"],
+        found["point_of"].astype(np.int64),
+        found["photograph_of"].astype(np.int64),
+        tuple(sanitize_text(name.decode(), LONGEST_NAME) for name in found["names"].tolist()),
+        found["Ts_world_camera"],
+        KnownLenses(lenses[:, 0], lenses[:, 1:3], lenses[:, 3:5], lenses[:, 5]),
+        bounds[:, 0],
+        bounds[:, 1],
+        noise_px,
+        unit,
+        bool(metric),
+        found.get(_FOCAL_BOUNDS),
+    )
+
+
+def _explain_missing(folder: Path) -> str:
+    """Explains what to do where a folder has no landmarks."""
+    if (folder / "scene.ply").is_file():
+        return (
+            f"{folder / LANDMARKS} is not there: an earlier splatnode made this result, or it is a merged map or a "
+            "converted scene. Reconstruct the photographs again, or give the folder of one scene of the map"
+        )
+    if (folder / "report.json").is_file():
+        return f"{folder} holds no scene: its report.json says why. A photograph can be placed in a scene only"
+    return f"{folder} is not a result of splatnode; give the folder that splatnode replay --out wrote"
+
+
+# A result on disk as the snapshot that it was, and its photographs where they still are.
 
 log = logging.getLogger(__name__)
 

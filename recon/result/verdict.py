@@ -109,7 +109,7 @@ def encode_matrix(T: Array) -> tuple[float, ...]:
 
 
 class Code(enum.Enum):
-    """The codes of a verdict. `recon/verification/rejections.py` has the sentences and the advice."""
+    """The codes of a verdict. `recon/verification/__init__.py` has the sentences and the advice."""
 
     OK = "OK"
     OK_PARTIAL = "OK_PARTIAL"

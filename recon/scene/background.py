@@ -15,11 +15,11 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from splatnode.capture.process.config import Internal
+from splatnode.recon import priors as priors_pointmap
 from splatnode.recon.geometry import project, quat_from_matrix, transform_to_camera
-from splatnode.recon.priors import pointmap as priors_pointmap
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import SHELL
-from splatnode.recon.scene.scene import SH_C0, Gaussians, logit
+from splatnode.recon.scene import SH_C0, Gaussians, logit
 from splatnode.recon.threads import map_parallel
 
 Array = npt.NDArray[np.float64]

@@ -24,10 +24,10 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from splatnode.capture.process.config import Internal
+from splatnode.recon import priors as priors_pointmap
 from splatnode.recon.keyframes import Keyframe
-from splatnode.recon.priors import pointmap as priors_pointmap
-from splatnode.recon.priors.pointmap import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap
-from splatnode.recon.scene.scene import Exposure
+from splatnode.recon.priors import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap
+from splatnode.recon.scene import Exposure
 from splatnode.recon.threads import map_parallel
 from splatnode.recon.verification.evidence import BRIGHT, DARK
 

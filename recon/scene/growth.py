@@ -13,14 +13,18 @@ import torch
 from splatnode.recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix, transform_to_camera
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.pointmap import Pointmap, compute_modelled_K, select_sparse_points
-from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.registration.undistortion import apply_known_lenses, corner_shift, undistort_keyframes
+from splatnode.recon.priors import Pointmap, compute_modelled_K, select_sparse_points
+from splatnode.recon.registration.registration import (
+    RegisteredCamera,
+    Registration,
+    apply_known_lenses,
+    corner_shift,
+    undistort_keyframes,
+)
 from splatnode.recon.result.snapshot import decode_frame_id
+from splatnode.recon.scene import Gaussians, Scene, TrainingView, concatenate, initialization
 from splatnode.recon.scene import exposure as scene_exposure
-from splatnode.recon.scene import initialization
 from splatnode.recon.scene.exposure import compute_exposure_priors
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, concatenate
 
 NUM_NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty: each costs time
 

@@ -19,20 +19,15 @@ from scipy.spatial import KDTree
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.config import Internal
 from splatnode.recon import keyframes
+from splatnode.recon import priors as priors_pointmap
 from splatnode.recon.core import library
 from splatnode.recon.geometry import quat_from_matrix
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors import pointmap as priors_pointmap
-from splatnode.recon.priors.pointmap import (
-    Pointmap,
-    compute_consistent_shares,
-    compute_modelled_K,
-    find_consistent_pixels,
-)
+from splatnode.recon.priors import Pointmap, compute_consistent_shares, compute_modelled_K, find_consistent_pixels
 from splatnode.recon.registration.registration import Registration
 from splatnode.recon.result.snapshot import encode_unconfirmed
+from splatnode.recon.scene import SH_C0, Exposure, Gaussians, Scene, TrainingView, concatenate, logit
 from splatnode.recon.scene import background as scene_background
-from splatnode.recon.scene.scene import SH_C0, Exposure, Gaussians, Scene, TrainingView, concatenate, logit
 from splatnode.recon.threads import map_parallel
 
 # Partitions an image into pieces, each of which one colour and one depth explain well enough.

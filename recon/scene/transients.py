@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon import priors as priors_pointmap
 from splatnode.recon.keyframes import resize_mask
-from splatnode.recon.priors import pointmap as priors_pointmap
-from splatnode.recon.priors.pointmap import AGREEING, LEAST_CONFIDENCE, Pointmap, find_consistent_pixels
+from splatnode.recon.priors import AGREEING, LEAST_CONFIDENCE, Pointmap, find_consistent_pixels
 from splatnode.recon.threads import map_parallel
 
 Array = npt.NDArray[np.float64]

@@ -13,13 +13,14 @@ from functools import cached_property
 import numpy as np
 
 from splatnode.capture import keyframe_selection
+from splatnode.recon import verification
 from splatnode.recon.geometry import distortion
 from splatnode.recon.keyframes import Rejected, longer_side
 from splatnode.recon.matching.pair_matching import TwoView, median_motion_px
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, find_widest
-from splatnode.recon.verification import refit, rejections
+from splatnode.recon.verification import DecisionConfig, Refusal, refit, refuse
 from splatnode.recon.verification.error_model import (
     VerdictModel,
     VerdictModels,
@@ -31,7 +32,6 @@ from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import refuse_stereo_or_panorama
 from splatnode.recon.verification.refit import FreedLens
-from splatnode.recon.verification.rejections import DecisionConfig, Refusal, refuse
 
 Pair = tuple[int, int]
 
@@ -55,13 +55,13 @@ def refuse_unplaced(graph: ViewGraph, registration: Registration | None, config:
     components = graph.components()
     if len(components[0]) < config.min_cameras:
         found = f"Only {len(components[0])} of {len(names)} photographs overlap."
-        return refuse(rejections.NO_OVERLAP, names, found=found)
+        return refuse(verification.NO_OVERLAP, names, found=found)
     turned = _find_pure_rotations(graph)
     if 2 * len(turned) >= len(graph.pairs):
         return _refuse_pure_rotation(graph, turned)
     placed = 0 if registration is None else len(registration.cameras)
     found = f"Only {placed} of {len(names)} photographs could be placed with certainty."
-    return refuse(rejections.NO_OVERLAP, names, found=found)
+    return refuse(verification.NO_OVERLAP, names, found=found)
 
 
 def _refuse_insufficient_images(
@@ -74,8 +74,8 @@ def _refuse_insufficient_images(
         return None
     plain = [keyframe.name for keyframe in graph.keyframes if len(keyframe.features.points) < config.min_features]
     if len(plain) > len(names) / 2:
-        return refuse(rejections.WITHOUT_TEXTURE, plain, plain=len(plain), count=len(names))
-    return refuse(rejections.NO_OVERLAP, names, found="No two photographs show enough of the same things.")
+        return refuse(verification.WITHOUT_TEXTURE, plain, plain=len(plain), count=len(names))
+    return refuse(verification.NO_OVERLAP, names, found="No two photographs show enough of the same things.")
 
 
 def _refuse_too_few_views(names: list[str], rejected: Sequence[Rejected], config: DecisionConfig) -> Verdict:
@@ -84,24 +84,24 @@ def _refuse_too_few_views(names: list[str], rejected: Sequence[Rejected], config
     copies, blurred, blank = (by_code[code] for code in (Code.STATIC_CAMERA, Code.BLUR, Code.LOW_TEXTURE))
     if len(names) + len(rejected) >= config.min_cameras or (copies and len(names) == 1):
         if copies and len(names) == 1 and not blurred and not blank:
-            return refuse(rejections.ONLY_COPIES, [*names, *(frame.name for frame in copies)])
+            return refuse(verification.ONLY_COPIES, [*names, *(frame.name for frame in copies)])
         if len(blurred) > max(len(copies), len(blank)):
             of_blurred = [frame.name for frame in blurred]
             reason = blurred[0].reason
-            return refuse(rejections.ALL_BLURRED, of_blurred, count=len(blurred), first=of_blurred[0], reason=reason)
+            return refuse(verification.ALL_BLURRED, of_blurred, count=len(blurred), first=of_blurred[0], reason=reason)
         if len(blank) > len(copies):
             of_blank = [frame.name for frame in blank]
-            return refuse(rejections.WITHOUT_TEXTURE, of_blank, plain=len(blank), count=len(names) + len(rejected))
+            return refuse(verification.WITHOUT_TEXTURE, of_blank, plain=len(blank), count=len(names) + len(rejected))
     usable = f"{len(names)} usable photograph{'s' if len(names) != 1 else ''}"
     left_out = f"; {len(rejected)} more were left out ({rejected[0].name}: {rejected[0].reason})" if rejected else ""
-    return refuse(rejections.TOO_FEW, names, usable=usable, least=config.min_cameras, left_out=left_out)
+    return refuse(verification.TOO_FEW, names, usable=usable, least=config.min_cameras, left_out=left_out)
 
 
 def _refuse_no_motion(graph: ViewGraph, config: DecisionConfig) -> Verdict | None:
     """The camera stood still, or only turned."""
     still = [pair for pair, view in graph.pairs.items() if _motion_px(graph, pair, view) < config.static_px]
     if len(still) == len(graph.pairs):
-        return refuse(rejections.ONLY_COPIES, _names(graph, still))
+        return refuse(verification.ONLY_COPIES, _names(graph, still))
     turned = _find_pure_rotations(graph)
     return _refuse_pure_rotation(graph, turned) if len(turned) >= config.turned_share * len(graph.pairs) else None
 
@@ -117,7 +117,7 @@ def _refuse_doubtful_focal(graph: ViewGraph, config: DecisionConfig) -> Verdict 
         return None
     names = [keyframe.name for keyframe in graph.keyframes]
     change = 100 * (voted / told - 1.0)
-    return refuse(rejections.WRONG_FOCAL_BY_VOTE, names, given=told, voted=voted, change=change)
+    return refuse(verification.WRONG_FOCAL_BY_VOTE, names, given=told, voted=voted, change=change)
 
 
 def _find_pure_rotations(graph: ViewGraph) -> list[Pair]:
@@ -126,7 +126,7 @@ def _find_pure_rotations(graph: ViewGraph) -> list[Pair]:
 
 def _refuse_pure_rotation(graph: ViewGraph, turned: list[Pair]) -> Verdict:
     found = f"{len(turned)} of {len(graph.pairs)} overlapping pairs show no parallax"
-    return refuse(rejections.NO_PARALLAX, _names(graph, turned), found=found)
+    return refuse(verification.NO_PARALLAX, _names(graph, turned), found=found)
 
 
 def _names(graph: ViewGraph, pairs: Iterable[Pair]) -> list[str]:
@@ -210,7 +210,7 @@ def check_given_lens(case: EvidenceCase) -> Verdict | None:
     if 2 * len(refuted) <= len(changes):
         return None
     change = 100 * (float(np.median(refuted)) - 1.0)
-    return refuse(rejections.WRONG_LENS, case.names, refuted=len(refuted), count=len(changes), change=change)
+    return refuse(verification.WRONG_LENS, case.names, refuted=len(refuted), count=len(changes), change=change)
 
 
 def check_given_focal(case: EvidenceCase) -> Verdict | None:
@@ -220,7 +220,7 @@ def check_given_focal(case: EvidenceCase) -> Verdict | None:
         return None
     worst = max(doubted, key=lambda lens: abs(lens.found / lens.given - 1.0))
     change = 100 * (worst.found / worst.given - 1.0)
-    return refuse(rejections.WRONG_FOCAL, case.names, given=worst.given, found=worst.found, change=change)
+    return refuse(verification.WRONG_FOCAL, case.names, given=worst.given, found=worst.found, change=change)
 
 
 def _is_contradicted(freed: FreedLens, config: DecisionConfig) -> bool:
@@ -236,7 +236,7 @@ def check_distortion(case: EvidenceCase) -> Verdict | None:
     found, config = case.evidence.distortion, case.config
     if found.cost_ratio >= config.focal_gain or found.corner_shift <= config.corner_shift:
         return None
-    return refuse(rejections.DISTORTED, case.names, further=100 * found.corner_shift)
+    return refuse(verification.DISTORTED, case.names, further=100 * found.corner_shift)
 
 
 def check_moving_plane(case: EvidenceCase) -> Verdict | None:
@@ -245,7 +245,7 @@ def check_moving_plane(case: EvidenceCase) -> Verdict | None:
     explained = evidence.inlier_ratio > config.moving_inlier_ratio
     if evidence.flatness < config.moving_flatness or (explained and np.isfinite(evidence.flatness)):
         return None
-    return refuse(rejections.MOVING, case.names, inliers=100 * evidence.inlier_ratio)
+    return refuse(verification.MOVING, case.names, inliers=100 * evidence.inlier_ratio)
 
 
 def check_weakest_link(case: EvidenceCase) -> Verdict | None:
@@ -262,7 +262,7 @@ def check_connectivity(case: EvidenceCase) -> Verdict | None:
 
 
 def _refuse_split(frames: Sequence[str]) -> Verdict:
-    return refuse(rejections.APART, frames, count=len(frames))
+    return refuse(verification.APART, frames, count=len(frames))
 
 
 def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
@@ -271,7 +271,7 @@ def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
     weakest = min(cameras, key=lambda camera: camera.confirmed)
     if len(cameras) == 2 or weakest.confirmed >= case.config.min_confirmed:
         return None
-    return refuse(rejections.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
+    return refuse(verification.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
 
 
 def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
@@ -279,14 +279,14 @@ def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
     found = case.evidence.reflection
     if found.gain <= case.config.max_reflection:
         return None
-    return refuse(rejections.MIRRORED_PHOTOGRAPHS, found.frames, count=len(found.frames))
+    return refuse(verification.MIRRORED_PHOTOGRAPHS, found.frames, count=len(found.frames))
 
 
 def check_mirrored_scene(case: EvidenceCase) -> Verdict | None:
     """The scene mirrored in depth fits nearly as well."""
     if case.evidence.mirrored_cost >= case.config.min_mirrored_cost:
         return None
-    return refuse(rejections.MIRRORED_IN_DEPTH, case.names)
+    return refuse(verification.MIRRORED_IN_DEPTH, case.names)
 
 
 def check_required_precision(case: EvidenceCase) -> Verdict | None:
@@ -294,7 +294,7 @@ def check_required_precision(case: EvidenceCase) -> Verdict | None:
     needed = case.config.max_position_error_percent
     if needed is None or case.widest_bounds.centre_percent <= needed:
         return None
-    return refuse(rejections.ROUGHER, case.names, found=case.widest_bounds.centre_percent, needed=needed)
+    return refuse(verification.ROUGHER, case.names, found=case.widest_bounds.centre_percent, needed=needed)
 
 
 # Why bounds are wide: which of parallax, depth, focal length and shared points was missing, and between which frames.
@@ -329,7 +329,7 @@ def _check_pure_rotation(case: VerificationCase) -> Verdict | None:
     share = sum(view.num_rotation for view in pairs) / max(1, matches)
     if share <= case.config.explained_by_turning:
         return None
-    return refuse(rejections.NO_PARALLAX, case.names, found=f"a turn explains {100 * share:.0f} % of all matches")
+    return refuse(verification.NO_PARALLAX, case.names, found=f"a turn explains {100 * share:.0f} % of all matches")
 
 
 def _check_planarity(case: VerificationCase) -> Verdict | None:
@@ -341,7 +341,7 @@ def _check_planarity(case: VerificationCase) -> Verdict | None:
     return (
         None
         if case.widest_bounds.focal_percent <= case.config.exact_focal_percent
-        else refuse(rejections.PLANAR, case.names)
+        else refuse(verification.PLANAR, case.names)
     )
 
 
@@ -350,7 +350,7 @@ def _check_focal(case: VerificationCase) -> Verdict | None:
     if worst.focal_percent <= case.config.exact_focal_percent:
         return None
     centre, rotation = worst.centre_percent, worst.rotation_deg
-    return refuse(rejections.UNCERTAIN_FOCAL, case.names, focal=worst.focal_percent, centre=centre, rotation=rotation)
+    return refuse(verification.UNCERTAIN_FOCAL, case.names, focal=worst.focal_percent, centre=centre, rotation=rotation)
 
 
 def _check_shared_points(case: VerificationCase) -> Verdict | None:
@@ -362,7 +362,7 @@ def _check_shared_points(case: VerificationCase) -> Verdict | None:
     partners = case.graph.partners(case.graph.names.index(weakest.name))
     nearest = case.graph.names[max(partners, key=lambda index: (partners[index], -index))]
     return refuse(
-        rejections.FEW_SHARED_POINTS,
+        verification.FEW_SHARED_POINTS,
         (weakest.name, nearest),
         name=weakest.name,
         points=weakest.confirmed,
@@ -377,7 +377,7 @@ def _check_viewing_angle(case: VerificationCase) -> Verdict | None:
     if angle >= SMALL_ANGLE_DEG:
         return None
     rotation = case.widest_bounds.rotation_deg
-    return refuse(rejections.TOO_CLOSE, case.names, angle=angle, travel=case.travel_percent, rotation=rotation)
+    return refuse(verification.TOO_CLOSE, case.names, angle=angle, travel=case.travel_percent, rotation=rotation)
 
 
 def _refuse_scattered(case: VerificationCase) -> Verdict:
@@ -391,7 +391,7 @@ def _refuse_scattered(case: VerificationCase) -> Verdict:
     worst = max(case.bounds, key=width)
     bounds = case.bounds[worst]
     return refuse(
-        rejections.SCATTERED, (worst,), name=worst, centre=bounds.centre_percent, rotation=bounds.rotation_deg
+        verification.SCATTERED, (worst,), name=worst, centre=bounds.centre_percent, rotation=bounds.rotation_deg
     )
 
 
@@ -533,7 +533,7 @@ def _refuse_wrong_frames(case: VerificationCase) -> Verdict | None:
     names, limit = case.names, case.config.blurred_px
     foreign = _find_other_lens_frames(case)
     if foreign:
-        return refuse(rejections.MIXED_CAMERAS, foreign, others=len(foreign), count=len(names))
+        return refuse(verification.MIXED_CAMERAS, foreign, others=len(foreign), count=len(names))
     widths = {
         keyframe.name: keyframe_selection.blur_width(keyframe.image) or 0.0
         for keyframe in case.graph.keyframes
@@ -541,7 +541,7 @@ def _refuse_wrong_frames(case: VerificationCase) -> Verdict | None:
     }
     widest = max(widths.values())
     if widest > limit:
-        return refuse(rejections.BLURRED, [name for name in names if widths[name] > limit], width_px=widest)
+        return refuse(verification.BLURRED, [name for name in names if widths[name] > limit], width_px=widest)
     return None
 
 
@@ -550,15 +550,15 @@ def _refuse_wrong_poses(case: VerificationCase, against: str) -> Verdict:
     cameras = case.evidence.cameras
     if against == "reflection":
         mirrored = case.evidence.reflection.frames
-        return refuse(rejections.MIRRORED_PHOTOGRAPHS, mirrored, count=len(mirrored))
+        return refuse(verification.MIRRORED_PHOTOGRAPHS, mirrored, count=len(mirrored))
     if against == "flat_patch":
         smallest = min(cameras, key=lambda camera: camera.coverage)
         percent = 100 * smallest.coverage
-        return refuse(rejections.FLAT_PATCH, (smallest.name,), name=smallest.name, percent=percent)
+        return refuse(verification.FLAT_PATCH, (smallest.name,), name=smallest.name, percent=percent)
     if against == "coverage":
         smallest = min(cameras, key=lambda camera: camera.coverage)
         percent = 100 * smallest.coverage
-        return refuse(rejections.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
+        return refuse(verification.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
     if against in ("rotation_bound", "travel_bound"):
         return explain_wide_bounds(case)
     return _refuse_contradictions(case, against)
@@ -568,14 +568,14 @@ def _refuse_contradictions(case: VerificationCase, against: str) -> Verdict:
     """Photographs, pairs of them, or two parts do not fit together. It is about the photograph that fits least."""
     weakest = min(case.evidence.cameras, key=lambda camera: camera.inlier_ratio)
     if against == "directions":
-        return refuse(rejections.DISAGREEING, (weakest.name,), degrees=case.evidence.cycles.direction_deg)
+        return refuse(verification.DISAGREEING, (weakest.name,), degrees=case.evidence.cycles.direction_deg)
     if against == "link_inlier_ratio":
         link, inliers = case.evidence.weakest_link, 100 * case.evidence.weakest_link.inlier_ratio
         count, points = len(link.smaller_part), link.shared_points
-        return refuse(rejections.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
+        return refuse(verification.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
     if against == "camera_inlier_ratio":
-        return refuse(rejections.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
-    return refuse(rejections.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
+        return refuse(verification.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
+    return refuse(verification.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 
 def _find_other_lens_frames(case: VerificationCase) -> list[str]:

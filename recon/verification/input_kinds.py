@@ -18,7 +18,7 @@ from splatnode.recon.keyframes import PLAIN, Keyframe, longer_side
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.rejections import Refusal, refuse
+from splatnode.recon.verification import Refusal, refuse
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]

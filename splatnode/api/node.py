@@ -17,7 +17,7 @@ from splatnode.capture.messaging.network import RECON_MAP, Network
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config, read_yaml
 from splatnode.capture.process.terminal import Problems, is_logged
-from splatnode.recon.occupancy.grid import MapHeader, OccupancyMap, decode_map
+from splatnode.recon.occupancy import MapHeader, OccupancyMap, decode_map
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.sources import LiveSource

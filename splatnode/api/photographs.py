@@ -31,8 +31,8 @@ from splatnode.capture.masks import Find, Mask, apply_mask, open_masks, parse_ma
 from splatnode.capture.process.terminal import Tell, ignore_progress, notify
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.rig import TOLERANCE_S
+from splatnode.recon.locating import Located, NotLocated
 from splatnode.recon.locating.localize import follow, localize_image
-from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.replay_source import (
     Request,
     Source,

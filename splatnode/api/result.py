@@ -26,7 +26,6 @@ from splatnode.recon import core
 from splatnode.recon.result.export.limits import sanitize_gaussians
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.export.staged import hold_result_folder
-from splatnode.recon.result.npz_files import LANDMARKS, read_depths, read_landmarks
 from splatnode.recon.result.placement import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import (
@@ -36,15 +35,15 @@ from splatnode.recon.result.snapshot import (
     find_camera_problem,
     find_confirmed,
 )
-from splatnode.recon.result.stored_snapshot import read_result
+from splatnode.recon.result.stored_snapshot import LANDMARKS, read_depths, read_landmarks, read_result
 from splatnode.recon.result.submap_index import is_map_set
 from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict, compute_covariance
 from splatnode.viewer.probe import open3d_installed, probe_window
 
 if TYPE_CHECKING:
     from splatnode.api.photographs import Lens, Picture
-    from splatnode.recon.locating.outcome import Located, NotLocated
-    from splatnode.recon.occupancy.grid import OccupancyMap
+    from splatnode.recon.locating import Located, NotLocated
+    from splatnode.recon.occupancy import OccupancyMap
     from splatnode.recon.result.snapshot import DepthCheck
 
 # A result in a viewer, which is a process of its own: in a window, in rerun's, or in a browser.
@@ -405,7 +404,7 @@ class Result:
         direction of up in the world; None: the floor tells it, or the cameras, as `upright.source` says. Raises
         ValueError where no map can be made of the result, with the reason, or these are no size and no direction.
         """
-        from splatnode.recon.occupancy.grid import occupancy_map  # brings what carves
+        from splatnode.recon.occupancy import occupancy_map  # brings what carves
 
         return occupancy_map(self._snapshot, voxel, None if up is None else np.asarray(up, np.float64))
 

@@ -41,7 +41,7 @@ from splatnode.capture.messaging.network import (
     create_keys,
 )
 from splatnode.capture.messaging.pubsub import Subscriber
-from splatnode.recon.daemon.status import ReconStatus
+from splatnode.recon.daemon import ReconStatus
 from tests.capture.messaging.test_sockets import free_ports
 from tests.support.node import Node, descriptors, running
 from tests.viewer.web.test_server import KEY, scene, shown

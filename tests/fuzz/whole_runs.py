@@ -15,10 +15,10 @@ from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, Sp
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import parse_config
 from splatnode.command_line import main
+from splatnode.recon.daemon import ReconState
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.node import Daemon
-from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.result.export.staged import hold_result_folder
 from tests.bench.node.trial import RECON
 from tests.fuzz.interrupted import Piece, Tell, in_a_fork

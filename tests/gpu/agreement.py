@@ -25,7 +25,7 @@ from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.pipeline import run
 from splatnode.recon.rasterize import dispatch, reference
 from splatnode.recon.rasterize.dispatch import Device
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from tests.support.known_scene import disturbed, photographed, render, turned
 from tests.support.rasterize_cases import HEIGHT, NAMES, WIDTH, Case, images, moderate, relative_error
 

@@ -21,7 +21,7 @@ from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.rasterize import dispatch
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from tests.bench.speed.rasterize import CASES, LRS, Case, bumpy_surface
 
 ROUNDS, UNTIMED = 30, 5

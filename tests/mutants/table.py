@@ -239,7 +239,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "depth",
-        "recon/priors/pointmap.py",
+        "recon/priors/__init__.py",
         (
             "world points are half a pixel off",
             "    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)\n    rays",
@@ -425,7 +425,7 @@ MUTANTS = (
         ),
         (
             "held out: the rim counts",
-            "shown = screening.valid_rectangle(valid)",
+            "shown = keyframes.valid_rectangle(valid)",
             "shown = (slice(0, valid.shape[0]), slice(0, valid.shape[1]))",
         ),
         (
@@ -588,7 +588,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/free_space.py",
+        "recon/daemon/relocalization.py",
         ("a map of a lost robot is told", "        if state is ReconState.LOST:\n            return LOST\n", ""),
     ),
     *_list_mutants(
@@ -686,7 +686,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "export",
-        "recon/result/export/cameras.py",
+        "recon/result/export/stored.py",
         (
             "two cameras of one name are read",
             "if len({camera.name for camera in cameras}) < len(cameras):",

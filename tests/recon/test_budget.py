@@ -6,11 +6,11 @@ import msgspec
 import pytest
 import torch
 
-from splatnode.recon.budget import STAYS, find_budget_hits, loss_fall
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.modelling import STAYS, find_budget_hits, loss_fall
 from splatnode.recon.optimize import training
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
-from splatnode.recon.scene.scene import Gaussians, Scene
+from splatnode.recon.scene import Gaussians, Scene
 
 SECONDS = {"poses": 1.0, "points": 2.0, "optimise": 4.0, "total": 7.0}
 

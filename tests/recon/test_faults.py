@@ -18,8 +18,7 @@ from splatnode.recon.estimation import UnusableFrame, prepare_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import screen_all
 from splatnode.recon.matching import features, pair_matching
-from splatnode.recon.matching.dynamic_objects import moving_points
-from splatnode.recon.matching.view_graph import match
+from splatnode.recon.matching.view_graph import match, moving_points
 from splatnode.recon.priors import stereo
 from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import photographs

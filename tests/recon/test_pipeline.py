@@ -20,10 +20,10 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct, reconstruct_stream
-from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.result.npz_files import format_percent
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.stored_snapshot import format_percent
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.synthetic import SMALL, errors, photographs, places, pure_rotation
 
@@ -100,7 +100,9 @@ def held_out_psnr(snapshot: Snapshot, index: int) -> float:
     )
     K = average_intrinsics(snapshot.cameras, SMALL.width, SMALL.height)
     start = to_estimated.camera(T_world_camera)
-    aligned = find_test_pose(GaussianAppearance(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
+    aligned = find_test_pose(
+        GaussianAppearance(snapshot.gaussians, rasterize_on_cpu), image, start, K, steps=60, levels=2
+    )
     rendered = render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height)
     return psnr(torch.from_numpy(rendered), image)
 

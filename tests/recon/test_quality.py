@@ -9,7 +9,7 @@ from splatnode.extras.evaluate.methods import continue_reconstruction, find_star
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.light import changed, drawn
 
@@ -37,7 +37,7 @@ def score(final: Snapshot, scene: EvaluationScene, split: Split, best_gain: bool
         scene,
         split,
         Run("fast", 0, None, final.seconds, None),
-        rasterize=rasterize,
+        rasterize=rasterize_on_cpu,
         networks=PerceptualNetworks(alex=None, vgg=None),
         settings=Settings(alignment_steps=20, best_gain=best_gain),
     )

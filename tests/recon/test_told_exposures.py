@@ -10,7 +10,7 @@ from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from tests.support.row_of_views import graph_of, maps_of, registration_of
 
 TIMES = (0.01, 0.04, 0.01, 0.01)

@@ -13,8 +13,8 @@ from typing import Any
 import splatnode
 from splatnode.capture.frame import DroppedFrame, Stamp
 from splatnode.capture.process.terminal import ProgressStep
-from splatnode.recon.locating.outcome import LocalizationBounds
-from splatnode.recon.occupancy.grid import Upright
+from splatnode.recon.locating import LocalizationBounds
+from splatnode.recon.occupancy import Upright
 from splatnode.recon.result.snapshot import DepthCheck
 from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict
 from tests.reference.comments import field_comments

@@ -9,7 +9,7 @@ import torch
 
 from splatnode.recon.geometry import exp_se3
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from tests.support.synthetic import tiny_scene
 
 

@@ -12,7 +12,7 @@ from splatnode.capture.diorama import Camera
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import Similarity, align_cameras
-from splatnode.recon.locating.outcome import Located
+from splatnode.recon.locating import Located
 from splatnode.recon.result.snapshot import Landmarks
 from tests.support.synthetic import photographs, view_graph
 

@@ -18,7 +18,7 @@ from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
-from splatnode.recon.daemon.status import ReconState, ReconStatus
+from splatnode.recon.daemon import ReconState, ReconStatus
 from splatnode.recon.result.message import LiveScene, SceneHeader, decode_snapshot, make_camera_record
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.conftest import ROOT

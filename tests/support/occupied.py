@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.diorama import look_at
-from splatnode.recon.occupancy.grid import OccupancyMap, Upright
+from splatnode.recon.occupancy import OccupancyMap, Upright
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from tests.support.exported import make_snapshot
 

@@ -12,10 +12,10 @@ from splatnode.recon.geometry import Similarity
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.scene import Scene
 from splatnode.recon.scene.initialization import SceneInitializationConfig, initialize_scene
-from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT, STEP = 32, 24, 0.3

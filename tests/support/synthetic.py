@@ -20,9 +20,9 @@ from splatnode.recon.keyframes import Keyframe, resize_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph, match
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 
 SMALL = synthetic.Config(views=6, width=320, height=240)
 

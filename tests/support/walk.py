@@ -15,10 +15,10 @@ import numpy as np
 
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.limits import SH_C0
-from splatnode.recon.result.npz_files import DEPTHS, encode_depths
 from splatnode.recon.result.placement import IDENTITY, Placement
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.stored_snapshot import DEPTHS, encode_depths
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.viewer.test_scene import together
 

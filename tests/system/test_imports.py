@@ -43,7 +43,7 @@ def test_loads_without_torch(module):
 
 def test_the_block_bites():
     result = subprocess.run(
-        [sys.executable, "-c", NO_TORCH.format(module="splatnode.recon.scene.scene")],
+        [sys.executable, "-c", NO_TORCH.format(module="splatnode.recon.scene")],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.locating.outcome import Reason
-from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
+from splatnode.recon.locating import Reason
+from splatnode.recon.result.stored_snapshot import LANDMARKS, encode_landmarks
 from tests.conftest import ROOT
 from tests.support.located import known_place, photograph
 

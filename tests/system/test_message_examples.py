@@ -18,7 +18,7 @@ from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.messages import Numbering
 from splatnode.capture.messaging.network import RECON_MAP, RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import StateServer
-from splatnode.recon.occupancy.grid import encode_map as map_message
+from splatnode.recon.occupancy import encode_map as map_message
 from splatnode.recon.result.message import encode_snapshot
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from splatnode.recon.occupancy.grid import VoxelState
+from splatnode.recon.occupancy import VoxelState
 from splatnode.recon.result.report import write_result_folder
 from tests.conftest import ROOT
 from tests.support.occupied import room_snapshot

@@ -12,9 +12,9 @@ from splatnode.capture.config import PreviewHeader
 from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.frame import ExposureSettings, GivenPose, Gravity, Intrinsics, Motion
 from splatnode.capture.messaging import messages, network, pubsub
+from splatnode.recon.daemon import ReconState, ReconStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
-from splatnode.recon.daemon.status import ReconState, ReconStatus
-from splatnode.recon.occupancy.grid import MapHeader, MapRecord
+from splatnode.recon.occupancy import MapHeader, MapRecord
 from splatnode.recon.result.export import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code

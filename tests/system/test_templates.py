@@ -17,7 +17,7 @@ _OWN = {  # templates, and widths, of the program's own that are no constants wh
     "capture/cli.py": {"longest"},
     "extras/evaluate/report.py": {"digits", "measure.digits"},
     "recon/result/snapshot.py": {"max(decimals, 0)"},
-    "recon/verification/rejections.py": {"refusal.message.format", "refusal.advice.format"},
+    "recon/verification/__init__.py": {"refusal.message.format", "refusal.advice.format"},
 }
 _LEVELS = {"debug", "info", "warning", "error", "exception", "critical"}
 

@@ -29,11 +29,11 @@ from splatnode.extras.evaluate.regions import GaussianAppearance
 from splatnode.extras.evaluate.rivals import colmap_3dgs
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import ControlChoice, adaptive
-from splatnode.recon.priors.pointmap import compute_world_points
+from splatnode.recon.priors import compute_world_points
 from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.scene.initialization import gaussians_at
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.threads import Clock
 
 

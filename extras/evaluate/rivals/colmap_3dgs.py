@@ -23,8 +23,8 @@ from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.optimize import ensemble, training
 from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene import Scene, TrainingView
 from splatnode.recon.scene.initialization import gaussians_at
-from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.threads import Clock
 
 SIZE = 512  # longer side of the photographs, pixels

@@ -20,10 +20,9 @@ from splatnode.extras.evaluate.rivals.colmap import SparseModel
 from splatnode.recon.optimize import regularizers, training
 from splatnode.recon.optimize.control import ControlChoice, adaptive, proximity
 from splatnode.recon.optimize.losses import LossChoice, depth
-from splatnode.recon.priors import classical, stereo
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap, classical, stereo
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 
 _WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correlates it
 _DEPTH = regularizers.RegularizerConfig(

@@ -22,6 +22,7 @@ from splatnode.extras.evaluate.stability.trial import ROUGH, CameraError, has_on
 from splatnode.extras.evaluate.stability.window_campaign import KINDS, compute_share_within
 from splatnode.extras.evaluate.stability.windows import OURS, WindowRow
 from splatnode.recon.result.verdict import Code
+from splatnode.recon.verification import DecisionConfig
 from splatnode.recon.verification.decision import LIMITS, EvidenceCase
 from splatnode.recon.verification.error_model import (
     MIN_INLIER_RATIO,
@@ -36,7 +37,6 @@ from splatnode.recon.verification.error_model import (
 )
 from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.refit import Errors
-from splatnode.recon.verification.rejections import DecisionConfig
 
 CLEAN = "clean"  # the kind of trials of lens assumptions that break nothing
 GROSS_SPREAD_PCT = 20.0  # of the true centres' spread

@@ -73,8 +73,7 @@ from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.keyframes import screen_all
-from splatnode.recon.matching.dynamic_objects import mask_moving_objects
-from splatnode.recon.matching.view_graph import match
+from splatnode.recon.matching.view_graph import mask_moving_objects, match
 from splatnode.recon.result.export.staged import hold_result_folder, json_bytes, write_files
 
 # splatnode's answers to windows: the steps of recon/pipeline.py up to the verdict.

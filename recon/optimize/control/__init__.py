@@ -10,7 +10,7 @@ from torch import Tensor
 
 from splatnode.capture.process.config import Plugin
 from splatnode.recon.optimize.photometric_losses import TrainingImage
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 
 
 class ControlChoice(Plugin):

@@ -21,7 +21,7 @@ from torch import Tensor
 from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.rasterize.reference import compute_rotations
-from splatnode.recon.scene.scene import Gaussians, concatenate, logit
+from splatnode.recon.scene import Gaussians, concatenate, logit
 
 NEVER = 2.0  # for `reset_every`: a share of the iterations that is never reached
 _EXTENT_MARGIN = 1.1  # the extent over the largest distance of a camera from their mean, as in the authors' code

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control import GaussianChange, OptimizerStep, adaptive
-from splatnode.recon.scene.scene import Gaussians, concatenate
+from splatnode.recon.scene import Gaussians, concatenate
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -13,9 +13,9 @@ from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.regularizers import sample_pseudo_views
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.scene import Gaussians
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.initialization import REFERENCE_PX, visibility
-from splatnode.recon.scene.scene import Gaussians
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -17,7 +17,7 @@ from torch import Tensor
 from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.rasterize.reference import compute_rotations
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 
 MAX_COPIES = 51  # of one Gaussian, itself included: the size of the authors' tables
 _SHARPNESS = 100.0  # of the sigmoid of the opacity by which noise is weighed

@@ -60,7 +60,7 @@ def read_json_file(path: Path) -> bytes:
 
 # What a Gaussian must satisfy before it is written: viewers trust their input, so files hold only sane values.
 
-SH_C0 = 0.5 / np.sqrt(np.pi)  # the constant basis function; splatnode.recon.scene.scene has it too, but needs torch
+SH_C0 = 0.5 / np.sqrt(np.pi)  # the constant basis function; splatnode.recon.scene has it too, but needs torch
 
 _FARTHEST = 1000.0  # times the median distance from the scene's middle; beyond it a viewer frames nothing else
 _SCALE_LIMITS = (1e-7, 10.0)  # times the same distance

@@ -14,13 +14,13 @@ import msgspec
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.text import guard_untrusted, is_printable
-from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.formats.tum import encode_tum
 from splatnode.recon.result.export.limits import SceneFileError, read_json_file, sanitize_gaussians
 from splatnode.recon.result.export.staged import ResultWriteError, explain_error, json_bytes, write_files
+from splatnode.recon.result.export.stored import encode_cameras
 from splatnode.recon.result.snapshot import Snapshot
 
 # The list of the files that were written together, by which they are known again and removed together.

@@ -26,7 +26,7 @@ from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support.node import PATIENCE_S, Node, Viewer, processor_s, running
 
@@ -127,4 +127,6 @@ def psnr(snapshot: Snapshot | None, scene: EvaluationScene, split: Split) -> flo
         return None
     nowhere = Run("live", 0, None, {}, None)
     networks = PerceptualNetworks(alex=None, vgg=None)
-    return evaluate(snapshot, scene, split, nowhere, rasterize=rasterize, networks=networks, settings=SETTINGS).psnr
+    return evaluate(
+        snapshot, scene, split, nowhere, rasterize=rasterize_on_cpu, networks=networks, settings=SETTINGS
+    ).psnr

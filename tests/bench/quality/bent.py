@@ -27,7 +27,7 @@ from splatnode.extras.evaluate.stability.perturbations import TrialImage, distor
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import Reconstruction, estimate_depth, load_prior
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.registration.undistortion import corner_shift, undistort_keyframes, undistort_pixels
+from splatnode.recon.registration.registration import corner_shift, undistort_keyframes, undistort_pixels
 from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = (

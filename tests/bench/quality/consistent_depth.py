@@ -26,7 +26,7 @@ from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import angles_deg
 from splatnode.recon.pipeline import run
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from tests.bench.quality.held_out import Case
 
 CASES = (
@@ -157,7 +157,14 @@ def measured(case: Case, scenes: Path) -> Row:
     about = Run("preview", 0, None, {}, None)
     networks = PerceptualNetworks(None, None)
     evaluate(
-        snapshot, case.scene, case.split, about, rasterize=rasterize, networks=networks, settings=SEARCH, show=keep
+        snapshot,
+        case.scene,
+        case.split,
+        about,
+        rasterize=rasterize_on_cpu,
+        networks=networks,
+        settings=SEARCH,
+        show=keep,
     )
     return Row(
         scene=case.scene.name,

@@ -25,8 +25,8 @@ from splatnode.extras.evaluate.dataset import Split, load_scene
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Settings
 from splatnode.recon.config import preset
 from splatnode.recon.pipeline import run
-from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.staged import write_file, write_files
+from splatnode.recon.result.export.stored import encode_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.bench.quality.held_out import Case, Scoring
 

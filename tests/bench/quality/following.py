@@ -13,6 +13,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import estimate_cameras, prepare
 from splatnode.recon.geometry import align_cameras, angles_deg
+from splatnode.recon.locating import LocalizationBounds, Located, NotLocated
 from splatnode.recon.locating.localize import (
     QUICK,
     Localization,
@@ -21,7 +22,6 @@ from splatnode.recon.locating.localize import (
     localize_near,
     prepare_query_image,
 )
-from splatnode.recon.locating.outcome import LocalizationBounds, Located, NotLocated
 from splatnode.recon.matching.view_graph import match
 from splatnode.recon.result.snapshot import Landmarks
 

@@ -14,7 +14,7 @@ from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings
 from splatnode.extras.evaluate.protocol import Row as Scored
 from splatnode.extras.evaluate.regions import Counts
 from splatnode.recon.config import preset
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 
 
@@ -51,7 +51,7 @@ class Case:
             self.scene,
             self.split,
             run,
-            rasterize=rasterize,
+            rasterize=rasterize_on_cpu,
             networks=scoring.networks,
             settings=scoring.settings,
             shown=shown,

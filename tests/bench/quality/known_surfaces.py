@@ -15,10 +15,10 @@ import numpy.typing as npt
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import EvaluationScene
 from splatnode.extras.evaluate.regions import Surface
+from splatnode.recon import priors
 from splatnode.recon.geometry import Similarity, transform_to_camera
 from splatnode.recon.keyframes import resize_image
-from splatnode.recon.priors import pointmap, stereo
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap, stereo
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -64,7 +64,7 @@ class KnownSurfaces:
         target = _pointmap(KnownView(T_world_camera, K, nothing))
         nearest = np.full((height, width), np.inf, np.float32)
         for view in self.views.values():
-            nearest = np.minimum(nearest, pointmap.project_nearest(_pointmap(view), target)[0])
+            nearest = np.minimum(nearest, priors.project_nearest(_pointmap(view), target)[0])
         return KnownView(T_world_camera, K, np.where(np.isfinite(nearest), nearest, 0).astype(np.float32))
 
 

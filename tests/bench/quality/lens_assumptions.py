@@ -62,7 +62,7 @@ from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import estimate_cameras, load_prior, prepare
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.keyframes import screen_all
-from splatnode.recon.matching.dynamic_objects import mask_moving_objects
+from splatnode.recon.matching.view_graph import mask_moving_objects
 from splatnode.recon.verification.error_model import VerdictModel
 
 STEP_DEG = 12.0

@@ -42,11 +42,11 @@ from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_pr
 from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.keyframes import screen_all
+from splatnode.recon.locating import Located, NotLocated
 from splatnode.recon.locating.localize import QUICK, follow, localize_image, localize_query, prepare_query_image
-from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching.view_graph import match
-from splatnode.recon.result.npz_files import decode_landmarks, encode_landmarks
 from splatnode.recon.result.snapshot import Landmarks
+from splatnode.recon.result.stored_snapshot import decode_landmarks, encode_landmarks
 from tests.bench.quality.following import SIDE, FollowingFrame, errors_of, nearby, of_frames, placed_near, video
 from tests.conftest import ROOT
 

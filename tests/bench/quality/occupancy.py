@@ -36,9 +36,9 @@ from splatnode.extras.building import CHAIR_ROOM, MIRROR_ROOM, ZONES, interior
 from splatnode.extras.cameras import building
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import Similarity, align_cameras
-from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
+from splatnode.recon.occupancy import NoMap, OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.pipeline import estimate_frames
-from splatnode.recon.priors.pointmap import compute_consistent_depths
+from splatnode.recon.priors import compute_consistent_depths
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.threads import Clock, apply_thread_limit
 from tests.bench.quality.pane import Pane, photograph

@@ -33,10 +33,10 @@ from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_
 from splatnode.recon.config import preset
 from splatnode.recon.core import set_threads
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.locating import Located, NotLocated
 from splatnode.recon.locating.localize import localize_image
-from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.result.npz_files import decode_landmarks, encode_landmarks
 from splatnode.recon.result.snapshot import Landmarks
+from splatnode.recon.result.stored_snapshot import decode_landmarks, encode_landmarks
 from tests.bench.quality.following import errors_of
 from tests.bench.quality.locate import estimated, head_commit, outcome
 from tests.bench.quality.query_warps import BAR, CLEAN, WARPS, Query

@@ -17,7 +17,7 @@ from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.methods import Start, continue_reconstruction
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate, load_networks
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 
 
@@ -33,7 +33,7 @@ def timed(
     snapshot = made()
     seconds = time.process_time() - begun
     run = Run("balanced", 0, None, {"total": seconds}, None)
-    row = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
+    row = evaluate(snapshot, scene, split, run, rasterize=rasterize_on_cpu, networks=networks, settings=settings)
     return snapshot, row, seconds
 
 

@@ -30,9 +30,9 @@ from splatnode.recon.geometry import exp_se3, twist_gradient
 from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize import cpu
+from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.reference import CHANNELS
-from splatnode.recon.scene.scene import SH_C0
+from splatnode.recon.scene import SH_C0
 
 FLOPS_PER_PAIR = 117
 LRS = {"means": 1.6e-3, "quats": 1e-2, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh": 1e-1, "twist": 1e-4}
@@ -162,7 +162,7 @@ class Iteration:
         scales, opacities = params["log_scales"].exp(), params["logit_opacities"].sigmoid()
         start.mark("activations")
         height, width, _ = self.scene.target.shape
-        render = cpu.rasterize(
+        render = dispatch.rasterize_on_cpu(
             params["means"], params["quats"], scales, opacities, params["sh"], self.T_world_camera, self.scene.K,
             width, height, channels=self.channels,
         )  # fmt: skip

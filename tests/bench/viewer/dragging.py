@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.limits import select_gaussians
+from splatnode.recon.result.export.stored import encode_cameras
 from splatnode.viewer.sources import load_result
 from tests.bench.speed.rasterize import processor_name
 from tests.support.node import processor_s

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
+from splatnode.recon.result.stored_snapshot import LANDMARKS, encode_landmarks
 from tests.support.located import known_place
 
 

@@ -17,8 +17,8 @@ from splatnode.extras.audit import (
     find_moves,
     measure_motion,
 )
+from splatnode.recon.locating import LocalizationBounds, Located
 from splatnode.recon.locating.localize import Localization
-from splatnode.recon.locating.outcome import LocalizationBounds, Located
 from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens
 
 LENS = Lens(500.0, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)

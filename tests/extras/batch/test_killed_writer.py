@@ -13,7 +13,7 @@ import pytest
 
 from splatnode.capture.process.files import exclusive
 from splatnode.extras.batch.command import EXIT_GOOD, EXIT_SOME_FAILED
-from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.stored import encode_cameras
 from tests.conftest import ROOT
 from tests.extras.batch.killed_writer import NEVER, run
 from tests.extras.batch.test_write_back import camera, everything, own

@@ -19,7 +19,7 @@ from splatnode.capture.image_file import encode_png
 from splatnode.extras.batch import BatchRecording, recordings
 from splatnode.extras.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
 from splatnode.extras.lerobot import list_parts
-from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.stored import encode_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support import lerobot_sets, mcap_files
 from tests.support.recordings import REFUSAL, REPORT, options

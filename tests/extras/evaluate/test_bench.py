@@ -25,7 +25,7 @@ from splatnode.extras.jobs import ALONE, Engine, Limits, engine, usable_cores
 from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.optimize.training import RefinementConfig as Optimize
 from splatnode.recon.pipeline import reconstruct as pipeline
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.blobs import QUICK, perfect_snapshot, write_scene
@@ -89,7 +89,7 @@ def bench(
 ) -> list[Row]:
     """Methods whose names begin with `shared`, if it is given, start from the same cameras and points."""
     entrants = MethodRunner(reconstruct, shared_by(shared), device)
-    scoring = Scoring(rasterize, create_empty_networks, settings, by_region)
+    scoring = Scoring(rasterize_on_cpu, create_empty_networks, settings, by_region)
     on = on or in_this_process()
     return list(run_bench(plan, entrants, out, scoring=scoring, command="bench", resume=resume, engine=on).rows)
 

@@ -30,12 +30,12 @@ from splatnode.extras.evaluate.protocol import (
 from splatnode.extras.evaluate.regions import UNKNOWN
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon import keyframes
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.formats.ply import encode_ply
+from splatnode.recon.result.export.stored import encode_cameras
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -78,7 +78,7 @@ def score(
         load_scene(folder),
         split,
         RUN,
-        rasterize=rasterize,
+        rasterize=rasterize_on_cpu,
         networks=NO_NETWORKS,
         settings=replace(QUICK, **settings),
         found=found,

@@ -11,7 +11,7 @@ from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_be
 from splatnode.extras.evaluate.stability import campaign
 from splatnode.extras.evaluate.stability.perturbations import ScenesByMotion
 from splatnode.extras.jobs import engine
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from tests.extras.evaluate import test_bench
 from tests.extras.evaluate.stability.test_campaign import six_views
 from tests.extras.evaluate.stability.windows.test_campaign import answered_by, pair_of_scenes
@@ -39,7 +39,7 @@ def test_what_comes_of_ray_is_what_comes_of_a_core(tmp_path):
             tried.append(campaign.run_campaign(trials, ScenesByMotion(()), tmp_path / where / "a", "command", on))
             plan = Plan((tmp_path / "blobs",), (3,), ("shared", "broken"))
             entrants = MethodRunner(test_bench.reconstruct, test_bench.shared_by("shared"))
-            out, scoring = tmp_path / where / "b", Scoring(rasterize, create_empty_networks, QUICK)
+            out, scoring = tmp_path / where / "b", Scoring(rasterize_on_cpu, create_empty_networks, QUICK)
             benched.append(run_bench(plan, entrants, out, scoring=scoring, command="bench", engine=on))
     assert without_costs(tried[0]) == without_costs(tried[1]) and tried[0][0]["num_gaussians"] > 1000
     here, there = ([asdict(test_bench.without_costs(row)) for row in bench.rows] for bench in benched)

@@ -9,7 +9,7 @@ import torch
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import GaussianAppearance
 from splatnode.recon.geometry import angles_deg, exp_se3
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
 from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
 
@@ -40,7 +40,7 @@ def test_test_pose_is_found_again(levels, steps):
     gaussians, true = make_wall(), motion(5, 0.05)
     image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))
     start = true @ motion(6, 0.02)
-    found = find_test_pose(GaussianAppearance(gaussians, rasterize), image, start, K, steps=steps, levels=levels)
+    found = find_test_pose(GaussianAppearance(gaussians, rasterize_on_cpu), image, start, K, steps=steps, levels=levels)
     assert float(np.linalg.norm(start[:3, 3] - true[:3, 3])) > 0.02
     assert float(np.linalg.norm(found.T_world_camera[:3, 3] - true[:3, 3])) < 0.002
     assert angles_deg(found.T_world_camera[:3, :3], true[:3, :3]) < 0.03
@@ -57,7 +57,7 @@ def test_what_is_not_used_does_not_move_the_pose(levels):
     start, off = true @ motion(6, 0.01), []
     for mask in (used, None):
         found = find_test_pose(
-            GaussianAppearance(gaussians, rasterize), image, start, K, steps=200, levels=levels, used=mask
+            GaussianAppearance(gaussians, rasterize_on_cpu), image, start, K, steps=200, levels=levels, used=mask
         )
         off.append(float(np.linalg.norm(found.T_world_camera[:3, 3] - true[:3, 3])))
     assert off[0] < 0.005 < off[1]
@@ -67,7 +67,7 @@ def test_search_never_ends_worse_than_it_started():
     gaussians = make_wall()
     image = torch.from_numpy(render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT))
     found = find_test_pose(
-        GaussianAppearance(gaussians, rasterize), image, np.eye(4), K, steps=3, levels=2, learning_rate=0.5
+        GaussianAppearance(gaussians, rasterize_on_cpu), image, np.eye(4), K, steps=3, levels=2, learning_rate=0.5
     )
     assert found.loss == pytest.approx(0.0, abs=1e-6)
     assert np.array_equal(found.T_world_camera, np.eye(4))

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from splatnode.capture.process.system import remedy
 from splatnode.recon.result.export import export_scene
-from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
+from splatnode.recon.result.stored_snapshot import LANDMARKS, encode_landmarks
 from tests.support.exported import make_gaussians, make_landmarks, make_snapshot, stamped, write
 
 BEGAN_NS = 1_714_989_607_250_000_001

@@ -12,7 +12,7 @@ import pytest
 from splatnode.capture.process.system import remedy
 from splatnode.recon.result import export
 from splatnode.recon.result.export import export_scene
-from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
+from splatnode.recon.result.stored_snapshot import LANDMARKS, encode_landmarks
 from tests.support.exported import make_gaussians, make_landmarks, make_snapshot, write
 
 

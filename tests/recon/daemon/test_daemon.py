@@ -27,14 +27,14 @@ from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.node import Answer, Daemon, RemoveKeyframe
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.locating import Located
 from splatnode.recon.locating.localize import localize_image
-from splatnode.recon.locating.outcome import Located
 from splatnode.recon.optimize import training
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.staged import FolderInUse
 from splatnode.recon.result.message import LiveScene, SceneHeader, decode_snapshot
-from splatnode.recon.result.npz_files import read_depths, read_landmarks
 from splatnode.recon.result.snapshot import format_widest_bounds
+from splatnode.recon.result.stored_snapshot import read_depths, read_landmarks
 from splatnode.recon.result.verdict import RELATIVE, Code
 from tests.capture.messaging.test_sockets import wait_for
 from tests.support.synthetic import photographs, places

@@ -17,9 +17,8 @@ from splatnode.capture.frame import Baseline, ExposureSettings, GivenPose, Gravi
 from splatnode.capture.messaging import messages, pubsub
 from splatnode.capture.messaging.messages import Header
 from splatnode.capture.messaging.pubsub import Want
-from splatnode.recon.daemon import node
-from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.grid import MapHeader
+from splatnode.recon.daemon import ReconStatus, node
+from splatnode.recon.occupancy import MapHeader
 from splatnode.recon.result.message import DepthHeader, SceneHeader
 
 SCHEMAS = [

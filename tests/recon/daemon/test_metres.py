@@ -14,7 +14,7 @@ from splatnode.recon.daemon.output import MetricScaler
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.metric.measurement import MetricConfig as Metric
 from splatnode.recon.result.export import read_cameras
-from splatnode.recon.result.export.cameras import decode_scale
+from splatnode.recon.result.export.stored import decode_scale
 from tests.recon.daemon.test_daemon import config, finished, peer, running  # noqa: F401
 from tests.support.synthetic import SMALL, photographs
 

@@ -22,9 +22,8 @@ from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Inbox
 from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.node import RemoveKeyframe
-from splatnode.recon.daemon.output import Output
+from splatnode.recon.daemon.output import Output, SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.daemon.submap import ActiveSubmap
-from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.result.export import read_cameras
 from tests.capture.messaging.test_sockets import wait_for

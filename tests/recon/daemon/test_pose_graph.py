@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
+from splatnode.recon.daemon.output import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.daemon.pose_graph import LEAST_DEG, LEAST_RELATIVE, EdgeKind, PoseGraphEdge, optimize_pose_graph
-from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.geometry import Similarity
 from tests.support.exported import make_snapshot
 

@@ -19,7 +19,7 @@ from splatnode.recon.daemon import checkpoint, ledger
 from splatnode.recon.daemon import loop_closure as module
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message
-from splatnode.recon.daemon.submap_index import SubmapIndex
+from splatnode.recon.daemon.output import SubmapIndex
 from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.estimation import prepare
 from splatnode.recon.geometry import Similarity

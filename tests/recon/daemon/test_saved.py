@@ -19,9 +19,9 @@ from splatnode.recon.daemon.checkpoint import (
     parse_scene,
 )
 from splatnode.recon.matching.pair_matching import TwoView
-from splatnode.recon.registration.undistortion import undistort_keyframe
+from splatnode.recon.registration.registration import undistort_keyframe
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.scene import exposure as scene_exposure
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
 from tests.support.synthetic import photographs, tiny_scene, view_graph
 
 

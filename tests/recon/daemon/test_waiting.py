@@ -17,12 +17,11 @@ from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.recon import incremental
 from splatnode.recon.config import ReconstructionConfig as Recipe
-from splatnode.recon.daemon import checkpoint, ledger
+from splatnode.recon.daemon import ReconState, checkpoint, ledger
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Inbox
 from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output
-from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap import ActiveSubmap
 from splatnode.recon.daemon.worker import InactiveSubmaps, Worker
 from splatnode.recon.estimation import prepare

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.locating import pose_refinement, verification
-from splatnode.recon.locating.outcome import LocalizationBounds, Reason
+from splatnode.recon.locating import LocalizationBounds, Reason, pose_refinement, verification
 from splatnode.recon.locating.pose_refinement import PINHOLE, CameraModel, Correspondences, Lens
 from splatnode.recon.locating.verification import PoseHypothesis, QueryContext
 

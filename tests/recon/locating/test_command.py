@@ -13,8 +13,8 @@ from splatnode.capture.image_file import encode_png
 from splatnode.capture.recording import Recorder
 from splatnode.command_line import main
 from splatnode.recon.locating.localize import stream_query_frames as named
-from splatnode.recon.result.export.cameras import encode_cameras
-from splatnode.recon.result.npz_files import LANDMARKS, encode_landmarks
+from splatnode.recon.result.export.stored import encode_cameras
+from splatnode.recon.result.stored_snapshot import LANDMARKS, encode_landmarks
 from splatnode.recon.result.verdict import FrameName, ReferenceFrame, Scale
 from tests.support.located import PLACE, known_place, photograph
 

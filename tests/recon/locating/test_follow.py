@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from splatnode.recon.locating import Located, NotLocated
 from splatnode.recon.locating import localize as following
 from splatnode.recon.locating.localize import follow, localize_image
-from splatnode.recon.locating.outcome import Located, NotLocated
 from tests.support.located import errors, known_place, photograph
 
 

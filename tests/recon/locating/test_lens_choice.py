@@ -9,9 +9,8 @@ import pytest
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.keyframes import Features
-from splatnode.recon.locating import pose_refinement
+from splatnode.recon.locating import LensSource, Located, NotLocated, Reason, pose_refinement
 from splatnode.recon.locating.localize import follow, localize_image, prepare_query_image
-from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason
 from splatnode.recon.locating.pose_refinement import (
     PINHOLE,
     CameraModel,

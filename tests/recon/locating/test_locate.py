@@ -9,9 +9,8 @@ import pytest
 from splatnode.capture.frame import Intrinsics
 from splatnode.extras.cameras import building
 from splatnode.recon import opencv_poses
-from splatnode.recon.locating import pose_refinement
+from splatnode.recon.locating import Located, NotLocated, Reason, pose_refinement
 from splatnode.recon.locating.localize import LocalizationConfig, localize_image, localize_query, prepare_query_image
-from splatnode.recon.locating.outcome import Located, NotLocated, Reason
 from tests.support.located import PLACE, errors, known_place, photograph
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import apply_changes, preset
-from splatnode.recon.matching.dynamic_objects import mask_moving_objects, moving_masks
-from splatnode.recon.matching.view_graph import MovingObjectsConfig, ViewGraph
+from splatnode.recon.matching.view_graph import MovingObjectsConfig, ViewGraph, mask_moving_objects, moving_masks
 from splatnode.recon.pipeline import reconstruct_stream, run
 from splatnode.recon.result.report import build_report
 from tests.support.moving import look_of, pasted

@@ -9,7 +9,7 @@ import pytest
 
 import splatnode
 from splatnode.command_line import main
-from splatnode.recon.occupancy.grid import VoxelState
+from splatnode.recon.occupancy import VoxelState
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.stored_snapshot import find_pieces
 from splatnode.recon.result.submap_index import read_map_set

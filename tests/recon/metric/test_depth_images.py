@@ -29,7 +29,7 @@ from splatnode.recon.metric.metres import (
     estimate_scale_from_depth,
     gather_evidence,
 )
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import DepthCode
 from tests.recon.metric import test_stereo

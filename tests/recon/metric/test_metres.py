@@ -18,8 +18,8 @@ from splatnode.recon.metric.metres import Evidence, apply_metric_scale
 from splatnode.recon.metric.stereo import MetricDepth, estimate_scale_from_network
 from splatnode.recon.networks.vit import crop
 from splatnode.recon.result.export import export_scene
-from splatnode.recon.result.export.cameras import decode_scale
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
+from splatnode.recon.result.export.stored import decode_scale
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report, write_result_folder
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot

@@ -24,8 +24,8 @@ from splatnode.recon.metric.metres import (
     transform_rigidly,
 )
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.limits import SceneFileError
+from splatnode.recon.result.export.stored import decode_cameras, decode_scale
 from splatnode.recon.result.message import make_scale_record, parse_scale
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot

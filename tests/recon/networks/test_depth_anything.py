@@ -24,8 +24,7 @@ from splatnode.recon.networks.vit import Dinov2, crop
 from splatnode.recon.networks.vit import Size as VitSize
 from splatnode.recon.optimize.losses.semantic import DinoFeatures, load_dino
 from splatnode.recon.optimize.losses.semantic import load_network as load_dinov2
-from splatnode.recon.priors.monocular import fit_monocular_depth
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap, fit_monocular_depth
 from tests.support.generated import generated_images, generated_weights, shapes_of
 
 TINY = Size(vit=VitSize(width=48, depth=12, heads=3, grid=5), head_width=16, head_layer_widths=(8, 16, 24, 32))

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.metric.metres import transform_rigidly
+from splatnode.recon.occupancy import NoMap, OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.occupancy.files import encode_nav2
-from splatnode.recon.occupancy.grid import NoMap, OccupancyMap, VoxelState, occupancy_map
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale
 from tests.support.exported import make_snapshot

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
-from splatnode.recon.occupancy.grid import occupancy_map
+from splatnode.recon.occupancy import occupancy_map
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.verdict import Code
 from tests.support.exported import make_snapshot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.diorama import look_at
-from splatnode.recon.occupancy.grid import find_floor, level, upright
+from splatnode.recon.occupancy import find_floor, level, upright
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from msgspec.structs import replace as with_fields
 
 from splatnode.capture.messaging.messages import Message, Numbering, WireError, decode, encode
-from splatnode.recon.occupancy.grid import MapHeader, decode_map, encode_map, no_map
+from splatnode.recon.occupancy import MapHeader, decode_map, encode_map, no_map
 from splatnode.recon.result.verdict import Scale
 from tests.support.occupied import small_map
 

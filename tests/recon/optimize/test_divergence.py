@@ -10,7 +10,7 @@ import pytest
 
 from splatnode.recon.optimize.training import check_divergence, compute_photometric_misfit, refine
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from tests.recon.optimize.test_refinement import QUICK, disturbed, photographed
 
 

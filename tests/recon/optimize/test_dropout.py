@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.ensemble import Dropout, DropoutConfig, uncertainty
+from splatnode.recon.scene import Gaussians, TrainingView
 from splatnode.recon.scene.background import SHELL
-from splatnode.recon.scene.scene import Gaussians, TrainingView
 from tests.support.synthetic import plane_pointmap
 
 SEEN = plane_pointmap(np.eye(4), confidence=0.3, frame_id=4)

@@ -14,7 +14,7 @@ from msgspec import structs
 from splatnode.recon.optimize import ensemble
 from splatnode.recon.optimize.fit import Trainer
 from splatnode.recon.optimize.training import RefinementConfig, refine
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.scene import Scene, TrainingView
 from tests.support.known_scene import disturbed, photographed, render
 
 ALONE = RefinementConfig(

@@ -14,10 +14,10 @@ from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.modelling import refine_scene
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.training import SHORT, RefinementWatch, examine, start_watch
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView
+from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from tests.recon.optimize.test_refinement import photographed, plain
 
 SIZE = 64

@@ -11,7 +11,7 @@ from splatnode.recon.optimize.fit import (
     rotate_to_axes,
     rotate_to_world,
 )
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 
 pytestmark = pytest.mark.numerical
 QUARTER_TURN = [

@@ -12,7 +12,7 @@ from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.optimize.photometric_losses import LpipsDistance, PerceptualLossConfig, make_training_image
 from splatnode.recon.optimize.training import RefinementConfig as Refinement
 from splatnode.recon.optimize.training import refine
-from splatnode.recon.scene.scene import Exposure, TrainingView
+from splatnode.recon.scene import Exposure, TrainingView
 from tests.support.known_scene import disturbed, photographed
 
 HEIGHT, WIDTH = 40, 56

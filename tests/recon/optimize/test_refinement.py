@@ -19,10 +19,9 @@ from splatnode.recon.optimize.fit import Trainer
 from splatnode.recon.optimize.losses import LossChoice, normal
 from splatnode.recon.optimize.regularizers import PseudoView
 from splatnode.recon.optimize.training import LearningRates, RefinementConfig, refine
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import SHELL
-from splatnode.recon.scene import initialization
-from splatnode.recon.scene.scene import Scene, TrainingView, logit
+from splatnode.recon.scene import Scene, TrainingView, initialization, logit
 from tests.support.known_scene import disturbed, photographed, render, turned
 
 FROZEN = LearningRates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0, sh=0.0)

@@ -14,7 +14,7 @@ from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.networks.vit import Crop
 from splatnode.recon.optimize import losses
 from splatnode.recon.optimize.regularizers import PseudoView, Regularizer, RegularizerConfig
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.rasterize.reference import Render
 
 PAPER = CONFIGS["paper"].optimize.regularizers

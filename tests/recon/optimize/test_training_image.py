@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.photometric_losses import make_training_image
-from splatnode.recon.scene.scene import Exposure, TrainingView
+from splatnode.recon.scene import Exposure, TrainingView
 
 HEIGHT, WIDTH = 24, 40
 

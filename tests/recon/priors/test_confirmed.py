@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.priors.pointmap import compute_consistent_depths, compute_consistent_shares, find_consistent_pixels
+from splatnode.recon.priors import compute_consistent_depths, compute_consistent_shares, find_consistent_pixels
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 64, 48

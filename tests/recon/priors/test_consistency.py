@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.priors.pointmap import compute_depth_normals
+from splatnode.recon.priors import compute_depth_normals
 from splatnode.recon.priors.stereo import (
     Agreement,
     Confidence,

@@ -16,6 +16,7 @@ from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.networks.vit import crop
+from splatnode.recon.priors import compute_depth_normals
 from splatnode.recon.priors.mast3r import (
     PATCH,
     Config,
@@ -26,7 +27,6 @@ from splatnode.recon.priors.mast3r import (
     load,
     prepare_image,
 )
-from splatnode.recon.priors.pointmap import compute_depth_normals
 from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.verification.decision import DecisionConfig, decide, refuse_before_registration
 from splatnode.recon.verification.evidence import VerificationConfig, verify

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.priors import pointmap
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon import priors
+from splatnode.recon.priors import Pointmap
 
 WIDTH, HEIGHT, FOCAL = 6, 4, 4.0
 
@@ -35,7 +35,7 @@ def grey(value: int) -> np.ndarray:
 
 def test_points_move_by_their_parallax():
     # focal * baseline / depth = 4 * 0.5 / 2 = 1 pixel to the left.
-    depth, footprint = pointmap.project_nearest(view(), view(x=0.5))
+    depth, footprint = priors.project_nearest(view(), view(x=0.5))
     assert (depth[:, :-1] == 2).all() and np.isinf(depth[:, -1]).all()
     np.testing.assert_allclose(footprint[:, :-1], 2 / FOCAL)
     assert np.isinf(footprint[:, -1]).all()
@@ -44,7 +44,7 @@ def test_points_move_by_their_parallax():
 def test_the_nearest_of_several_points_counts_with_its_own_footprint():
     source = view(4.0, focal=2 * FOCAL)
     source.depth[1, 3] = 1.0
-    depth, footprint = pointmap.project_nearest(source, view())
+    depth, footprint = priors.project_nearest(source, view())
     # Twice the focal length: two columns and rows of the source fall into one of the target.
     assert depth[1, 3] == 1.0 and footprint[1, 3] == pytest.approx(1.0 / (2 * FOCAL))
     assert depth[2, 3] == 4.0 and footprint[2, 3] == pytest.approx(4.0 / (2 * FOCAL))
@@ -53,20 +53,20 @@ def test_the_nearest_of_several_points_counts_with_its_own_footprint():
 def test_what_is_behind_the_camera_or_unknown_falls_nowhere():
     behind = view()
     behind.T_world_camera[2, 3] = -5.0
-    assert np.isinf(pointmap.project_nearest(behind, view())[0]).all()
+    assert np.isinf(priors.project_nearest(behind, view())[0]).all()
     nothing = view()
     nothing.depth[:] = 0
-    assert np.isinf(pointmap.project_nearest(nothing, view())[0]).all()
+    assert np.isinf(priors.project_nearest(nothing, view())[0]).all()
 
 
 def test_a_point_explains_a_pixel_of_its_colour_in_every_channel():
-    falls, alike = pointmap.find_explained(view(), grey(100), view(x=0.5), grey(110), colour_tolerance=10 / 255 + 1e-6)
+    falls, alike = priors.find_explained(view(), grey(100), view(x=0.5), grey(110), colour_tolerance=10 / 255 + 1e-6)
     expected = np.ones((HEIGHT, WIDTH), bool)
     expected[:, -1] = False
     assert falls.tolist() == expected.tolist() and alike.tolist() == expected.tolist()
     tinted = grey(100)
     tinted[..., 2] = 121
-    falls, alike = pointmap.find_explained(view(), tinted, view(x=0.5), grey(110), colour_tolerance=10 / 255 + 1e-6)
+    falls, alike = priors.find_explained(view(), tinted, view(x=0.5), grey(110), colour_tolerance=10 / 255 + 1e-6)
     assert falls.tolist() == expected.tolist() and not alike.any()
 
 
@@ -74,7 +74,7 @@ def test_one_of_several_points_that_fall_together_may_explain():
     source = view(focal=2 * FOCAL)
     image = grey(200)
     image[::2, [0, 2, 4, 5]] = 50  # columns 0, 1 2, 3 4 and 5 fall into a column each, and the rows in pairs
-    falls, alike = pointmap.find_explained(source, image, view(), grey(50), colour_tolerance=0.0)
+    falls, alike = priors.find_explained(source, image, view(), grey(50), colour_tolerance=0.0)
     assert falls.any() and alike.tolist() == falls.tolist()
 
 
@@ -82,7 +82,7 @@ def test_a_point_hides_what_lies_behind_it_by_more_than_the_margin():
     target = view(2.0)
     target.depth[:, :3] = 0  # unknown: nothing there to hide
     for depth, hides in ((1.9, True), (1.98, False), (2.5, False)):
-        hiding = pointmap.find_hiding(view(depth), target, tolerance=0.03)
+        hiding = priors.find_hiding(view(depth), target, tolerance=0.03)
         assert not hiding[:, :3].any() and hiding[:, 3:].all() == hides and hiding[:, 3:].any() == hides
 
 
@@ -99,4 +99,4 @@ def test_a_general_pair_of_cameras_agrees_with_numpy():
         if 0 <= column < WIDTH and 0 <= row < HEIGHT:
             expected[row, column] = min(expected[row, column], z)
     assert np.isfinite(expected).sum() > 5
-    np.testing.assert_allclose(pointmap.project_nearest(source, target)[0], expected, rtol=1e-5)
+    np.testing.assert_allclose(priors.project_nearest(source, target)[0], expected, rtol=1e-5)

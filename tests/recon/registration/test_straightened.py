@@ -13,9 +13,9 @@ from splatnode.capture.lenses import undistort_frame
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.registration import Registration
-from splatnode.recon.registration.undistortion import (
+from splatnode.recon.registration.registration import (
     LEAST_SHIFT,
+    Registration,
     apply_known_lenses,
     corner_shift,
     radial_of,

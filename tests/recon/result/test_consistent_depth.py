@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from splatnode.capture.messaging.messages import Header, WireError, decode, encode
-from splatnode.recon.result.export.cameras import decode_cameras, encode_cameras
+from splatnode.recon.result.export.stored import decode_cameras, encode_cameras
 from splatnode.recon.result.message import (
     DepthHeader,
     SceneHeader,
@@ -16,9 +16,14 @@ from splatnode.recon.result.message import (
     decode_snapshot,
     make_depth_header,
 )
-from splatnode.recon.result.npz_files import ADVICE, ConsistentDepthConfig, append_consistent_depth, format_percent
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.stored_snapshot import (
+    ADVICE,
+    ConsistentDepthConfig,
+    append_consistent_depth,
+    format_percent,
+)
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.recon.result.test_message import NUMBERED, sent, snapshot
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export.limits import SceneFileError
-from splatnode.recon.result.npz_files import DEPTHS, decode_depths, encode_depths, read_depths
+from splatnode.recon.result.stored_snapshot import DEPTHS, decode_depths, encode_depths, read_depths
 
 KNOWN = {"a.png": np.arange(12, dtype=np.float16).reshape(3, 4), "ü b.jpg": np.ones((2, 2), np.float16)}
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export.limits import SceneFileError
-from splatnode.recon.result.npz_files import LANDMARKS, decode_landmarks, encode_landmarks, read_landmarks
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
+from splatnode.recon.result.stored_snapshot import LANDMARKS, decode_landmarks, encode_landmarks, read_landmarks
 from tests.support.exported import make_landmarks
 
 

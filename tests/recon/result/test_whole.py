@@ -11,7 +11,7 @@ import torch
 
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.stored import encode_cameras
 from splatnode.recon.result.placement import Placement, compute_sh_basis, compute_sh_terms, rotate_sh
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays

@@ -11,8 +11,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.scene import Gaussians
 from splatnode.recon.scene.background import SHELL, BackgroundConfig, far_shell
-from splatnode.recon.scene.scene import Gaussians
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 64, 48

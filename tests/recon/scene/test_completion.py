@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.scene.background import DepthCompletionConfig, complete, smooth_depth
 from tests.support.synthetic import plane_pointmap, without
 

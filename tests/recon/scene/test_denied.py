@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.scene.transients import find_transient_masks
 from tests.support.synthetic import plane_pointmap
 

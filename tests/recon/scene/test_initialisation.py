@@ -11,11 +11,10 @@ import torch
 from splatnode.capture.process.config import parse_config
 from splatnode.recon import keyframes
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import decode_frame_id
-from splatnode.recon.scene import background, initialization
+from splatnode.recon.scene import Scene, background, initialization
 from splatnode.recon.scene.initialization import initialize_scene
-from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 32, 24

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
+from splatnode.recon.scene import Exposure
 from splatnode.recon.scene.exposure import (
     ExposureConfig,
     apply_exposure,
@@ -21,7 +22,6 @@ from splatnode.recon.scene.exposure import (
     estimate_further_exposures,
     estimate_log_gains,
 )
-from splatnode.recon.scene.scene import Exposure
 
 PLACE = synthetic.Config(views=5, width=240, height=180)
 LIT = {"0": Exposure((1.0, 1.0, 1.0), 0.0, None)}  # the light of the scene was changed

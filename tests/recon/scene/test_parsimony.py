@@ -14,8 +14,8 @@ from splatnode.extras.evaluate.methods import continue_reconstruction, find_star
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.optimize import training
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene import Scene, TrainingView
 from splatnode.recon.scene.initialization import initialize_gaussians
-from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.synthetic import photographs, plane_pointmap, repeated
 
 SHORT = training.RefinementConfig(iterations=20, checkpoints=())

@@ -10,16 +10,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
 from splatnode.recon.result.snapshot import encode_unconfirmed
+from splatnode.recon.scene import Gaussians
 from splatnode.recon.scene.initialization import (
     GaussianInitializationConfig,
     find_redundant_pixels,
     gaussians_from_pointmap,
     initialize_gaussians,
 )
-from splatnode.recon.scene.scene import Gaussians
 from tests.support.synthetic import plane_pointmap, without
 
 NORMAL = (0.36, 0.48, -0.8)  # of a slanted plane

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.scene.exposure import (
     ExposureConfig,
     SharedPixels,

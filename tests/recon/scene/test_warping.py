@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.registration import Registration
-from splatnode.recon.registration.undistortion import undistort_keyframe
+from splatnode.recon.registration.registration import Registration, undistort_keyframe
 from splatnode.recon.scene.growth import registration_in_scene_world, replace_images, update_pointmaps, warp_scene
 from tests.support.row_of_views import HEIGHT, STEP, WIDTH, camera, graph_of, maps_of, registration_of, scene_of
 

@@ -13,7 +13,7 @@ from splatnode.capture.frame import Clock, Stamp
 from splatnode.capture.rig import FrameSet
 from splatnode.recon.registration.rigs import Mount, RigChange, RigEstimate
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, make_ball
-from splatnode.recon.verification.claims import compute_placed_bounds, describe_rig
+from splatnode.recon.verification.error_model import compute_placed_bounds, describe_rig
 
 NAMES = ("front_0", "left_0", "front_1", "left_1")
 AT = Stamp(0, Clock.RECORDING)

@@ -10,15 +10,15 @@ from string import Formatter
 import pytest
 
 import splatnode.recon
+from splatnode.recon import verification
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification import decision, input_kinds, rejections
+from splatnode.recon.verification import Refusal, decision, input_kinds, refuse
 from splatnode.recon.verification.decision import CHECKS
-from splatnode.recon.verification.rejections import Refusal, refuse
 
 ROOT = Path(splatnode.recon.__file__).parent
 ENTRIES = {
     name: entry
-    for module in (rejections, decision, decision, input_kinds)
+    for module in (verification, decision, decision, input_kinds)
     for name, entry in vars(module).items()
     if isinstance(entry, Refusal)
 }
@@ -60,13 +60,13 @@ def test_every_entry_is_a_code_a_sentence_and_an_advice(name):
 
 def test_an_entry_that_is_filled_in_is_a_verdict_without_a_scene():
     given = refuse(
-        rejections.FEW_SHARED_POINTS, ["a.png"], name="a.png", points=3, partner="b.png", centre=9, rotation=2
+        verification.FEW_SHARED_POINTS, ["a.png"], name="a.png", points=3, partner="b.png", centre=9, rotation=2
     )
     assert given.code == Code.NO_OVERLAP and given.frames == ("a.png",) and not given.publishable
     assert given.message.startswith("a.png shares only 3 points with two others at once")
     assert given.advice == "Add a photograph between a.png and b.png."
     with pytest.raises(KeyError, match="needed"):
-        refuse(rejections.ROUGHER, ["a.png"], found=1.0)
+        refuse(verification.ROUGHER, ["a.png"], found=1.0)
 
 
 def test_whether_all_was_computed_is_asked_first():

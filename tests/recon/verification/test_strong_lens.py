@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.verification import DecisionConfig
 from splatnode.recon.verification.decision import STRONG, decide
-from splatnode.recon.verification.rejections import DecisionConfig
 from tests.support.verdicts import all_pairs, evidence, graph, registration
 
 ALL = (0, 1, 2)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from splatnode.recon.result import npz_files
+from splatnode.recon.result import stored_snapshot
 from tests.reference.measured.raw import (
     average_over_sets,
     bullets,
@@ -286,7 +286,7 @@ def consistent_depth() -> str:
     """Quality away from the cameras by the share of multi-view consistent depth."""
     every = list(raw("consistent_depth")["rows"].values())
     found = [row for row in every if row["consistent_depth"] is not None]
-    limit = npz_files.ConsistentDepthConfig().min_share
+    limit = stored_snapshot.ConsistentDepthConfig().min_share
     rows = []
     for words, kept in (
         (f"below {percent(limit)}", [row for row in found if row["consistent_depth"] < limit]),

@@ -31,13 +31,13 @@ from splatnode.capture.messaging.network import REQUEST_LIMITS
 from splatnode.capture.messaging.pubsub import Answer, Want
 from splatnode.capture.process.config import ConfigError, load_config
 from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
+from splatnode.recon.daemon import ReconStatus
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
 from splatnode.recon.daemon.ledger import CheckpointError, Ledger
 from splatnode.recon.daemon.node import Command
-from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.occupancy.grid import MapHeader
-from splatnode.recon.occupancy.grid import decode_map as map_from
+from splatnode.recon.occupancy import MapHeader
+from splatnode.recon.occupancy import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.message import SceneHeader, decode_snapshot

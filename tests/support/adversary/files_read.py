@@ -31,7 +31,7 @@ from splatnode.extras.logged.messages import (
     rgb,
 )
 from splatnode.recon.result.export.limits import SceneFileError
-from splatnode.recon.result.npz_files import decode_depths, decode_landmarks
+from splatnode.recon.result.stored_snapshot import decode_depths, decode_landmarks
 from tests.support.adversary import archives, images, lenses, logs, poses, stored
 from tests.support.adversary.boundary import Boundary, Reader
 

@@ -11,16 +11,16 @@ from dataclasses import asdict
 
 import numpy as np
 
-from splatnode.recon.result.export.cameras import (
+from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.export.stored import (
     BOUNDS_MEANING,
     FRAME_SET_MEANING,
     GIVEN_MEANING,
     STAMP_MEANING,
+    StoredResult,
     make_given_dict,
     make_stamp_dict,
 )
-from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import RELATIVE, Scale
 

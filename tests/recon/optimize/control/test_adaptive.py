@@ -10,8 +10,8 @@ import torch
 
 from splatnode.recon.optimize.control import OptimizerStep, adaptive, proximity
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss, TrainingImage
-from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.scene import Gaussians
 from tests.support.synthetic import tiny_scene
 
 K = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
@@ -54,7 +54,7 @@ def test_the_gradient_in_the_image_is_that_of_moving_what_is_seen():
     photograph = TrainingImage(scene.Ks[0], scene.width, scene.height, IMAGE.loss)
 
     def image(K):
-        return rasterize(of.means, of.quats, of.scales, of.opacities, of.sh, T, K, scene.width, scene.height)
+        return rasterize_on_cpu(of.means, of.quats, of.scales, of.opacities, of.sh, T, K, scene.width, scene.height)
 
     ramp = torch.linspace(0, 1, scene.width)[None, :, None] + torch.linspace(0, 2, scene.height)[:, None, None]
     (image(scene.Ks[0]).rgb * ramp).sum().backward()

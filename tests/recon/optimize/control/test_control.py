@@ -11,7 +11,7 @@ from msgspec import structs
 
 from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.training import refine
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene import Scene
 from tests.recon.optimize.test_refinement import plain, truth  # noqa: F401  a fixture
 
 QUICK = plain(iterations=6, half_resolution_share=0.5)

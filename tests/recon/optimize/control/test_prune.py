@@ -15,9 +15,9 @@ from splatnode.recon.optimize.photometric_losses import TrainingImage, make_trai
 from splatnode.recon.optimize.regularizers import sample_pseudo_views
 from splatnode.recon.optimize.training import refine
 from splatnode.recon.rasterize.dispatch import Camera
+from splatnode.recon.scene import Gaussians, Scene, TrainingView, concatenate
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.initialization import visibility
-from splatnode.recon.scene.scene import Gaussians, Scene, TrainingView, concatenate
 from tests.recon.optimize.test_refinement import plain, render, truth  # noqa: F401  a fixture
 
 

@@ -11,7 +11,7 @@ from splatnode.recon.optimize.control import ControlChoice
 from splatnode.recon.optimize.control.relocate import Config, add_noise, relocate_dead, split_opacity
 from splatnode.recon.optimize.training import RefinementConfig as Optimising
 from splatnode.recon.optimize.training import refine
-from splatnode.recon.scene.scene import Gaussians
+from splatnode.recon.scene import Gaussians
 from tests.recon.optimize.test_refinement import truth  # noqa: F401  a fixture
 
 
