@@ -22,7 +22,7 @@ from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize import ensemble, regularizers, training
 from splatnode.recon.optimize.losses import LossChoice, depth, normal, point_render, semantic
 from splatnode.recon.pipeline import estimate_frames, model_scene, reconstruct
-from splatnode.recon.rasterize.dispatch import Device
+from splatnode.recon.rasterize import Device
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import initialization

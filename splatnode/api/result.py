@@ -15,8 +15,8 @@ import numpy.typing as npt
 from splatnode.api.entrance import enter_api
 from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
 from splatnode.recon import core
+from splatnode.recon.result.export import copy_result
 from splatnode.recon.result.export.limits import sanitize_gaussians
-from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.placement import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.rendering import render_arrays
