@@ -42,7 +42,7 @@ from splatnode.recon.replay_source import (
     load_source,
     parse_sources,
 )
-from splatnode.recon.result.export.result import LIVE_PICTURE
+from splatnode.recon.result.export import LIVE_PICTURE
 from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.message import encode_snapshot, make_depth_header
 from splatnode.recon.result.report import bound_result_bytes, print_summary

@@ -17,7 +17,7 @@ from splatnode.recon.metric import measurement as metric
 from splatnode.recon.optimize import ensemble, photometric_losses, training
 from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.priors import classical
-from splatnode.recon.rasterize.dispatch import Device
+from splatnode.recon.rasterize import Device
 from splatnode.recon.registration import registration
 from splatnode.recon.result import stored_snapshot
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians

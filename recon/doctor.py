@@ -135,7 +135,7 @@ def _poselib() -> Finding:
 def _gpu() -> Finding:
     """Whether Gaussians can be refined on a GPU: the answer of those who would do it."""
     try:
-        from splatnode.recon.rasterize.dispatch import choose_device, format_device
+        from splatnode.recon.rasterize import choose_device, format_device
 
         device = choose_device("auto")
     except (ImportError, OSError) as error:

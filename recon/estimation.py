@@ -19,7 +19,7 @@ from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.metric.depth_fit import fill_measured_depth
 from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
-from splatnode.recon.rasterize.dispatch import choose_device, format_device
+from splatnode.recon.rasterize import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.mapping_problem import compute_pooled_ratio

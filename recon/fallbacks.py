@@ -26,15 +26,14 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon import networks as networks_weights
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.keyframes import PLAIN, Rejected
 from splatnode.recon.matching.features import count_search_pixels
 from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_weak_pair
-from splatnode.recon.networks import depth_anything
-from splatnode.recon.networks import weights as networks_weights
-from splatnode.recon.networks.weights import Weights, find_mismatch, locate_weights
+from splatnode.recon.networks import Weights, depth_anything, find_mismatch, locate_weights
 from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
 from splatnode.recon.result.verdict import Code
@@ -81,7 +80,7 @@ def find_unavailable_reason(part: LearnedPart) -> str:
     known = _catalogue()
     for path in part.weights:
         if path not in known:
-            return f"{path} is not in the catalogue of weights: recon/networks/weights.py needs its entry"
+            return f"{path} is not in the catalogue of weights: recon/networks/__init__.py needs its entry"
         entry, file = known[path], locate_weights(path)
         if file is None:
             return f"no weights: splatnode weights fetch {entry.name}" if entry.url else f"no weights: see {entry.name}"

@@ -31,7 +31,7 @@ from splatnode.capture.process.text import LONGEST_TEXT, sanitize_text
 from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import ControlChoice, prune
-from splatnode.recon.rasterize.dispatch import Camera
+from splatnode.recon.rasterize import Camera
 from splatnode.recon.result.export import SceneFileError, write_result
 from splatnode.recon.result.export.formats.ply import compute_max_gaussians, encode_ply
 from splatnode.recon.result.export.limits import sanitize_gaussians, select_gaussians

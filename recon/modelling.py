@@ -20,7 +20,7 @@ from splatnode.recon.keyframes import valid_masks
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.training import examine, single_torch_thread, start_watch
 from splatnode.recon.priors import Pointmap, compute_consistent_depths
-from splatnode.recon.rasterize.dispatch import choose_device
+from splatnode.recon.rasterize import choose_device
 from splatnode.recon.registration.registration import undistort_keyframes
 from splatnode.recon.result.export.formats.ply import compute_ply_bytes
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, InGivenWorld, OnRig, Snapshot

@@ -342,7 +342,7 @@ VERBS = (
         "weights",
         "get and check the weights of optional networks",
         _weights_arguments,
-        import_lazily("splatnode.recon.networks.weights", "command"),
+        import_lazily("splatnode.recon.networks", "command"),
     ),
     Verb(
         "doctor",

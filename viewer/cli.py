@@ -34,8 +34,7 @@ from splatnode.capture.process.terminal import (
     show_progress,
     show_waiting,
 )
-from splatnode.recon.result.export import ResultWriteError, write_beside, write_files
-from splatnode.recon.result.export.result import LIVE_PICTURE
+from splatnode.recon.result.export import LIVE_PICTURE, ResultWriteError, write_beside, write_files
 from splatnode.recon.result.rendering import use_threads
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.stored_snapshot import load_images

@@ -21,7 +21,7 @@ from splatnode.recon.optimize import ensemble, regularizers, training
 from splatnode.recon.optimize.losses import LossChoice, depth, normal, point_render, semantic
 from splatnode.recon.pipeline import estimate_frames, model_scene, reconstruct
 from splatnode.recon.priors import Pointmap
-from splatnode.recon.rasterize.dispatch import Device
+from splatnode.recon.rasterize import Device
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

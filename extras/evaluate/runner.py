@@ -85,10 +85,10 @@ from splatnode.extras.jobs import (
 )
 from splatnode.extras.jobs import Moment as Since
 from splatnode.extras.jobs import engine as opened
+from splatnode.recon import rasterize
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.pipeline import run as run_pipeline
-from splatnode.recon.rasterize import dispatch
-from splatnode.recon.rasterize.dispatch import Device, make_rasterizer
+from splatnode.recon.rasterize import Device, make_rasterizer
 from splatnode.recon.result.export.staged import hold_result_folder, write_files
 from splatnode.recon.result.report import bound_result_bytes, peak_rss_mb, print_summary, write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
@@ -723,7 +723,7 @@ def evaluate_held_out_views(
         load_scene(capture),
         split,
         Run("balanced", 0, None, snapshot.seconds, None),
-        rasterize=make_rasterizer(dispatch.choose_device(on)),
+        rasterize=make_rasterizer(rasterize.choose_device(on)),
         networks=PerceptualNetworks(alex=None, vgg=None),
         settings=Settings(alignment_steps=DEMO_STEPS, alignment_levels=2),
         show=report_view,
@@ -753,7 +753,7 @@ def bench(args: argparse.Namespace) -> int:
 
 def _run_bench(args: argparse.Namespace) -> Bench:
     wanted = args.device or "cpu"
-    on = dispatch.choose_device(wanted)
+    on = rasterize.choose_device(wanted)
     one_gpu = on.type != "cpu" and (args.ray is not None or (args.cores or 1) > 1)
     plan = Plan(
         tuple(args.scenes),

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.config import Internal
 from splatnode.recon.keyframes import Keyframe
+from splatnode.recon.networks import find, load_network, read_weights
 from splatnode.recon.networks.vit import crop, crop_image
-from splatnode.recon.networks.weights import find, load_network, read_weights
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior
 

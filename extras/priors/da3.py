@@ -22,12 +22,13 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from splatnode.capture.process.config import Internal
+from splatnode.recon import networks as networks_weights
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching.features import describe
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.networks import find
 from splatnode.recon.networks import vit as networks_vit
-from splatnode.recon.networks import weights as networks_weights
 from splatnode.recon.networks.depth_anything import Scratch, resizers, upsample
 from splatnode.recon.networks.vit import (
     PATCH,
@@ -41,7 +42,6 @@ from splatnode.recon.networks.vit import (
     grid_positions,
     normalize_image,
 )
-from splatnode.recon.networks.weights import find
 from splatnode.recon.priors import Pointmap, Prior, make_registered_pointmap
 from splatnode.recon.registration.registration import Registration
 

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from splatnode.recon.networks import weights as networks_weights
-from splatnode.recon.networks.weights import find
+from splatnode.recon import networks as networks_weights
+from splatnode.recon.networks import find
 from splatnode.recon.priors import classical, stereo
 from splatnode.recon.priors.classical import ClassicalPrior
 from splatnode.recon.priors.stereo import DepthMap, Planes, SparsePoints, StereoView, make_level

@@ -1,6 +1,6 @@
 """The compiled core: one C ABI, built once per instruction set and chosen when it is first used.
 
-Everything in here is reached through the Python functions beside its use (`recon.rasterize.dispatch`,
+Everything in here is reached through the Python functions beside its use (`recon.rasterize`,
 `recon.priors.stereo`, ...), which check shapes and types; nothing else should call it.
 """
 

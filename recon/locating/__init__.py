@@ -1,4 +1,4 @@
-"""What is said of a photograph: where it was taken, or why that cannot be said."""
+"""Where a photograph that was not in the set was taken, in a finished scene; or why that cannot be said."""
 
 from __future__ import annotations
 

@@ -16,15 +16,17 @@ from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progre
 from splatnode.capture.process.text import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.depth_fit import DepthFit, DepthView, fit_depth_images, merge_lens
-from splatnode.recon.metric.markers import MarkerDetection, detect_markers, estimate_scale_from_markers
 from splatnode.recon.metric.measurement import (
     MAX_DEVIATION,
+    MarkerDetection,
     Measurement,
     MetricConfig,
     MetricView,
     combine_measurements,
     compute_scale_sigma,
+    detect_markers,
     estimate_scale_from_distance,
+    estimate_scale_from_markers,
     make_metric_views,
 )
 from splatnode.recon.metric.odometry import (

@@ -17,10 +17,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from splatnode.recon import networks
+from splatnode.recon.networks import locate_weights
 from splatnode.recon.networks import vit as networks_vit
-from splatnode.recon.networks import weights
 from splatnode.recon.networks.vit import PATCH, Crop, Dinov2, crop, crop_image, normalize_image
-from splatnode.recon.networks.weights import locate_weights
 
 # Fusion of features from coarse to fine: the decoder of dense prediction transformers (DPT, Ranftl et al. 2021).
 
@@ -171,7 +171,7 @@ class _HeadScratch(Scratch):
 def load_network(path: Path, size: Size = SMALL, *, max_m: float | None = None) -> DepthAnythingV2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
     build = partial(DepthAnythingV2, size, max_m=max_m)
-    return weights.load_network(build, weights.read_weights(path), path, "Depth Anything V2 Small")
+    return networks.load_network(build, networks.read_weights(path), path, "Depth Anything V2 Small")
 
 
 @dataclass(frozen=True, eq=False)

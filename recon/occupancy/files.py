@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from splatnode.capture.process.terminal import say, show_waiting
 from splatnode.recon.occupancy import OccupancyMap, VoxelState, occupancy_map
-from splatnode.recon.result.export.result import MAPS, OF_A_MAP, make_entries, read_digests
+from splatnode.recon.result.export import MAPS, OF_A_MAP, make_entries, read_digests
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.stored_snapshot import read_depths, read_result

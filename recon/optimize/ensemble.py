@@ -20,7 +20,7 @@ from torch import Tensor
 from splatnode.capture.process.config import Internal
 from splatnode.recon.geometry import transform_to_camera
 from splatnode.recon.optimize import regularizers
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.result.snapshot import decode_frame_id
 from splatnode.recon.scene import Gaussians, Scene, TrainingView
 

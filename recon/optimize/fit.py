@@ -16,14 +16,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.recon import rasterize
 from splatnode.recon.core import library
 from splatnode.recon.geometry import exp_se3, matrices_from_quats, twist_gradient
 from splatnode.recon.optimize import ensemble, photometric_losses, regularizers
 from splatnode.recon.optimize.control import Control, OptimizerStep
 from splatnode.recon.optimize.photometric_losses import TrainingImage, make_training_image
 from splatnode.recon.optimize.regularizers import PseudoView, Regularizer
-from splatnode.recon.rasterize import dispatch
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.rasterize.reference import Render
 from splatnode.recon.scene import Gaussians, Scene, TrainingView, compute_fit_masks
 
@@ -75,7 +75,7 @@ class Adam:
         gradients = {name: _gradient(name, group.param) for name, group in moving.items()}
         for group in moving.values():
             group.steps += 1
-        if all(dispatch.is_on_cpu(group.param) for group in moving.values()):
+        if all(rasterize.is_on_cpu(group.param) for group in moving.values()):
             self._step_natively(moving, gradients, factors)
             return
         self._step_by_torch(moving, gradients, factors)
@@ -269,7 +269,7 @@ def rotate_to_world(offsets: Tensor, gaussians: Gaussians) -> Tensor:
 def make_axis_rotation(gaussians: Gaussians) -> Callable[..., Tensor]:
     """A function of vectors (N, 3) and of `to_world`, by which vectors along the axes of `gaussians` turn into it."""
     quats, log_scales = gaussians.quats.detach(), gaussians.log_scales.detach()
-    if dispatch.is_on_cpu(quats):
+    if rasterize.is_on_cpu(quats):
         return partial(_rotate_by_core, quats, log_scales)
     return partial(rotate_by_torch, axes_by_torch(quats, log_scales))
 

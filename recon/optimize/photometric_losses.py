@@ -21,10 +21,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from splatnode.capture.process.config import Internal
+from splatnode.recon import rasterize
 from splatnode.recon.core import library
 from splatnode.recon.networks.lpips import MIN_SIDE, Lpips, load_lpips
 from splatnode.recon.optimize.losses import Schedule
-from splatnode.recon.rasterize import dispatch
 from splatnode.recon.scene import TrainingView
 
 # Perceptual distance of two images: LPIPS where its weights are present, else image gradients over several scales.
@@ -277,7 +277,7 @@ class PhotometricLoss:
         if not bool(torch.isfinite(self.target).all()):
             raise ValueError("target must be finite")
         self._on_device: LossWeights | None = None  # where torch computes
-        if not dispatch.is_on_cpu(self.target):
+        if not rasterize.is_on_cpu(self.target):
             self._on_device = make_weights(self.target, ssim_weight, self._weights)
             return
         pixels = float(target.shape[0] * target.shape[1])

@@ -22,7 +22,7 @@ from splatnode.capture.process.config import Internal
 from splatnode.recon.networks.depth_anything import load_relative
 from splatnode.recon.optimize.losses import Evaluate, Loss, LossChoice, Schedule
 from splatnode.recon.priors import Pointmap, fit_monocular_depth
-from splatnode.recon.rasterize.dispatch import Camera
+from splatnode.recon.rasterize import Camera
 from splatnode.recon.rasterize.reference import Render
 from splatnode.recon.scene import TrainingView
 

@@ -29,7 +29,7 @@ from splatnode.recon.optimize.fit import PARAMETERS, Trainer
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss, make_training_image, scale_intrinsics
 from splatnode.recon.optimize.regularizers import PointRender, PseudoView, render_points, sample_pseudo_views
 from splatnode.recon.priors import compute_world_points
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.result.snapshot import SHELL
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import Gaussians, Scene, TrainingView, compute_fit_masks, logit

@@ -1,4 +1,7 @@
-"""Pointmap: what every prior gives for a keyframe, in one world frame."""
+"""Priors: each proposes matches where plain features find few, and gives depth to registered cameras.
+
+Pointmap: what every prior gives for a keyframe, in one world frame.
+"""
 
 from __future__ import annotations
 
@@ -317,7 +320,7 @@ def compute_depth_range(
 # The interface of priors. A new prior is one file or folder of recon/priors, and no line elsewhere.
 #
 # Its module has `Config`, a Struct with at least `seed`, and `load(config)`; `splatnode.recon.fallbacks` says what a
-# module with learned weights has beside them. The weights need an entry in recon/networks/weights.py.
+# module with learned weights has beside them. The weights need an entry in recon/networks/__init__.py.
 
 
 class Prior(Protocol):

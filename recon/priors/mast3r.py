@@ -34,10 +34,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from splatnode.capture.process.config import Internal
+from splatnode.recon import networks
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.networks import weights
+from splatnode.recon.networks import LruCache, find
 from splatnode.recon.networks.depth_anything import Fusion
 from splatnode.recon.networks.vit import (
     Attention,
@@ -52,7 +53,6 @@ from splatnode.recon.networks.vit import (
     grid_positions,
     split_heads,
 )
-from splatnode.recon.networks.weights import LruCache, find
 from splatnode.recon.priors import Pointmap, Prior, make_registered_pointmap
 from splatnode.recon.registration.registration import Registration
 
@@ -472,7 +472,7 @@ def load_network(path: Path, size: Size = PUBLISHED) -> Mast3r:
 
     Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError.
     """
-    return weights.load_network(partial(Mast3r, size), weights.read_weights(path), path, "MASt3R")
+    return networks.load_network(partial(Mast3r, size), networks.read_weights(path), path, "MASt3R")
 
 
 class _CrossAttention(nn.Module):

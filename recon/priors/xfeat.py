@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from splatnode.capture.process.config import Internal
 from splatnode.recon.keyframes import Keyframe
-from splatnode.recon.networks.weights import WeightsError, find
+from splatnode.recon.networks import WeightsError, find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior
 

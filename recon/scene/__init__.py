@@ -1,4 +1,7 @@
-"""Scene: the training views and the Gaussians that are fitted to them."""
+"""The scene: training views and Gaussians, and how they begin (completion, seeding, far shell), grow and warp.
+
+Scene: the training views and the Gaussians that are fitted to them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The table of refusals: a code, one sentence that says what was found, and what to do about it.
+"""Verification: what speaks for and against a registration, before anything is published.
+
+The table of refusals: a code, one sentence that says what was found, and what to do about it.
 
 `refuse` fills an entry in. An entry that only one check needs may stand beside that check instead of here.
 """

@@ -23,8 +23,8 @@ from splatnode.capture.frame import DroppedFrame, Intrinsics, Stamp
 from splatnode.capture.process import python
 from splatnode.capture.process.system import remedy
 from splatnode.recon import core
+from splatnode.recon.result.export import copy_result
 from splatnode.recon.result.export.limits import sanitize_gaussians
-from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.export.staged import hold_result_folder
 from splatnode.recon.result.placement import compute_mean_colours, make_flat_sh
 from splatnode.recon.result.rendering import render_arrays

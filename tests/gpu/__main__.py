@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from splatnode.extras.jobs import usable_cores
-from splatnode.recon.rasterize.dispatch import DeviceUnavailable, choose_device, format_device
+from splatnode.recon.rasterize import DeviceUnavailable, choose_device, format_device
 from tests.gpu.agreement import Figure, figures, whole_figures
 from tests.gpu.speed import milliseconds, refinement_ms
 

@@ -17,14 +17,14 @@ from splatnode.capture.cameras import folder as folder_camera
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import write_capture
 from splatnode.extras.evaluate.runner import evaluate_held_out_views
+from splatnode.recon import rasterize as dispatch
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.optimize.control import ControlChoice, prune
 from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training import RefinementConfig, refine
 from splatnode.recon.pipeline import run
-from splatnode.recon.rasterize import dispatch, reference
-from splatnode.recon.rasterize.dispatch import Device
+from splatnode.recon.rasterize import Device, reference
 from splatnode.recon.scene import Scene
 from tests.support.known_scene import disturbed, photographed, render, turned
 from tests.support.rasterize_cases import HEIGHT, NAMES, WIDTH, Case, images, moderate, relative_error

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.methods import extract_start_config, find_start
+from splatnode.recon import rasterize
 from splatnode.recon.config import preset
 from splatnode.recon.modelling import create_initial_scene
 from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.optimize.training import RefinementConfig, refine
-from splatnode.recon.rasterize import dispatch
 from splatnode.recon.scene import Scene
 from tests.bench.speed.rasterize import CASES, LRS, Case, bumpy_surface
 
@@ -54,7 +54,7 @@ class _Iteration:
 
     def step(self, after_part: Callable[[str], None] = lambda name: None) -> None:
         params, case = self._params, self._case
-        render = dispatch.rasterize(
+        render = rasterize.rasterize(
             params["means"], params["quats"], params["log_scales"].exp(), params["logit_opacities"].sigmoid(),
             params["sh"], *self._camera, case.width, case.height, channels=case.channels,
         )  # fmt: skip

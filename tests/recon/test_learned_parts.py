@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process.config import parse_config
+from splatnode.recon import networks as networks_weights
 from splatnode.recon import priors
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.doctor import findings
 from splatnode.recon.fallbacks import LearnedPart, find_unavailable_reason, list_learned_parts
-from splatnode.recon.networks import weights as networks_weights
-from splatnode.recon.networks.weights import CATALOGUE, Weights
+from splatnode.recon.networks import CATALOGUE, Weights
 
 PARTS = list_learned_parts()
 PATCHMATCHNET = next(part for part in PARTS if part.name == "patchmatchnet")

@@ -20,7 +20,7 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct, reconstruct_stream
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.stored_snapshot import format_percent

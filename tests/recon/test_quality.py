@@ -9,7 +9,7 @@ from splatnode.extras.evaluate.methods import continue_reconstruction, find_star
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate
 from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.light import changed, drawn
 

@@ -15,7 +15,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatnode.recon.rasterize import dispatch, gsplat
+from splatnode.recon import rasterize as dispatch
+from splatnode.recon.rasterize import gsplat
 
 _ALPHA_MIN, _ALPHA_MAX, _TRANSMITTANCE_MIN = 1 / 255, 0.999, 1e-4  # of gsplat's kernels
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from splatnode.recon.geometry import exp_se3
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from tests.support.synthetic import tiny_scene
 

@@ -66,7 +66,8 @@ def test_the_copy_is_what_is_checked(product):
 
 def test_every_wrong_import_is_named_and_breaks_its_contract(product):
     for importer, imported in WRONG:
-        with (product / f"{importer.replace('.', '/')}.py").open("a") as file:
+        room = product / importer.replace(".", "/")
+        with (room / "__init__.py" if room.is_dir() else room.with_suffix(".py")).open("a") as file:
             file.write(f"\nimport {imported}\n")
     done = lint(product)
     assert done.returncode != 0

@@ -91,7 +91,7 @@ HARMLESS = {
         "capture/cameras/v4l2.py:close",
         "extras/batch/__init__.py:_is",
         "extras/jobs/ray.py:_apply",
-        "recon/result/export/result.py:remove_result",
+        "recon/result/export/__init__.py:remove_result",
         "recon/result/export/staged.py:_remove",
         "recon/result/export/staged.py:_write_files",
         "recon/result/export/staged.py:_write_through",

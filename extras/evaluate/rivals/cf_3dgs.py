@@ -30,7 +30,7 @@ from splatnode.extras.evaluate.rivals import colmap_3dgs
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.control import ControlChoice, adaptive
 from splatnode.recon.priors import compute_world_points
-from splatnode.recon.rasterize.dispatch import rasterize
+from splatnode.recon.rasterize import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from splatnode.recon.scene.initialization import gaussians_at

@@ -42,7 +42,7 @@ from splatnode.recon.config import PREVIEW, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius, umeyama
 from splatnode.recon.pipeline import estimate_frames, reconstruct, reconstruct_stream
-from splatnode.recon.rasterize.dispatch import rasterize
+from splatnode.recon.rasterize import rasterize
 from splatnode.recon.registration.registration import register
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot

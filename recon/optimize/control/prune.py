@@ -12,7 +12,7 @@ from torch import Tensor
 from splatnode.capture.process.config import Internal
 from splatnode.recon.optimize.control import GaussianChange, OptimizerStep
 from splatnode.recon.optimize.regularizers import sample_pseudo_views
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.scene import Gaussians
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.initialization import REFERENCE_PX, visibility

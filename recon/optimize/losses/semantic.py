@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from splatnode.recon.networks import weights
+from splatnode.recon import networks
+from splatnode.recon.networks import locate_weights
 from splatnode.recon.networks.vit import PATCH, Dinov2, normalize_image
-from splatnode.recon.networks.weights import locate_weights
 from splatnode.recon.optimize.losses import Loss, Schedule
 from splatnode.recon.optimize.regularizers import Supervision
 from splatnode.recon.rasterize.reference import Render
@@ -56,7 +56,7 @@ def load_dino() -> DinoFeatures | None:
 
 def load_network(path: Path) -> Dinov2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
-    return weights.load_network(Dinov2, weights.read_weights(path), path, "DINOv2 ViT-S/14")
+    return networks.load_network(Dinov2, networks.read_weights(path), path, "DINOv2 ViT-S/14")
 
 
 class Config(Schedule, frozen=True, forbid_unknown_fields=True):

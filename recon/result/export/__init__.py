@@ -3,19 +3,209 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import hashlib
+import os
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
+from types import MappingProxyType
 from typing import Protocol, cast
 
+import msgspec
+
 from splatnode.capture.process import plugins
+from splatnode.capture.process.config import record_in
+from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import say, show_waiting
+from splatnode.capture.process.text import guard_untrusted, is_printable
 from splatnode.recon.result.export import formats
-from splatnode.recon.result.export.limits import EVERYTHING, Box, SceneFileError, Selection, sanitize_gaussians
-from splatnode.recon.result.export.result import remove_result, write_beside, write_result
-from splatnode.recon.result.export.staged import ResultWriteError, write_file, write_files
-from splatnode.recon.result.export.stored import StoredResult, read_cameras, read_gaussians
+from splatnode.recon.result.export.formats.colmap import encode_colmap
+from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
+from splatnode.recon.result.export.formats.ply import encode_ply
+from splatnode.recon.result.export.formats.tum import encode_tum
+from splatnode.recon.result.export.limits import (
+    EVERYTHING,
+    Box,
+    SceneFileError,
+    Selection,
+    read_json_file,
+    sanitize_gaussians,
+)
+from splatnode.recon.result.export.staged import ResultWriteError, explain_error, json_bytes, write_file, write_files
+from splatnode.recon.result.export.stored import StoredResult, encode_cameras, read_cameras, read_gaussians
+from splatnode.recon.result.snapshot import Snapshot
+
+# write_result: a snapshot as the folder that `splatnode replay` leaves.
+
+# The list of the files that were written together, by which they are known again and removed together.
+
+MANIFEST = "manifest.json"  # of a result
+EXPORTS = "exports.json"  # of what was made of a result afterwards and put into its folder: exports, pictures
+OF_A_MAP = "map.json"  # of a map of free space
+MAPS = "occupancy"  # the folder in a result's own that its map is in, where nobody names another
+
+
+LIVE_PICTURE = "live.png"  # which a viewer without a window keeps up to date while a scene is made
+
+
+class _Entry(msgspec.Struct, frozen=True):
+    sha256: str
+
+
+class _Manifest(msgspec.Struct, frozen=True):
+    files: dict[str, _Entry]
+
+
+def make_entries(files: Mapping[str, bytes]) -> dict[str, dict[str, object]]:
+    """Makes the manifest's entry for each of the files."""
+    return {name: {"bytes": len(data), "sha256": sha256(data)} for name, data in files.items()}
+
+
+def read_digests(path: Path) -> dict[str, str]:
+    """SHA-256 by file of what the manifest `path` lists; empty where there is none that can be read.
+
+    Raises what is_shortage tells.
+    """
+    try:
+        with guard_untrusted(SceneFileError):
+            manifest = record_in(read_json_file(path), _Manifest)
+    except (OSError, SceneFileError) as error:
+        raise_shortage(error)
+        return {}
+    return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
+
+
+def read_derived_digests(folder: Path) -> dict[str, str]:
+    """SHA-256 by file of what was made of the result in `folder`, and of the manifests: maps, exports and pictures."""
+    found = {}
+    for manifest in (OF_A_MAP, f"{MAPS}/{OF_A_MAP}", EXPORTS):
+        within = manifest.removesuffix(OF_A_MAP).removesuffix(EXPORTS)
+        listed = {f"{within}{name}": digest for name, digest in read_digests(folder / manifest).items()}
+        try:
+            listed |= {manifest: sha256((folder / manifest).read_bytes())} if listed else {}
+        except OSError as error:
+            raise_shortage(error)
+        found |= listed
+    return found
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def write_result(
+    snapshot: Snapshot,
+    out_dir: Path,
+    report: Mapping[str, object],
+    *,
+    preview: bytes | None = None,
+    further: Mapping[str, bytes] = MappingProxyType({}),
+) -> Path:
+    """Writes scene.ply, the cameras in four formats, preview.png, report.json and manifest.json; returns its path.
+
+    `further` are other files of the scene, by name in the folder.
+
+    A scene that its verdict does not let be published leaves report.json and manifest.json only. The folder holds one
+    result: files that an earlier manifest lists, that are unchanged since, and that this result does not have are
+    removed once the new manifest is there, and so is what was made of it: maps, exports and pictures. `report` is that
+    of `build_report`. Raises ResultWriteError, with an earlier result intact, where the files cannot be written.
+    """
+    files = {"report.json": json_bytes(report)}
+    if snapshot.verdict.publishable:
+        files = _scene_files(snapshot, preview) | dict(further) | files
+    previous = read_digests(out_dir / MANIFEST)
+    manifest = {**snapshot.scale.record(), "verdict": snapshot.verdict.code.value, "files": make_entries(files)}
+    gone = read_derived_digests(out_dir) | previous
+    superseded = {name: digest for name, digest in gone.items() if name not in files and name != MANIFEST}
+    write_files(out_dir, files | {MANIFEST: json_bytes(manifest)}, superseded)
+    return out_dir / MANIFEST
+
+
+def copy_result(folder: Path, out_dir: Path) -> Path:
+    """Writes the result that lies in `folder` into `out_dir`, as `write_result` wrote it; returns the manifest's path.
+
+    Raises SceneFileError where the files are not those of its manifest any more, and ResultWriteError.
+    """
+    listed, files = read_digests(folder / MANIFEST), {}
+    for name, digest in listed.items():
+        path = folder / name
+        if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
+            raise SceneFileError(f"{path} is not there any more, and {MANIFEST} lists it")
+        files[name] = path.read_bytes()
+        if sha256(files[name]) != digest:
+            raise SceneFileError(f"{path} was changed since it was written: it is not what {MANIFEST} tells of")
+    if not files:
+        raise SceneFileError(f"{folder} has no {MANIFEST} that can be read: it is no result that was written whole")
+    files[MANIFEST] = (folder / MANIFEST).read_bytes()
+    gone = read_derived_digests(out_dir) | read_digests(out_dir / MANIFEST)
+    superseded = {name: digest for name, digest in gone.items() if name not in files}
+    write_files(out_dir, files, superseded)
+    return out_dir / MANIFEST
+
+
+def write_beside(path: Path, contents: Mapping[str, bytes], of: Path) -> None:
+    """Writes what was made of the result `of`, a folder or its scene file: `contents`, by path relative to `path`.
+
+    The name "" is that of the file `path` itself. What lies inside of the result's folder is listed in its
+    `exports.json`: the next result that is written there removes it, unless somebody has changed it meanwhile. So does
+    the next export to the same place with what it does not write itself; elsewhere, a folder of several files has such
+    a list of its own. Raises ResultWriteError.
+    """
+    folder = Path(os.path.realpath(of if of.is_dir() else of.parent))
+    if path.is_dir():
+        path = Path(os.path.realpath(path))  # the user's own link
+    target = Path(os.path.realpath(path.parent)) / path.name
+    if not (target.is_relative_to(folder) and read_digests(folder / MANIFEST)):
+        files = {os.path.normpath(f"{path.name}/{name}"): data for name, data in contents.items()}
+        listed = read_digests(path / EXPORTS)
+        gone = {f"{path.name}/{name}": digest for name, digest in listed.items() if name not in contents}
+        if len(contents) > 1:
+            files[f"{path.name}/{EXPORTS}"] = json_bytes({"files": make_entries(contents)})
+        write_files(path.parent, files, gone)
+        return
+    place = target.relative_to(folder)
+    files = {os.path.normpath(place / name): data for name, data in contents.items()}
+    listed = read_digests(folder / EXPORTS)
+    gone = {name: digest for name, digest in listed.items() if name.startswith(f"{place}/") and name not in files}
+    known = {name: {"sha256": digest} for name, digest in listed.items() if name not in gone}
+    write_files(folder, files | {EXPORTS: json_bytes({"files": known | make_entries(files)})}, gone)
+
+
+def remove_result(out_dir: Path) -> None:
+    """Removes what `write_result` wrote and nobody changed since, and the folder if it is empty then.
+
+    Raises ResultWriteError.
+    """
+    previous = read_digests(out_dir / MANIFEST)
+    if not previous:
+        return
+    try:
+        own = {MANIFEST: sha256((out_dir / MANIFEST).read_bytes())}
+    except OSError as error:
+        raise ResultWriteError(error.errno, explain_error(error, out_dir)) from error
+    write_files(out_dir, {}, read_derived_digests(out_dir) | previous | own)
+    for folder in (out_dir / MAPS, out_dir):
+        with contextlib.suppress(OSError):  # others' files may be in it
+            folder.rmdir()
+
+
+def _scene_files(snapshot: Snapshot, preview: bytes | None) -> dict[str, bytes]:
+    gaussians = sanitize_gaussians(snapshot.gaussians)
+    cameras, scale = snapshot.cameras, snapshot.scale
+    colmap = encode_colmap(cameras, gaussians, scale)
+    return {
+        "scene.ply": encode_ply(gaussians, scale),
+        "cameras.json": encode_cameras(cameras, scale),
+        **{f"colmap/{name}": data for name, data in colmap.items()},
+        "trajectory.tum": encode_tum(cameras, scale),
+        "transforms.json": encode_nerfstudio(cameras, scale),
+        **({"preview.png": preview} if preview is not None else {}),
+    }
+
+
+# Scenes and cameras as files. NumPy only: a result can be read, converted and written where there is no torch.
 
 __all__ = [
     "ResultWriteError",

@@ -26,7 +26,7 @@ from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 from tests.support.node import PATIENCE_S, Node, Viewer, processor_s, running
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings, evaluate
 from splatnode.recon.merging import Submap, load_submaps, write_map
-from splatnode.recon.rasterize.dispatch import rasterize
+from splatnode.recon.rasterize import rasterize
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.submap_index import read_map_set

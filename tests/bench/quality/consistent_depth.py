@@ -26,7 +26,7 @@ from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import angles_deg
 from splatnode.recon.pipeline import run
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from tests.bench.quality.held_out import Case
 
 CASES = (

@@ -14,7 +14,7 @@ from splatnode.extras.evaluate.protocol import PerceptualNetworks, Run, Settings
 from splatnode.extras.evaluate.protocol import Row as Scored
 from splatnode.extras.evaluate.regions import Counts
 from splatnode.recon.config import preset
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 
 

@@ -32,8 +32,15 @@ from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import compute_rms_radius
-from splatnode.recon.metric.markers import MarkerDetection, estimate_scale_from_markers
-from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig, MetricView, make_metric_views
+from splatnode.recon.metric.measurement import (
+    Baseline,
+    MarkerDetection,
+    Measurement,
+    MetricConfig,
+    MetricView,
+    estimate_scale_from_markers,
+    make_metric_views,
+)
 from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.metric.odometry import PoseAlignment, PoseSigmas, align_to_poses
 from splatnode.recon.metric.stereo import StereoPair, estimate_scale_from_stereo, make_pairs

@@ -30,7 +30,7 @@ from splatnode.extras.evaluate.report import Bench, redraw
 from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_bench
 from splatnode.extras.jobs import Engine, engine
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.rasterize.dispatch import Device, DeviceUnavailable, choose_device, make_rasterizer
+from splatnode.recon.rasterize import Device, DeviceUnavailable, choose_device, make_rasterizer
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.verbs import add_device

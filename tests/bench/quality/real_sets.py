@@ -17,7 +17,7 @@ from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.methods import Start, continue_reconstruction
 from splatnode.extras.evaluate.protocol import PerceptualNetworks, Row, Run, Settings, evaluate, load_networks
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 
 

@@ -24,13 +24,12 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon import core
+from splatnode.recon import core, rasterize
 from splatnode.recon.config import preset
 from splatnode.recon.geometry import exp_se3, twist_gradient
 from splatnode.recon.optimize.fit import Adam
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize import dispatch
 from splatnode.recon.rasterize.reference import CHANNELS
 from splatnode.recon.scene import SH_C0
 
@@ -162,7 +161,7 @@ class Iteration:
         scales, opacities = params["log_scales"].exp(), params["logit_opacities"].sigmoid()
         start.mark("activations")
         height, width, _ = self.scene.target.shape
-        render = dispatch.rasterize_on_cpu(
+        render = rasterize.rasterize_on_cpu(
             params["means"], params["quats"], scales, opacities, params["sh"], self.T_world_camera, self.scene.K,
             width, height, channels=self.channels,
         )  # fmt: skip

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from splatnode.extras.priors.patchmatchnet import WEIGHTS, NetworkStereo, load_network
 from splatnode.recon.keyframes import resize_image
-from splatnode.recon.networks.weights import find
+from splatnode.recon.networks import find
 from splatnode.recon.priors.classical import DepthEstimator
 from splatnode.recon.priors.stereo import (
     DepthMap,

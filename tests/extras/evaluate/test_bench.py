@@ -25,7 +25,7 @@ from splatnode.extras.jobs import ALONE, Engine, Limits, engine, usable_cores
 from splatnode.recon.config import PRESETS, ReconstructionConfig
 from splatnode.recon.optimize.training import RefinementConfig as Optimize
 from splatnode.recon.pipeline import reconstruct as pipeline
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.blobs import QUICK, perfect_snapshot, write_scene

@@ -30,7 +30,7 @@ from splatnode.extras.evaluate.protocol import (
 from splatnode.extras.evaluate.regions import UNKNOWN
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, distort_image
 from splatnode.recon import keyframes
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio

@@ -11,7 +11,7 @@ from splatnode.extras.evaluate.runner import MethodRunner, Plan, Scoring, run_be
 from splatnode.extras.evaluate.stability import campaign
 from splatnode.extras.evaluate.stability.perturbations import ScenesByMotion
 from splatnode.extras.jobs import engine
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from tests.extras.evaluate import test_bench
 from tests.extras.evaluate.stability.test_campaign import six_views
 from tests.extras.evaluate.stability.windows.test_campaign import answered_by, pair_of_scenes

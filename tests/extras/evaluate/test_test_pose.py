@@ -9,7 +9,7 @@ import torch
 from splatnode.extras.evaluate.protocol import find_test_pose
 from splatnode.extras.evaluate.regions import GaussianAppearance
 from splatnode.recon.geometry import angles_deg, exp_se3
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.result.report import render_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.metric.markers import refine_corners
+from splatnode.recon.metric.measurement import refine_corners
 
 BITS = np.zeros((6, 6), bool)
 BITS[1:5, 1:5] = [[1, 0, 1, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0, 0, 1, 0]]  # number 0 of 4X4_50

@@ -12,8 +12,15 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lenses import project, undistort_frame
-from splatnode.recon.metric.markers import MarkerDetection, detect_markers, estimate_scale_from_markers
-from splatnode.recon.metric.measurement import Baseline, Measurement, MetricConfig, MetricView
+from splatnode.recon.metric.measurement import (
+    Baseline,
+    MarkerDetection,
+    Measurement,
+    MetricConfig,
+    MetricView,
+    detect_markers,
+    estimate_scale_from_markers,
+)
 from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.recon.result.test_preview import snapshot as ball_snapshot

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.networks import weights
-from splatnode.recon.networks.weights import CATALOGUE, Weights, WeightsError, fetch, find, find_mismatch, folder
+from splatnode.recon import networks
+from splatnode.recon.networks import CATALOGUE, Weights, WeightsError, fetch, find, find_mismatch, folder
 
 CONTENT = bytes(range(256)) * 4000
 GOOD = Weights("net/tiny.pth", "a test", "CC0", "", hashlib.sha256(CONTENT).hexdigest(), len(CONTENT))
@@ -132,17 +132,17 @@ def test_a_checkout_beside_a_folder_that_others_can_change_does_not_look_there(t
     file = tmp_path / "shared" / "weights" / "net" / "tiny.pth"
     file.parent.mkdir(parents=True)
     file.write_bytes(CONTENT)
-    monkeypatch.setattr(weights, "__file__", str(module))
+    monkeypatch.setattr(networks, "__file__", str(module))
     monkeypatch.delenv("SPLATNODE_WEIGHTS", raising=False)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    assert weights.locate_weights("net/tiny.pth") == file
+    assert networks.locate_weights("net/tiny.pth") == file
     try:
         change(tmp_path / "shared" / what)
     except PermissionError:
         pytest.skip("needs root, which can be two users")
-    assert weights.locate_weights("net/tiny.pth") is None
+    assert networks.locate_weights("net/tiny.pth") is None
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path / "shared" / "weights"))
-    assert weights.locate_weights("net/tiny.pth") == file  # whoever names it means it
+    assert networks.locate_weights("net/tiny.pth") == file  # whoever names it means it
 
 
 def test_a_file_with_another_digest_is_not_kept(server, tmp_path):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from splatnode.recon.networks.weights import read_weights
+from splatnode.recon.networks import read_weights
 
 
 def packed(tensors: dict, folder: Path) -> Path:

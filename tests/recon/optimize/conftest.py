@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from splatnode.recon.rasterize import dispatch
+from splatnode.recon import rasterize
 
 
 @pytest.fixture(params=["core", "torch"])
 def computed_by(request, monkeypatch) -> str:
     """Runs a test twice: with what serves on the processor, and with what serves elsewhere."""
     if request.param == "torch":
-        monkeypatch.setattr(dispatch, "is_on_cpu", lambda tensor: False)
+        monkeypatch.setattr(rasterize, "is_on_cpu", lambda tensor: False)
     return request.param

@@ -15,7 +15,7 @@ from splatnode.recon.modelling import refine_scene
 from splatnode.recon.optimize import training
 from splatnode.recon.optimize.training import SHORT, RefinementWatch, examine, start_watch
 from splatnode.recon.priors import Pointmap
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene import Gaussians, Scene, TrainingView
 from tests.recon.optimize.test_refinement import photographed, plain

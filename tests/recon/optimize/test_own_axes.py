@@ -93,5 +93,5 @@ def random_gaussians(count: int = 5000) -> Gaussians:
 def test_gaussians_on_another_device_are_turned_by_torch(monkeypatch: pytest.MonkeyPatch):
     some, vectors = random_gaussians(20), torch.ones(20, 3)
     expected = rotate_to_world(vectors, some)
-    monkeypatch.setattr(fit.dispatch, "is_on_cpu", lambda _: False)
+    monkeypatch.setattr(fit.rasterize, "is_on_cpu", lambda _: False)
     assert rotate_to_world(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-6)

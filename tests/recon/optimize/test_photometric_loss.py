@@ -6,10 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatnode.recon import core
+from splatnode.recon import core, rasterize
 from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss
-from splatnode.recon.rasterize import dispatch
 
 
 def textured(height: int, width: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -64,7 +63,7 @@ def test_the_closed_form_is_the_references(height, width, weighted):
 
 
 def test_where_torch_computes_single_precision_suffices(monkeypatch):
-    monkeypatch.setattr(dispatch, "is_on_cpu", lambda tensor: False)
+    monkeypatch.setattr(rasterize, "is_on_cpu", lambda tensor: False)
     rgb, target = textured(60, 80, 5)
     rgb, target = 0.02 * rgb + 0.9, 0.02 * target + 0.9  # bright and almost plain: where variances lose most digits
     expected_rgb, actual_rgb = rgb.clone().requires_grad_(), rgb.float().requires_grad_()

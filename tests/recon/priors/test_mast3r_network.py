@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
+from splatnode.recon.networks import check_names_and_shapes
 from splatnode.recon.networks.vit import Rotary, grid_positions
-from splatnode.recon.networks.weights import check_names_and_shapes
 from splatnode.recon.priors.mast3r import Mast3r, Size, load_network
 from tests.support.generated import generated, generated_weights, shapes_of
 

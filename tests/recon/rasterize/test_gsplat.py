@@ -8,9 +8,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+from splatnode.recon import rasterize
 from splatnode.recon.geometry import twist_gradient
-from splatnode.recon.rasterize import dispatch, gsplat, reference
-from splatnode.recon.rasterize.dispatch import DeviceUnavailable
+from splatnode.recon.rasterize import DeviceUnavailable, gsplat, reference
 from tests.support import gsplat_by_torch
 from tests.support.rasterize_cases import (
     CASES,
@@ -126,7 +126,7 @@ def test_a_background_shows_through_what_alpha_leaves(by_torch, monkeypatch):
 def test_the_dispatch_follows_the_tensors(by_torch):
     tensors = moderate(34).tensors()
     direct = gsplat.rasterize(*tensors, width=WIDTH, height=HEIGHT)
-    assert torch.equal(dispatch.rasterize(*tensors, WIDTH, HEIGHT).rgb, direct.rgb)
+    assert torch.equal(rasterize.rasterize(*tensors, WIDTH, HEIGHT).rgb, direct.rgb)
 
 
 def test_nothing_in_view(by_torch):
@@ -146,6 +146,6 @@ def test_tensors_must_be_on_the_gpu():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
 def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
     with pytest.raises(DeviceUnavailable, match=r"device cuda needs an NVIDIA GPU .* but .* Take device auto or cpu"):
-        dispatch.choose_device("cuda")
-    assert dispatch.choose_device("auto") == dispatch.choose_device("cpu") == torch.device("cpu")
-    assert "on the processor: the torch that is installed" in dispatch.format_device("auto", torch.device("cpu"))
+        rasterize.choose_device("cuda")
+    assert rasterize.choose_device("auto") == rasterize.choose_device("cpu") == torch.device("cpu")
+    assert "on the processor: the torch that is installed" in rasterize.format_device("auto", torch.device("cpu"))

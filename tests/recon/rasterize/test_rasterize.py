@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon import core
-from splatnode.recon.rasterize import dispatch, reference
+from splatnode.recon.rasterize import rasterize_on_cpu, reference
 from splatnode.recon.result import rendering
 from tests.support.rasterize_cases import (
     HEIGHT,
@@ -31,7 +31,7 @@ from tests.support.rasterize_cases import (
 def test_cpu_equals_the_reference(make, seed, antialias):
     case = make(seed)
     expected_images, expected = render_and_differentiate(reference.rasterize, case, antialias=antialias)
-    actual_images, actual = render_and_differentiate(dispatch.rasterize_on_cpu, case, antialias=antialias)
+    actual_images, actual = render_and_differentiate(rasterize_on_cpu, case, antialias=antialias)
     for image, expected_image in zip(actual_images, expected_images, strict=True):
         assert relative_error(image, expected_image) < 2e-5
     for name, gradient, expected_gradient in zip(NAMES, actual, expected, strict=True):
@@ -42,7 +42,7 @@ def test_cpu_equals_the_reference(make, seed, antialias):
 def test_every_degree_of_spherical_harmonics(bases):
     case = random_case(3, bases=bases)
     _, expected = render_and_differentiate(reference.rasterize, case, channels=("rgb",))
-    _, actual = render_and_differentiate(dispatch.rasterize_on_cpu, case, channels=("rgb",))
+    _, actual = render_and_differentiate(rasterize_on_cpu, case, channels=("rgb",))
     for name, gradient, expected_gradient in zip(NAMES, actual, expected, strict=True):
         assert relative_error(gradient, expected_gradient) < 1e-4, name
 
@@ -52,15 +52,15 @@ def test_every_degree_of_spherical_harmonics(bases):
 )
 def test_channels_are_the_same_alone(channels):
     case = random_case(4)
-    whole = dispatch.rasterize_on_cpu(*case.tensors(), width=WIDTH, height=HEIGHT)
-    part = dispatch.rasterize_on_cpu(*case.tensors(), width=WIDTH, height=HEIGHT, channels=channels)
+    whole = rasterize_on_cpu(*case.tensors(), width=WIDTH, height=HEIGHT)
+    part = rasterize_on_cpu(*case.tensors(), width=WIDTH, height=HEIGHT, channels=channels)
     for name in reference.CHANNELS:
         if name in channels:
             torch.testing.assert_close(getattr(part, name), getattr(whole, name))
         else:
             assert getattr(part, name) is None
     _, expected = render_and_differentiate(reference.rasterize, case, channels=channels)
-    _, actual = render_and_differentiate(dispatch.rasterize_on_cpu, case, channels=channels)
+    _, actual = render_and_differentiate(rasterize_on_cpu, case, channels=channels)
     for name, gradient, expected_gradient in zip(NAMES, actual, expected, strict=True):
         if expected_gradient.norm() == 0:
             assert gradient.norm() == 0, name
@@ -99,7 +99,7 @@ def test_cpu_camera_gradient_against_finite_differences_of_the_definition(parame
         return float(sum((image * image).sum() for image in rendered))
 
     tensors = case.tensors()
-    rendered = images(dispatch.rasterize_on_cpu(*tensors, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha")))
+    rendered = images(rasterize_on_cpu(*tensors, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha")))
     torch.stack([(image * image).sum() for image in rendered]).sum().backward()
     gradient = tensors[NAMES.index(parameter)].grad
     assert gradient is not None
@@ -109,7 +109,7 @@ def test_cpu_camera_gradient_against_finite_differences_of_the_definition(parame
     assert float((gradient * direction).sum()) == pytest.approx(slope, rel=5e-4)
 
 
-@pytest.mark.parametrize("rasterize", [reference.rasterize, dispatch.rasterize_on_cpu], ids=["reference", "cpu"])
+@pytest.mark.parametrize("rasterize", [reference.rasterize, rasterize_on_cpu], ids=["reference", "cpu"])
 def test_one_gaussian_by_hand(rasterize):
     render = rasterize(*single(), width=17, height=17)
     variance = (20 * 0.1 / 2) ** 2 + 0.3
@@ -122,7 +122,7 @@ def test_one_gaussian_by_hand(rasterize):
     assert filtered.rgb[8, 8, 0].item() == pytest.approx(0.5 * (variance - 0.3) / variance, rel=1e-5)
 
 
-@pytest.mark.parametrize("rasterize", [reference.rasterize, dispatch.rasterize_on_cpu], ids=["reference", "cpu"])
+@pytest.mark.parametrize("rasterize", [reference.rasterize, rasterize_on_cpu], ids=["reference", "cpu"])
 @pytest.mark.parametrize(
     ("mean", "seen"),
     [
@@ -143,7 +143,7 @@ def test_instruction_sets_agree(instruction_set, monkeypatch):
     monkeypatch.setattr(rendering, "library", lambda: core.library(instruction_set))
     case = needles(1)
     expected_images, expected = render_and_differentiate(reference.rasterize, case)
-    actual_images, actual = render_and_differentiate(dispatch.rasterize_on_cpu, case)
+    actual_images, actual = render_and_differentiate(rasterize_on_cpu, case)
     for image, expected_image in zip(actual_images, expected_images, strict=True):
         assert relative_error(image, expected_image) < 2e-5
     for name, gradient, expected_gradient in zip(NAMES, actual, expected, strict=True):

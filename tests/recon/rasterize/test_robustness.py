@@ -8,8 +8,8 @@ import sys
 import pytest
 import torch
 
-from splatnode.recon import core
-from splatnode.recon.rasterize import dispatch, reference
+from splatnode.recon import core, rasterize
+from splatnode.recon.rasterize import reference
 from tests.support.rasterize_cases import HEIGHT, NAMES, WIDTH, images, random_case, render_and_differentiate, single
 
 
@@ -20,7 +20,7 @@ def test_the_result_does_not_depend_on_threads():
     try:
         for threads in (1, 2, 5, 2):
             core.set_threads(threads)
-            rendered, gradients = render_and_differentiate(dispatch.rasterize_on_cpu, case)
+            rendered, gradients = render_and_differentiate(rasterize.rasterize_on_cpu, case)
             results.append(rendered + gradients)
     finally:
         core.set_threads(before)
@@ -31,8 +31,8 @@ def test_the_result_does_not_depend_on_threads():
 def test_gradients_can_be_taken_twice_and_interleaved():
     case = random_case(6)
     first, second = case.tensors(), case.tensors()
-    a = dispatch.rasterize_on_cpu(*first, width=WIDTH, height=HEIGHT).rgb
-    b = dispatch.rasterize_on_cpu(*second, width=2 * WIDTH, height=HEIGHT).rgb
+    a = rasterize.rasterize_on_cpu(*first, width=WIDTH, height=HEIGHT).rgb
+    b = rasterize.rasterize_on_cpu(*second, width=2 * WIDTH, height=HEIGHT).rgb
     assert a is not None and b is not None
     a.sum().backward(retain_graph=True)
     once = first[0].grad.clone()
@@ -46,7 +46,7 @@ def test_rasters_are_given_back():
     """The core keeps two idle rasters; many renders must not grow the process."""
     script = (
         "import resource, torch\n"
-        "from splatnode.recon.rasterize.dispatch import rasterize_on_cpu\n"
+        "from splatnode.recon.rasterize import rasterize_on_cpu\n"
         "from tests.support.rasterize_cases import random_case\n"
         "tensors = random_case(0, count=2000).tensors(torch.float32)\n"
         "def peak():\n"
@@ -62,7 +62,7 @@ def test_no_gaussians_give_the_empty_image():
     empty = [torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 1, 3)]
     leaves = [tensor.requires_grad_() for tensor in empty]
     T_world_camera = torch.eye(4).requires_grad_()
-    render = dispatch.rasterize_on_cpu(*leaves, T_world_camera, single()[-1], width=33, height=20)
+    render = rasterize.rasterize_on_cpu(*leaves, T_world_camera, single()[-1], width=33, height=20)
     assert all(image.abs().max() == 0 for image in images(render))
     assert render.rgb.shape == (20, 33, 3)
     render.rgb.sum().backward()
@@ -74,14 +74,14 @@ def test_no_gaussians_give_the_empty_image():
 def test_small_images(width, height):
     case = random_case(8)
     expected = reference.rasterize(*case.tensors(), width=width, height=height)
-    actual = dispatch.rasterize_on_cpu(*case.tensors(), width=width, height=height)
+    actual = rasterize.rasterize_on_cpu(*case.tensors(), width=width, height=height)
     for image, expected_image in zip(images(actual), images(expected), strict=True):
         torch.testing.assert_close(image.double(), expected_image, rtol=1e-4, atol=1e-5)
 
 
 def test_a_large_image():
     tensors = random_case(9, count=500, width=4096, height=3072).tensors(torch.float32)
-    render = dispatch.rasterize_on_cpu(*tensors, width=4096, height=3072, channels=("rgb",))
+    render = rasterize.rasterize_on_cpu(*tensors, width=4096, height=3072, channels=("rgb",))
     assert render.rgb.shape == (3072, 4096, 3)
     render.rgb.mean().backward()
     assert torch.isfinite(tensors[0].grad).all() and tensors[0].grad.abs().max() > 0
@@ -90,17 +90,17 @@ def test_a_large_image():
 def test_a_million_gaussians():
     tensors = random_case(10, count=1_000_000, bases=1).tensors(torch.float32)
     tensors[2] = (tensors[2].detach() * 0.05).requires_grad_()
-    render = dispatch.rasterize_on_cpu(*tensors, width=128, height=96, channels=("rgb",))
+    render = rasterize.rasterize_on_cpu(*tensors, width=128, height=96, channels=("rgb",))
     render.rgb.mean().backward()
     assert render.rgb.max() > 0 and torch.isfinite(tensors[0].grad).all()
 
 
 def test_layout_and_dtype_do_not_matter():
     case = random_case(12)
-    expected = dispatch.rasterize_on_cpu(*case.tensors(torch.float32), width=WIDTH, height=HEIGHT).rgb
+    expected = rasterize.rasterize_on_cpu(*case.tensors(torch.float32), width=WIDTH, height=HEIGHT).rgb
     strided = [tensor.detach().mT.contiguous().mT if tensor.dim() > 1 else tensor for tensor in case.tensors()]
     assert not strided[0].is_contiguous()
-    assert torch.equal(dispatch.rasterize_on_cpu(*strided, width=WIDTH, height=HEIGHT).rgb, expected)
+    assert torch.equal(rasterize.rasterize_on_cpu(*strided, width=WIDTH, height=HEIGHT).rgb, expected)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_bad_input_is_named(name, change, message):
     tensors = {key: getattr(case, key) for key in NAMES}
     tensors[name] = change(tensors[name])
     with pytest.raises(ValueError, match=message):
-        dispatch.rasterize_on_cpu(*tensors.values(), width=WIDTH, height=HEIGHT)
+        rasterize.rasterize_on_cpu(*tensors.values(), width=WIDTH, height=HEIGHT)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_bad_input_is_named(name, change, message):
 def test_bad_options_are_named(options, message):
     case = random_case(13)
     with pytest.raises(ValueError, match=message):
-        dispatch.rasterize_on_cpu(*case.tensors(), **{"width": WIDTH, "height": HEIGHT, **options})
+        rasterize.rasterize_on_cpu(*case.tensors(), **{"width": WIDTH, "height": HEIGHT, **options})
 
 
 def test_wild_values_stay_finite():
@@ -158,7 +158,7 @@ def test_wild_values_stay_finite():
         tensors[2][50:100] = 1e-30
         tensors[0][100:120] *= 1e12
         tensors[4][120:130] *= 1e20
-    render = dispatch.rasterize_on_cpu(*tensors, width=WIDTH, height=HEIGHT)
+    render = rasterize.rasterize_on_cpu(*tensors, width=WIDTH, height=HEIGHT)
     assert all(torch.isfinite(image).all() for image in images(render))
     render.alpha.sum().backward()
     assert all(torch.isfinite(tensor.grad).all() for tensor in tensors if tensor.grad is not None)

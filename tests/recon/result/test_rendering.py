@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.rasterize import dispatch, reference
+from splatnode.recon import rasterize
+from splatnode.recon.rasterize import reference
 from splatnode.recon.result.rendering import NEAR, render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.synthetic import TinyScene, tiny_scene
@@ -29,7 +30,7 @@ def arrays(scene: TinyScene) -> GaussianArrays:
 def test_every_channel_equals_the_rasterisers(bases):
     scene = tiny_scene(bases=bases)
     gaussians = scene.gaussians
-    render = dispatch.rasterize_on_cpu(
+    render = rasterize.rasterize_on_cpu(
         gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh,
         scene.Ts_world_camera[1], scene.Ks[1], scene.width, scene.height,
     )  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.scene import Gaussians
 from splatnode.recon.scene.background import SHELL, BackgroundConfig, far_shell
 from tests.support.synthetic import plane_pointmap

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.scene import SH_C0, Gaussians, concatenate
 from tests.support.synthetic import TinyScene, tiny_scene
 

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.priors import Pointmap
-from splatnode.recon.rasterize.dispatch import Camera, render_gaussians
+from splatnode.recon.rasterize import Camera, render_gaussians
 from splatnode.recon.result.snapshot import encode_unconfirmed
 from splatnode.recon.scene import Gaussians
 from splatnode.recon.scene.initialization import (

@@ -30,8 +30,8 @@ from splatnode.extras import batch
 from splatnode.extras.batch import BatchRecording, read_list
 from splatnode.extras.jobs import End
 from splatnode.recon.result import submap_index
+from splatnode.recon.result.export import read_digests
 from splatnode.recon.result.export.limits import SceneFileError
-from splatnode.recon.result.export.result import read_digests
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -304,7 +304,7 @@ _REPORTS = Reader((), (f"{_BATCH}.answer",))
 _LEDGERS = Reader((batch.OtherBatch,), (f"{_BATCH}.ledger",))
 _QUARANTINES = Reader((), ("splatnode.capture.messaging.keyframe_queue",))
 _LAST_RUNS = Reader((Refused,), ("splatnode.capture.daemon",))
-_MANIFESTS = Reader((), ("splatnode.recon.result.export.result",))
+_MANIFESTS = Reader((), ("splatnode.recon.result.export",))
 _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))
 _NAMES = Reader((ValueError,), ("splatnode.capture.image_header", "splatnode.capture.film"))
 _ARGUMENTS = Reader((Refused,), ("splatnode.capture.process.arguments", "splatnode.capture.process.text"))

@@ -131,7 +131,7 @@ def _read_data_set(files: stored.Files, folder: Path) -> object:
 
 
 def _read_weights(files: stored.Files, folder: Path) -> object:
-    from splatnode.recon.networks.weights import read_weights
+    from splatnode.recon.networks import read_weights
 
     stored.lay(files, folder)
     return [tuple(tensor.shape) for tensor in read_weights(folder / next(iter(files))).values()]
@@ -166,7 +166,7 @@ _DATA_SETS = Reader((lerobot.UnusableDataSet,), ("splatnode.extras.lerobot",))
 _MASKS = Reader((UnusableMask,), _modules("masks"))
 _LANDMARKS = Reader((SceneFileError,), (f"{_RESULT}.landmarks_file", f"{_RESULT}.npz_file"))
 _DEPTHS = Reader((SceneFileError,), (f"{_RESULT}.depth_file",))
-_WEIGHTS = Reader((ValueError,), ("splatnode.recon.networks.weights",))
+_WEIGHTS = Reader((ValueError,), ("splatnode.recon.networks",))
 
 
 def _read_landmarks(data: bytes, folder: Path) -> object:

@@ -10,7 +10,7 @@ import torch
 
 from splatnode.recon.optimize.control import OptimizerStep, adaptive, proximity
 from splatnode.recon.optimize.photometric_losses import PhotometricLoss, TrainingImage
-from splatnode.recon.rasterize.dispatch import rasterize_on_cpu
+from splatnode.recon.rasterize import rasterize_on_cpu
 from splatnode.recon.scene import Gaussians
 from tests.support.synthetic import tiny_scene
 

@@ -14,7 +14,7 @@ from splatnode.recon.optimize.control.prune import Config, estimate_removal_chan
 from splatnode.recon.optimize.photometric_losses import TrainingImage, make_training_image
 from splatnode.recon.optimize.regularizers import sample_pseudo_views
 from splatnode.recon.optimize.training import refine
-from splatnode.recon.rasterize.dispatch import Camera
+from splatnode.recon.rasterize import Camera
 from splatnode.recon.scene import Gaussians, Scene, TrainingView, concatenate
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.initialization import visibility

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians
-from splatnode.recon.result.export.result import write_beside
+from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians, write_beside
 from tests.support.exported import make_gaussians, make_snapshot, write
 
 
