@@ -1,1 +1,1 @@
-"""Export formats, one a module: `--to spz` is the module spz. `export/format.py` says what a module must have."""
+"""Export formats, one a module: `--to spz` is the module spz. `export` itself says what a module must have."""
