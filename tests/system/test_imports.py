@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from tests.conftest import ROOT
+from tests.system.test_sizes import ROOMS
 
 NO_TORCH = """
 import sys
@@ -72,3 +76,34 @@ def test_a_users_own_modules_may_have_the_names_of_our_rooms(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     printed = subprocess.check_output([sys.executable, str(script)], cwd=tmp_path, env=environment, text=True)
     assert printed == "the user, of capture; the user, of recon; the user, of viewer\n"
+
+
+def find_hidden_modules(root: Path) -> Iterator[str]:
+    """Yields the modules whose names their package gives to something else: `from package import module` finds that."""
+    for room in ROOMS:
+        for package in sorted((root / room).rglob("__init__.py")):
+            folder = package.parent
+            own = {path.stem if path.suffix == ".py" else path.name for path in folder.iterdir()}
+            name = ".".join(("splatnode", *folder.relative_to(root).parts)).replace("splatnode.splatnode", "splatnode")
+            for node in ast.parse(package.read_text()).body:
+                if isinstance(node, ast.ImportFrom) and node.module != name:
+                    bound = {alias.asname or alias.name for alias in node.names}
+                elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+                    bound = {node.name}
+                else:
+                    continue
+                yield from (f"{name}.{each}" for each in sorted(bound & own))
+
+
+def test_a_package_hides_no_module_of_its_own():
+    assert list(find_hidden_modules(ROOT)) == []
+
+
+def test_a_module_that_its_package_hides_is_named(tmp_path):
+    folder = tmp_path / "extras" / "batch"
+    folder.mkdir(parents=True)
+    lines = ("from splatnode.extras.cameras import mcap", "from splatnode.extras.batch import ray")
+    (folder / "__init__.py").write_text("\n".join(lines))
+    for name in ("mcap", "ray"):
+        (folder / f"{name}.py").write_text("")
+    assert list(find_hidden_modules(tmp_path)) == ["splatnode.extras.batch.mcap"]
