@@ -26,7 +26,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon import networks as networks_weights
+from splatnode.recon import networks
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
 from splatnode.recon.geometry import align_cameras, angles_deg
@@ -100,7 +100,7 @@ def _priors() -> list[LearnedPart]:
 
 def _catalogue() -> dict[str, Weights]:
     """The catalogue's entries by their paths."""
-    return {entry.path: entry for entry in networks_weights.CATALOGUE}
+    return {entry.path: entry for entry in networks.CATALOGUE}
 
 
 # Fallbacks: what costs more is tried before photographs are refused for want of matches.

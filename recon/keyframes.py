@@ -119,9 +119,8 @@ REMEMBERED_REJECTED = 100  # frames of a stream: more of them change no verdict
 class ScreeningConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Screening: copies, blank and blurred frames are left out before anything is computed from them."""
 
-    limits: keyframe_selection.Limits = (
-        keyframe_selection.Limits()
-    )  # those of capture, which has screened live frames already
+    # Those of capture, which has screened live frames already
+    limits: keyframe_selection.Limits = keyframe_selection.Limits()
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon import networks as networks_weights
+from splatnode.recon import networks
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.matching.features import describe
@@ -281,9 +281,9 @@ class DepthAnything3(nn.Module):
 
 def load_network(path: Path, size: Size = SMALL) -> DepthAnything3:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
-    weights = {name.removeprefix("model."): tensor for name, tensor in networks_weights.read_weights(path).items()}
+    weights = {name.removeprefix("model."): tensor for name, tensor in networks.read_weights(path).items()}
     needed = {name: tensor for name, tensor in weights.items() if not name.startswith(_UNUSED)}
-    return networks_weights.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
+    return networks.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
 
 
 def _normalize_cameras(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:

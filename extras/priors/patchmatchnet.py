@@ -21,7 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from splatnode.recon import networks as networks_weights
+from splatnode.recon import networks
 from splatnode.recon.networks import find
 from splatnode.recon.priors import classical, stereo
 from splatnode.recon.priors.classical import ClassicalPrior
@@ -506,4 +506,4 @@ def load(config: Config) -> ClassicalPrior:
 
 def load_network(path: Path) -> PatchmatchNet:
     """Raises ValueError where the file is damaged or another network's, and FileNotFoundError."""
-    return networks_weights.load_network(PatchmatchNet, networks_weights.read_weights(path), path, "PatchmatchNet")
+    return networks.load_network(PatchmatchNet, networks.read_weights(path), path, "PatchmatchNet")

@@ -23,7 +23,6 @@ from splatnode.recon.registration import (
     self_calibration,
     subpixel,
 )
-from splatnode.recon.registration import mapping_problem as registration_resection
 from splatnode.recon.registration.mapping_problem import (
     Lens,
     MapperInput,
@@ -57,7 +56,7 @@ _MIN_VIEWS = 3  # that must stay when doubtful ones are removed
 class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Incremental mapping: a first pair, then one view after the other, with a bundle adjustment after each."""
 
-    resection: registration_resection.ResectionConfig = registration_resection.ResectionConfig()
+    resection: mapping_problem.ResectionConfig = mapping_problem.ResectionConfig()
     triangulation: multiview_geometry.TriangulationConfig = multiview_geometry.TriangulationConfig()
     robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
     min_points: int = 15  # points that a map needs
@@ -81,7 +80,7 @@ def score(problem: MapperInput, partial: PartialMap, zero_px: float) -> float:
 
     `zero_px` is in pixels at REFERENCE_SIDE; matches with larger errors count 0.
     """
-    errors = registration_resection.pair_errors(problem, partial).values()
+    errors = mapping_problem.pair_errors(problem, partial).values()
     return sum(float(np.maximum(0.0, 1.0 - (of_pair / zero_px) ** 2).sum()) for of_pair in errors)
 
 
@@ -152,7 +151,7 @@ def extend(problem: MapperInput, partial: PartialMap, config: IncrementalMapperC
     failed: set[int] = set()
     while len(partial.registered) + len(failed) < len(problem.views):
         candidates = _next_views(problem, partial, failed)[: config.candidates]
-        resect = functools.partial(registration_resection.resect, problem, partial, config=config.resection)
+        resect = functools.partial(mapping_problem.resect, problem, partial, config=config.resection)
         tried = dict(zip(candidates, map_parallel(resect, candidates), strict=True))
         found: dict[int, Resection] = {view: resected for view, resected in tried.items() if resected is not None}
         failed |= tried.keys() - found.keys()
@@ -197,10 +196,8 @@ def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapper
 
 def _find_weak_views(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> list[int]:
     """The registered views with an inlier ratio below `min_view_ratio`, the lowest first."""
-    ratios = registration_resection.inlier_ratios(problem, partial, config.triangulation.max_error_px)
-    of_view = {
-        view: registration_resection.compute_pooled_ratio(ratios, problem.pairs, view) for view in partial.registered
-    }
+    ratios = mapping_problem.inlier_ratios(problem, partial, config.triangulation.max_error_px)
+    of_view = {view: mapping_problem.compute_pooled_ratio(ratios, problem.pairs, view) for view in partial.registered}
     return sorted((view for view in of_view if of_view[view] < config.min_view_ratio), key=lambda view: of_view[view])
 
 
@@ -484,11 +481,9 @@ def give_own_lenses(
 
 def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> list[int]:
     """The views that are not registered, or whose matches hardly fit; those first that fit least."""
-    ratios = registration_resection.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
+    ratios = mapping_problem.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
     of_view = {
-        view: registration_resection.compute_pooled_ratio(ratios, problem.pairs, view)
-        if view in partial.registered
-        else 0.0
+        view: mapping_problem.compute_pooled_ratio(ratios, problem.pairs, view) if view in partial.registered else 0.0
         for view in range(len(problem.views))
     }
     return sorted((view for view in of_view if of_view[view] < _DOUBTED_RATIO), key=lambda view: (of_view[view], view))
@@ -525,7 +520,7 @@ def _try_other_focals(
         rest = adjust_quickly(problem, rest, SETTLED_TOLERANCE, config.incremental)
         if len(rest.estimate.points) < config.incremental.min_points:
             continue
-        focal = registration_resection.own_focal(problem, rest, view, config.incremental.resection)
+        focal = mapping_problem.own_focal(problem, rest, view, config.incremental.resection)
         if focal is not None:
             zoomed[view] = focal
     if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
@@ -586,7 +581,7 @@ def make_map(problem: MapperInput, finished: FinalMap, max_error_px: float, num_
         estimate=estimate,
         prior=partial.prior,
         loss=finished.loss,
-        inlier_ratios=registration_resection.inlier_ratios(problem, partial, max_error_px),
+        inlier_ratios=mapping_problem.inlier_ratios(problem, partial, max_error_px),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         rms_px=finished.rms_px,
         num_common=num_common,

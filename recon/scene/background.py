@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon import priors as priors_pointmap
+from splatnode.recon import priors
 from splatnode.recon.geometry import project, quat_from_matrix, transform_to_camera
 from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import SHELL
@@ -221,7 +221,7 @@ def complete(
     """
     known = [pointmap.apply_mask(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
-    partners = priors_pointmap.find_overlapping(known, config.most_partners)
+    partners = priors.find_overlapping(known, config.most_partners)
     smooth = map_parallel(partial(_smooth, config=config), known, images)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
@@ -306,9 +306,7 @@ def _project_others(
     """
     covered, explained = (np.zeros(target.depth.shape, bool) for _ in range(2))
     for other, other_image in others:
-        covered_here, explained_here = priors_pointmap.find_explained(
-            other, other_image, target, image, colour_tolerance
-        )
+        covered_here, explained_here = priors.find_explained(other, other_image, target, image, colour_tolerance)
         covered |= covered_here
         explained |= explained_here
     return _close_gaps(covered), _close_gaps(explained)
@@ -323,7 +321,7 @@ def _hides_known(filled: Pointmap, others: Sequence[Pointmap], occlusion_toleran
     """(h, w) filled pixels whose point lies clearly before a known surface of another view."""
     wrong = np.zeros(filled.depth.shape, bool)
     for other in others:
-        wrong |= priors_pointmap.find_hiding(filled, other, occlusion_tolerance)
+        wrong |= priors.find_hiding(filled, other, occlusion_tolerance)
     return wrong
 
 

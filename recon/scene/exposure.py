@@ -24,9 +24,8 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from splatnode.capture.process.config import Internal
-from splatnode.recon import priors as priors_pointmap
 from splatnode.recon.keyframes import Keyframe
-from splatnode.recon.priors import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap
+from splatnode.recon.priors import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap, find_overlapping
 from splatnode.recon.scene import Exposure
 from splatnode.recon.threads import map_parallel
 from splatnode.recon.verification.evidence import BRIGHT, DARK
@@ -81,7 +80,7 @@ def compute_squared_radius(x: npt.ArrayLike, y: npt.ArrayLike, width: int, heigh
 def find_shared_pixels(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> list[SharedPixels]:
     """Finds pixels that each two images share; `pictures` (h, w, 3) are as large as their point maps."""
     known = [pointmap.apply_mask(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
-    partners = priors_pointmap.find_overlapping(known, MOST_PARTNERS)
+    partners = find_overlapping(known, MOST_PARTNERS)
     seen = map_parallel(lambda view: _sample_view(*view), list(zip(known, pictures, strict=True)))
     pairs = sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
     found = map_parallel(lambda pair: _compare_views(pair, seen[pair[0]], seen[pair[1]]), pairs)

@@ -18,8 +18,7 @@ from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.config import Internal
-from splatnode.recon import keyframes
-from splatnode.recon import priors as priors_pointmap
+from splatnode.recon import keyframes, priors
 from splatnode.recon.core import library
 from splatnode.recon.geometry import quat_from_matrix
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -154,7 +153,7 @@ def find_redundant_pixels(pointmaps: Sequence[Pointmap], config: GaussianInitial
         mask = np.zeros(target.depth.shape, bool)
         for i in range(len(pointmaps)):
             if (score[i], -i) > (score[j], -j):
-                projected, footprint = priors_pointmap.project_nearest(pointmaps[i], target)
+                projected, footprint = priors.project_nearest(pointmaps[i], target)
                 near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
                 own = target.depth / target.K[0, 0]
                 mask |= near & (footprint < config.max_footprint_ratio * own)

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon import priors as priors_pointmap
+from splatnode.recon import priors
 from splatnode.recon.keyframes import resize_mask
 from splatnode.recon.priors import AGREEING, LEAST_CONFIDENCE, Pointmap, find_consistent_pixels
 from splatnode.recon.threads import map_parallel
@@ -88,7 +88,7 @@ def find_transient_masks(
         )
         for known, mask, picture, own in zip(reduced, sure, pictures, used, strict=True)
     ]
-    partners = priors_pointmap.find_overlapping(reduced, MOST_PARTNERS)
+    partners = priors.find_overlapping(reduced, MOST_PARTNERS)
 
     def find_mask(index: int) -> Mask | None:
         others = [views[other] for other in partners[index]]
@@ -137,7 +137,7 @@ def _collect_evidence(view: _ReducedView, others: Sequence[_ReducedView]) -> _Vi
 
 def _project_surface(other: _ReducedView, target: Pointmap) -> tuple[Float32, Float32]:
     """(h, w) depth in the target of what the other is sure of, infinite where that is nothing; (h, w, 3) its colour."""
-    depth, _ = priors_pointmap.project_nearest(other.sure, target)
+    depth, _ = priors.project_nearest(other.sure, target)
     depth = np.where(np.isinf(depth), cv2.erode(depth, np.ones((3, 3), np.uint8)), depth)  # gaps of a pixel
     there = depth < FARTHEST
     depth = np.where(there, depth, np.float32(np.inf))

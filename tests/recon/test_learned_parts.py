@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.process.config import parse_config
-from splatnode.recon import networks as networks_weights
-from splatnode.recon import priors
+from splatnode.recon import networks, priors
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
 from splatnode.recon.doctor import findings
 from splatnode.recon.fallbacks import LearnedPart, find_unavailable_reason, list_learned_parts
@@ -77,7 +76,7 @@ def test_a_new_prior_is_its_file_and_an_entry_of_the_catalogue(monkeypatch, tmp_
     (part,) = (part for part in list_learned_parts() if part.name == "ours")
     assert "ours/ours.pth is not in the catalogue of weights" in find_unavailable_reason(part)
     entry = Weights("ours/ours.pth", "a test", "CC0", "https://example.org/ours.pth", None, None)
-    monkeypatch.setattr(networks_weights, "CATALOGUE", (*CATALOGUE, entry))
+    monkeypatch.setattr(networks, "CATALOGUE", (*CATALOGUE, entry))
     (told,) = (finding for finding in findings() if finding.name == "ours")
     assert told.detail == "no weights: splatnode weights fetch ours; prior; weights: CC0"
     monkeypatch.delitem(sys.modules, "splatnode.recon.priors.ours")

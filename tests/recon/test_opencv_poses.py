@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon import opencv_poses
+from splatnode.recon import poselib
 
 Array = npt.NDArray[np.float64]
 COUNT = 300
@@ -53,7 +53,7 @@ def degrees(rotation: Array, other: Array) -> float:
 def test_absolute_pose(seed):
     view = two_views(seed)
     options = {"max_reproj_error": 2.5, "seed": 0}
-    pose, found = opencv_poses.estimate_absolute_pose(view.pixels2, view.points, view.camera, options)
+    pose, found = poselib.estimate_opencv_absolute_pose(view.pixels2, view.points, view.camera, options)
     assert degrees(pose.R, view.rotation) < 0.1 and np.linalg.norm(pose.t - view.translation) < 0.01
     assert pose.Rt.shape == (3, 4)
     inliers = np.array(found["inliers"])
@@ -64,7 +64,7 @@ def test_absolute_pose(seed):
 def test_relative_pose(seed):
     view = two_views(seed)
     options = {"max_epipolar_error": 1.5, "seed": 0}
-    pose, found = opencv_poses.estimate_relative_pose(view.pixels1, view.pixels2, view.camera, view.camera, options)
+    pose, found = poselib.estimate_opencv_relative_pose(view.pixels1, view.pixels2, view.camera, view.camera, options)
     cosine = pose.t @ view.translation / np.linalg.norm(view.translation)
     assert degrees(pose.R, view.rotation) < 0.5 and np.rad2deg(np.arccos(cosine)) < 2
     assert np.array(found["inliers"])[~view.wrong].mean() > 0.95
@@ -75,17 +75,17 @@ def test_shared_focal_length(seed):
     view = two_views(seed)
     pixels1, pixels2 = view.pixels1[~view.wrong], view.pixels2[~view.wrong]
     options = {"max_epipolar_error": 1.5, "seed": 0}
-    pair, _ = opencv_poses.estimate_shared_focal_relative_pose(pixels1, pixels2, np.zeros(2), options)
+    pair, _ = poselib.estimate_opencv_shared_focal_relative_pose(pixels1, pixels2, np.zeros(2), options)
     assert pair.camera1.focal() == pytest.approx(view.focal, rel=0.05)
-    again, _ = opencv_poses.estimate_shared_focal_relative_pose(pixels1, pixels2, np.zeros(2), options)
+    again, _ = poselib.estimate_opencv_shared_focal_relative_pose(pixels1, pixels2, np.zeros(2), options)
     assert again.camera1.focal() == pair.camera1.focal()
 
 
 def test_too_few_matches_give_no_inliers():
     view, options = two_views(0), {"max_epipolar_error": 1.5, "max_reproj_error": 2.5}
     few = slice(0, 3)
-    _, absolute = opencv_poses.estimate_absolute_pose(view.pixels2[few], view.points[few], view.camera, options)
-    _, relative = opencv_poses.estimate_relative_pose(
+    _, absolute = poselib.estimate_opencv_absolute_pose(view.pixels2[few], view.points[few], view.camera, options)
+    _, relative = poselib.estimate_opencv_relative_pose(
         view.pixels1[few], view.pixels2[few], view.camera, view.camera, options
     )
     assert not any(absolute["inliers"]) and not any(relative["inliers"])

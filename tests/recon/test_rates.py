@@ -5,9 +5,9 @@ import json
 import pytest
 
 from splatnode import command_line
-from splatnode.recon import rates
+from splatnode.recon import doctor
 from splatnode.recon.config import preset
-from splatnode.recon.rates import Rates, format_rates, measure_rates, record_rates
+from splatnode.recon.doctor import Rates, format_rates, measure_rates, record_rates
 
 SOME = Rates(6, 0.2, 0.75, 0.05, "5 of 5", 12.0, None, "OK_ROUGH", 9000)
 
@@ -32,7 +32,7 @@ def test_a_number_of_views_that_makes_no_scene_is_refused(views, capsys):
 
 
 def test_programs_get_the_rates_with_the_machine(monkeypatch, capsys):
-    monkeypatch.setattr(rates, "measure_rates", lambda views, tell: [SOME] if views == (3, 6, 12) else [])
+    monkeypatch.setattr(doctor, "measure_rates", lambda views, tell: [SOME] if views == (3, 6, 12) else [])
     assert command_line.main(["doctor", "--rates", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told == record_rates([SOME])
@@ -40,7 +40,7 @@ def test_programs_get_the_rates_with_the_machine(monkeypatch, capsys):
 
 
 def test_people_get_the_table_and_the_machine(monkeypatch, capsys):
-    monkeypatch.setattr(rates, "measure_rates", lambda views, tell: [SOME])
+    monkeypatch.setattr(doctor, "measure_rates", lambda views, tell: [SOME])
     assert command_line.main(["doctor", "--rates", "6"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == format_rates([SOME]) and "The built-in capture" in lines[2]

@@ -46,7 +46,7 @@ HARMLESS = {
         "recon/daemon/output.py:save",
         "recon/daemon/output.py:save_fallbacks",
         "extras/jobs/template.py:run_call",
-        "recon/mapping.py:run",
+        "recon/cli.py:run",
         "viewer/sources.py:_work",
         "viewer/window.py:call",
     },

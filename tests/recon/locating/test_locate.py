@@ -8,7 +8,7 @@ import pytest
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.extras.cameras import building
-from splatnode.recon import opencv_poses
+from splatnode.recon import poselib
 from splatnode.recon.locating import Located, NotLocated, Reason, pose_refinement
 from splatnode.recon.locating.localize import LocalizationConfig, localize_image, localize_query, prepare_query_image
 from tests.support.located import PLACE, errors, known_place, photograph
@@ -84,7 +84,7 @@ def test_what_shows_the_scene_in_one_patch_alone_is_refused():
 
 
 def test_without_poselib_it_is_placed_as_well(monkeypatch):
-    monkeypatch.setattr(pose_refinement.poselib, "estimate_absolute_pose", opencv_poses.estimate_absolute_pose)
+    monkeypatch.setattr(pose_refinement.poselib, "estimate_absolute_pose", poselib.estimate_opencv_absolute_pose)
     image, camera = photograph(1)
     found = localize_image(known_place().landmarks, image)
     assert isinstance(found, Located) and max(errors(found, camera)) < 1.0

@@ -8,8 +8,8 @@ from itertools import islice
 import pytest
 from msgspec.structs import replace
 
-from splatnode.recon import mapping
-from splatnode.recon.mapping import check_incomplete, make_node_config, make_scenes, remove_checkpoint
+from splatnode.recon import cli
+from splatnode.recon.cli import check_incomplete, make_node_config, make_scenes, remove_checkpoint
 from tests.recon.daemon.test_daemon import QUICK
 from tests.support.synthetic import photographs
 
@@ -48,8 +48,8 @@ def test_what_was_interrupted_goes_on_where_it_was(node, monkeypatch):
 
     with pytest.raises(KeyboardInterrupt):
         make_scenes(interrupted(), IDENTITY, node, ignored)
-    prepared, prepare = [], mapping.prepare
-    monkeypatch.setattr(mapping, "prepare", lambda frame, config: prepared.append(frame.name) or prepare(frame, config))
+    prepared, prepare = [], cli.prepare
+    monkeypatch.setattr(cli, "prepare", lambda frame, config: prepared.append(frame.name) or prepare(frame, config))
     make_scenes(photographs(), IDENTITY, node, ignored)
     assert prepared == [frame.name for frame in photographs()[4:]]
     names = {frame.name for frame in photographs()}
@@ -69,12 +69,12 @@ def test_a_map_is_not_mixed_with_another_one_nor_written_over(node):
 
 
 def test_a_photograph_that_cannot_be_used_is_named_and_stops_nothing(node, monkeypatch):
-    def failing(frame, config, prepare=mapping.prepare):
+    def failing(frame, config, prepare=cli.prepare):
         if frame.name == photographs()[3].name:
             raise ValueError("for the test")
         return prepare(frame, config)
 
-    monkeypatch.setattr(mapping, "prepare", failing)
+    monkeypatch.setattr(cli, "prepare", failing)
     make_scenes(photographs()[:4], IDENTITY, node, ignored)
     (place,) = index(node)["places"]
     assert len(place["frames_used"]) == 3
@@ -85,6 +85,6 @@ def test_what_ends_the_worker_ends_the_run(node, monkeypatch):
     def fail(*_: object) -> None:
         raise MemoryError("for the test")
 
-    monkeypatch.setattr(mapping.Worker, "_process_events", fail)
+    monkeypatch.setattr(cli.Worker, "_process_events", fail)
     with pytest.raises(MemoryError, match="for the test"):
         make_scenes(photographs(), IDENTITY, node, ignored)
