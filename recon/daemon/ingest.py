@@ -28,7 +28,7 @@ from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.checkpoint.records import StoredFrame
-from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint.store import Store, UnstorableFrame
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.preparation import prepare
 
@@ -328,6 +328,16 @@ RETRY_S = 1.0  # after a frame could not be written, or the connection failed
 ANOTHER_IS_SERVED = "capture gives its keyframes to another splatnode recon; stop one of the two"
 
 
+def _refuse_unstorable(waiting: Sequence[WaitingFrame], error: Exception) -> list[WaitingFrame]:
+    """Refuses the frame that cannot be stored because of what it is, all where nobody knows which; returns the rest."""
+    one = error.received if isinstance(error, UnstorableFrame) else None
+    why = str(error) if one else f"it cannot be stored: {type(error).__name__}: {error}"
+    for each in waiting:
+        if one is None or each.received is one:
+            each.client.refuse(each.received.key, why)
+    return [each for each in waiting if one is not None and each.received is not one]
+
+
 class Intake:
     def __init__(
         self,
@@ -376,31 +386,41 @@ class Intake:
             if captures.is_served is not None:
                 self._report_unconnected("" if captures.is_served else ANOTHER_IS_SERVED)
             arrived_s = time.monotonic()
-            stored = [each for frame in together if (each := self._store_received(captures, frame)) is not None]
+            stored = self._store_together(captures, together)
             if stored:  # what the camera could not give is told with the next scene, and disturbs none
                 self._enqueue_keyframes(captures, stored, arrived_s)
 
-    def _store_received(self, captures: Captures, waiting: WaitingFrame) -> StoredFrame | None:
-        """The frame as it is stored, and acknowledged; None where it is refused, or no image."""
-        client, received = waiting.client, waiting.received
-        while not self._stopping.is_set():
+    def _store_together(self, captures: Captures, together: Sequence[WaitingFrame]) -> list[StoredFrame]:
+        """Frames that were taken together, as they are stored, all of them before one is acknowledged.
+
+        Without those that are refused, or no image: none where the daemon stops before.
+        """
+        waiting = list(together)
+        while waiting and not self._stopping.is_set():
             try:
-                stored = self._store.add_frame(received)
+                stored = self._store_all([each.received for each in waiting])
             except Exception as error:
+                name = waiting[0].received.frame.name
                 if is_shortage(error):
-                    self._wait_for_memory(captures, received.frame.name)
-                    continue
-                if not isinstance(error, OSError):
-                    client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
-                    return None
-                self._report_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
-                self._stopping.wait(RETRY_S)
-                captures.say_ready()
+                    self._wait_for_memory(captures, name)
+                elif isinstance(error, OSError):
+                    self._report_full(f"{name} cannot be stored ({error.strerror}): make room on the disk")
+                    self._stopping.wait(RETRY_S)
+                    captures.say_ready()
+                else:
+                    waiting = _refuse_unstorable(waiting, error)
                 continue
             self.full = ""
-            client.acknowledge(received)
+            for each in waiting:
+                each.client.acknowledge(each.received)
             return stored
-        return None
+        return []
+
+    def _store_all(self, received: Sequence[ReceivedFrame]) -> list[StoredFrame]:
+        if len(received) > 1:
+            return self._store.add_frames(received)
+        stored = self._store.add_frame(received[0])
+        return [] if stored is None else [stored]
 
     def _enqueue_keyframes(self, captures: Captures, together: Sequence[StoredFrame], arrived_s: float) -> None:
         """Hands keyframes that were taken together to the worker, as one."""

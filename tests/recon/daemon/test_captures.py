@@ -25,6 +25,8 @@ from splatnode.capture.process.logs import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import ingest
+from splatnode.recon.daemon.checkpoint import records
+from splatnode.recon.daemon.checkpoint import store as checkpoint_store
 from splatnode.recon.daemon.checkpoint.records import read_frame
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
@@ -167,6 +169,57 @@ def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_p
     ]
     assert [each.frame_set for each in found] == [0, 0, 0, 3, 3, 3, 6, 6, 6]
     assert {server.acknowledged for server in servers.values()} == {3}
+
+
+def test_no_image_of_a_frame_set_is_acknowledged_before_all_are_stored(tmp_path, plain, monkeypatch):
+    """The disk takes the second of three images only the third time; what is odd of another set is refused alone."""
+    monkeypatch.setattr(ingest, "CONNECT_S", 30.0)
+    monkeypatch.setattr(ingest, "RETRY_S", 0.05)
+    network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
+    real, failures, acknowledged = records.write_frame, [OSError(28, "No space left"), MemoryError()], []
+
+    def write(path, key, one, following=0):
+        acknowledged.append(sum(server.acknowledged for server in servers.values()))
+        if one.name == "middle_1" and failures:
+            raise failures.pop()
+        if one.name == "left_200":
+            raise ArithmeticError("odd")
+        real(path, key, one, following)
+
+    monkeypatch.setattr(checkpoint_store, "write_frame", write)
+    with ExitStack() as resources:
+        servers = {
+            each: resources.enter_context(
+                KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "state"), each), each)
+            )
+            for each in IDS
+        }
+        for ms in (0, 200):
+            for offset, (camera_id, server) in enumerate(servers.items()):
+                server.offer(frame(camera_id, ms + offset))
+        store = Store(tmp_path / "checkpoint")
+        resources.callback(store.close)
+        sets = FrameSetConfig(wait_s=30.0)
+        intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping, sets)
+        thread = threading.Thread(target=intake.run)
+        thread.start()
+        found: list = []
+
+        def come():
+            for server in servers.values():
+                server.serve(0.01)
+            found.extend(inbox.dequeue(0))
+            return len(found) == 5 and not any(server.num_queued for server in servers.values())
+
+        try:
+            wait_for(come, 30.0)
+        finally:
+            stopping.set()
+            thread.join()
+    assert not failures and acknowledged[:7] == [0] * 7  # two times of two images, then all three
+    assert [each.frame_set for each in found] == [0, 0, 0, 3, 3]
+    assert [server.acknowledged for server in servers.values()] == [1, 2, 2]
+    assert servers["left"].set_aside == 1 and store.names == {each.keyframe.name for each in found}
 
 
 def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path):
