@@ -141,7 +141,7 @@ class InactiveSubmaps:
             self._not_before_s.pop(folder, None)
             try:
                 with contextlib.closing(Store(folder)) as store:
-                    store.forget(name, "retracted")
+                    store.forget_frames(store.find_frame_set(name, self._config.frame_set_tolerance_s), "retracted")
             except CheckpointError as error:
                 raise_shortage(error)
                 self._output.complain(f"{name} cannot be taken out of {scene}: {error}")

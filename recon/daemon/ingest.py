@@ -23,7 +23,7 @@ from splatnode.capture.frame import Frame, Stamp
 from splatnode.capture.messaging.keyframe_queue import READY_EVERY_S, KeyframeClient
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network, NotAllowed, find_captures
-from splatnode.capture.process.logs import Problems, is_logged
+from splatnode.capture.process.logs import Problems, event, is_logged
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
@@ -31,6 +31,8 @@ from splatnode.recon.daemon.checkpoint.records import StoredFrame
 from splatnode.recon.daemon.checkpoint.store import Store, UnstorableFrame
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.preparation import prepare
+
+log = logging.getLogger(__name__)
 
 LOOK_S = 0.5  # between looks at whether another capture has come
 MOST_CAPTURES = 32
@@ -41,8 +43,9 @@ ACTIVE_S = 3.0  # a camera that has sent a keyframe within so many seconds is wa
 class FrameSetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which keyframes of several cameras belong together."""
 
-    # Between images that were taken together, seconds. Higher: cameras that are not triggered together form sets, too
-    tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_S
+    # Between images that were taken together, seconds; None: reconstruction.frame_set_tolerance_s. Higher: cameras that
+    # are not triggered together form sets, too
+    tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None
     # A keyframe waits so long for those that other cameras took with it, seconds; where there is one camera, not at all
     wait_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = 0.3
 
@@ -75,9 +78,11 @@ class FrameSetQueue:
     """Frames of all captures in the order of their times, those that were taken together as one."""
 
     def __init__(self, config: FrameSetConfig) -> None:
-        self._config = config
+        self._wait_s = config.wait_s
+        self._tolerance_s = TOLERANCE_S if config.tolerance_s is None else config.tolerance_s
         self._waiting: list[WaitingFrame] = []
         self._heard_s: dict[str, float] = {}  # of each camera, when its last keyframe came
+        self._missed: set[str] = set()  # cameras that are not waited for, which was told
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -86,6 +91,9 @@ class FrameSetQueue:
         self._waiting.append(frame)
         if frame.camera_id:
             self._heard_s[frame.camera_id] = frame.arrived_s
+        if frame.camera_id in self._missed:
+            self._missed.discard(frame.camera_id)
+            event(log, logging.INFO, "camera_is_back", camera_id=frame.camera_id)
 
     def take(self, now_s: float, complete: bool = True) -> list[WaitingFrame]:
         """The frames that are next, taken together; none where there are none, or others may still belong to them.
@@ -100,9 +108,10 @@ class FrameSetQueue:
         is_whole = alone is not None or self._is_whole(now_s)
         if alone is None and not complete:
             return []
-        if not is_whole and now_s - first.arrived_s < self._config.wait_s:
+        if not is_whole and now_s - first.arrived_s < self._wait_s:
             return []
         found = [first] if alone else self._find_set(first)
+        self._tell_missed(now_s)
         self._waiting = [each for each in self._waiting if each not in found]
         return found
 
@@ -111,12 +120,25 @@ class FrameSetQueue:
         active = {camera for camera, heard_s in self._heard_s.items() if now_s - heard_s < ACTIVE_S}
         return active <= {each.camera_id for each in self._waiting}
 
+    def _tell_missed(self, now_s: float) -> None:
+        """Tells, once, that frame sets are complete without a camera from which nothing comes any more."""
+        silent = {camera for camera, heard_s in self._heard_s.items() if now_s - heard_s >= ACTIVE_S}
+        if len(silent) == len(self._heard_s):  # nothing comes from any: the robot stands still
+            return
+        for camera in sorted(silent - self._missed):
+            self._missed.add(camera)
+            event(
+                log, logging.WARNING, "camera_is_missed", camera_id=camera,
+                why=f"no keyframe has come from it for {ACTIVE_S:g} s, and keyframes come from others: frame sets are "
+                "complete without it until one comes",
+            )  # fmt: skip
+
     def _find_set(self, first: WaitingFrame) -> list[WaitingFrame]:
         """The first frame, and the earliest of each other camera that was taken with it, in order of time."""
         begun, found = first.captured_at, {first.camera_id: first}
         for each in sorted(self._waiting, key=lambda each: each.capture_ns):
             stamp = each.captured_at
-            if begun and stamp and are_taken_together(begun, stamp, self._config.tolerance_s):
+            if begun and stamp and are_taken_together(begun, stamp, self._tolerance_s):
                 found.setdefault(each.camera_id, each)
         return sorted(found.values(), key=lambda each: each.capture_ns)
 
@@ -320,8 +342,6 @@ class Inbox:
             self._changed.notify_all()
             return events
 
-
-log = logging.getLogger(__name__)
 
 RECEIVE_S = 0.2  # between looks at whether the daemon stops
 RETRY_S = 1.0  # after a frame could not be written, or the connection failed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import threading
@@ -47,7 +48,11 @@ class Worker:
         asked = config.reconstruction.fallbacks
         ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
         self._recipe = msgspec.structs.replace(
-            config.reconstruction, max_gaussians=limit, budget_s=None, fallbacks=ladder
+            config.reconstruction,
+            max_gaussians=limit,
+            budget_s=None,
+            fallbacks=ladder,
+            frame_set_tolerance_s=config.frame_set_tolerance_s,
         )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._report_problem)
@@ -94,6 +99,13 @@ class Worker:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
         return [scene for scene in self._output.places.find_scenes(name) if scene != self._store.scene_id]
 
+    def find_frame_set(self, name: str) -> list[str]:
+        """The photograph, and those that other cameras took with it, here and in places that the camera has left."""
+        tolerance_s, places = self._recipe.frame_set_tolerance_s, self._output.places
+        found = [self._store.find_frame_set(name, tolerance_s)]
+        found += [places.find_frame_set(scene, name, tolerance_s) for scene in self.find_inactive_scenes(name)]
+        return list(dict.fromkeys([name, *itertools.chain.from_iterable(found)]))
+
     @property
     def delay(self) -> tuple[float, str]:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
@@ -113,7 +125,7 @@ class Worker:
         found = self._restore()
         self.loading = 0
         if found is not None:
-            self._backlog = number_frame_sets(found.new, self._config.frame_sets.tolerance_s)
+            self._backlog = number_frame_sets(found.new, self._config.frame_set_tolerance_s)
             self._run_step(lambda: self.place.resume(found))
         give_back_memory()
         while not self._stopping.is_set():

@@ -129,7 +129,7 @@ def _storing(disk: Path, tell: Tell) -> None:
     doing("put 5", lambda: store.add_frame(ReceivedFrame(SESSION, 5, _frame(5))))
     doing("save graph 2", lambda: store.save("graph", _Thing(2), _arrays(2)))
     doing("finish", lambda: _finishing(store))
-    doing("retract 0", lambda: store.request_removal("0.png", ["scene-0001"]))
+    doing("retract 0", lambda: store.forget_frames([], "retracted", [("scene-0001", "0.png")]))
     doing("retracting 0", lambda: _retracting(store))
     store.close()
 
@@ -149,7 +149,7 @@ def _retracting(store: Store) -> None:
         folder = records.reopen(store.directory, scene)
         if folder is not None:
             with contextlib.closing(Store(folder)) as kept:
-                kept.forget(name, "retracted")
+                kept.forget_frames([name], "retracted")
         store.confirm_removal(scene, name)
 
 

@@ -218,7 +218,7 @@ class Store:
         with self._writing:
             for each in together:
                 if isinstance(each.frame, DroppedFrame):
-                    self._drop_frame({}, (each.session, each.sequence), (each.frame.name, each.frame.reason))
+                    self._drop_frames({}, [(each.session, each.sequence)], [(each.frame.name, each.frame.reason)])
             images = [each for each in together if isinstance(each.frame, Frame)]
             found: list[StoredFrame] = []
             try:
@@ -251,16 +251,19 @@ class Store:
 
     def forget(self, name: str, reason: str) -> None:
         """Removes a frame, if it is there, and records it with the reason as dropped. Raises OSError."""
-        with self._writing:
-            if name in self._names:
-                number = self._names[name]
-                self._drop_frame({number: name}, self._keys[number], (name, reason))
+        self.forget_frames([name], reason)
 
-    def request_removal(self, name: str, scenes: Iterable[str]) -> None:
-        """Records that these scenes, whose places were left, are to lose a frame. Raises OSError."""
+    def forget_frames(self, names: Iterable[str], reason: str, elsewhere: Iterable[tuple[str, str]] = ()) -> None:
+        """As `forget`, of several frames at once, so that no kill leaves half of a frame set. Raises OSError.
+
+        `elsewhere`: ids of scenes whose places were left, each with a name; these scenes are to lose such a frame.
+        """
         with self._writing:
-            retracted = dict.fromkeys((*self.ledger.retracted, *((scene, name) for scene in scenes)))
-            self._write(msgspec.structs.replace(self.ledger, retracted=tuple(retracted)))
+            here = {self._names[name]: name for name in names if name in self._names}
+            retracted = tuple(dict.fromkeys((*self.ledger.retracted, *elsewhere)))
+            if here or retracted != self.ledger.retracted:
+                keys = [self._keys[number] for number in here]
+                self._drop_frames(here, keys, [(name, reason) for name in here.values()], retracted)
 
     def confirm_removal(self, scene: str, name: str) -> None:
         """Records that the scene has lost the frame. Raises OSError."""
@@ -338,20 +341,28 @@ class Store:
         """
         records.move_to_finished(self.directory, _INSTEAD)
 
-    def _drop_frame(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
+    def _drop_frames(
+        self,
+        frames: Mapping[int, str],
+        keys: Iterable[tuple[str, int]],
+        dropped: Iterable[tuple[str, str]],
+        retracted: tuple[tuple[str, str], ...] | None = None,
+    ) -> None:
+        """Records names as `dropped`, with the reason, and removes those that are stored `frames`."""
         ledger = self.ledger
-        shown = sanitize_text(dropped[0], LONGEST_NAME), sanitize_text(dropped[1])
+        shown = [(sanitize_text(name, LONGEST_NAME), sanitize_text(reason)) for name, reason in dropped]
         self._write(
             msgspec.structs.replace(
                 ledger,
                 next=self._next,
-                gone=(*ledger.gone, key)[-REMEMBERED:],
-                dropped=(*ledger.dropped, shown)[-REMEMBERED_DROPPED:],
+                gone=(*ledger.gone, *keys)[-REMEMBERED:],
+                dropped=(*ledger.dropped, *shown)[-REMEMBERED_DROPPED:],
+                retracted=ledger.retracted if retracted is None else retracted,
             )
         )
         self._unlink(frames)
 
-    def _unlink(self, frames: dict[int, str]) -> None:
+    def _unlink(self, frames: Mapping[int, str]) -> None:
         for number, name in frames.items():
             self._remove(number)
             self._forget_frame(name, number)

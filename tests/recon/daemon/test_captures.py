@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -9,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,7 +31,7 @@ from splatnode.recon.daemon.checkpoint import records
 from splatnode.recon.daemon.checkpoint import store as checkpoint_store
 from splatnode.recon.daemon.checkpoint.records import read_frame
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.finalizer import InactiveSubmaps
 from splatnode.recon.daemon.ingest import (
     ArrivedKeyframe,
     FrameSetConfig,
@@ -39,9 +41,13 @@ from splatnode.recon.daemon.ingest import (
     WaitingFrame,
 )
 from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
-from splatnode.recon.daemon.worker import number_frame_sets
+from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
+from splatnode.recon.daemon.worker import Worker, number_frame_sets
+from splatnode.recon.result.export import write_files
+from splatnode.recon.result.export.cameras import encode_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
+from tests.support.exported import make_camera, make_snapshot
 from tests.support.three_captures import STEP_NS, install_camera
 
 IMAGE = np.zeros((12, 16, 3), np.uint8)
@@ -84,6 +90,24 @@ def test_a_frame_waits_for_the_other_cameras_and_no_longer_than_it_is_told():
     assert take_all(queue, 0.46) == [["right_200", "left_210"]]
     queue.add(waiting(frame("right", 9000), 9.0))
     assert take_all(queue, 9.0) == [["right_9000"]]  # left has been silent for long
+
+
+def test_a_camera_that_is_waited_for_no_more_is_told_once_until_it_is_back(caplog):
+    """It died while others go on: each of their keyframes waits .3 s at most, and after 3 s not at all."""
+    queue = FrameSetQueue(FrameSetConfig(wait_s=0.3))
+    queue.add(waiting(frame("right", 0), 0.0))
+    waited = []
+    with caplog.at_level(logging.INFO):
+        for tenths in range(0, 60, 5):
+            at_s = tenths / 10
+            queue.add(waiting(frame("left", 100 * tenths), at_s))
+            until_s = next(at_s + step / 20 for step in range(100) if take_all(queue, at_s + step / 20))
+            waited.append(round(until_s - at_s, 2))
+        assert max(waited) <= 0.35 and waited[6:] == [0.0] * 6
+        assert len([each for each in caplog.records if "camera_is_missed" in each.getMessage()]) == 1
+        assert "right" in caplog.text and "3 s" in caplog.text
+        queue.add(waiting(frame("right", 6000), 6.0))
+    assert "camera_is_back" in caplog.text
 
 
 def test_frames_wait_until_captures_that_were_just_found_have_sent_something():
@@ -222,25 +246,63 @@ def test_no_image_of_a_frame_set_is_acknowledged_before_all_are_stored(tmp_path,
     assert servers["left"].set_aside == 1 and store.names == {each.keyframe.name for each in found}
 
 
-def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path):
+def make_daemon(store: Store, places=None) -> SimpleNamespace:
+    """What of a daemon answers who takes a keyframe back."""
+    places = places or SimpleNamespace(find_scenes=lambda name: [])
+    worker = SimpleNamespace(
+        _store=store, _recipe=ReconstructionConfig(), _output=SimpleNamespace(places=places),
+        find_inactive_scenes=lambda name: Worker.find_inactive_scenes(worker, name),
+        find_frame_set=lambda name: Worker.find_frame_set(worker, name),
+    )  # fmt: skip
+    daemon = SimpleNamespace(
+        _store=store, _inbox=Inbox(), _worker=worker, _retract=lambda names: Daemon._retract(daemon, names)
+    )
+    return daemon
+
+
+def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path, monkeypatch):
     store = Store(tmp_path / "checkpoint")
     for number, each in enumerate([frame("left", 100), frame("right", 105), frame("left", 300), frame("", 100)]):
         store.add_frame(ReceivedFrame("0" * 32, number, each))
-    inbox = Inbox()
-    node = SimpleNamespace(
-        _store=store,
-        _inbox=inbox,
-        _config=DaemonConfig(),
-        _worker=SimpleNamespace(find_inactive_scenes=lambda name: []),
-        _remove_keyframe=lambda name: Daemon._remove_keyframe(node, name),
-    )
+    node, ledgers = make_daemon(store), []
+    real = checkpoint_store.write_ledger
+    monkeypatch.setattr(checkpoint_store, "write_ledger", lambda *what: (ledgers.append(what), real(*what)))
     answer = Daemon._answer(node, RemoveKeyframe("right_105"))
     assert answer.done and answer.message.endswith("with it left_100, taken at the same time")
     assert store.names == {"left_300", "_100"}
+    assert len(ledgers) == 1, "at once: no kill leaves half of it"
+    assert node._inbox.dequeue(0) == [RemovedFrame("right_105")] and node._inbox.dequeue(0) == [
+        RemovedFrame("left_100")
+    ]
     assert Daemon._answer(node, RemoveKeyframe("left_300")).message == (
         "left_300 is removed; the scene is built anew without it"
     )
     assert not Daemon._answer(node, RemoveKeyframe("right_105")).done
+    store.close()
+
+
+def test_a_frame_set_of_a_place_that_the_camera_has_left_is_retracted_as_one(tmp_path):
+    store = Store(tmp_path / "checkpoint")
+    store.add_frames([ReceivedFrame("0" * 32, number, frame(each, 100)) for number, each in enumerate(IDS)])
+    store.leave_submap(3)
+    store.close()
+    at = Stamp(10**8, Clock.UTC)
+    cameras = tuple(
+        replace(make_camera(i), name=f"{each}_100", camera_id=each, captured_at=at) for i, each in enumerate(IDS)
+    )
+    write_files(tmp_path / "out" / "scene-0001", {"cameras.json": encode_cameras(cameras)})
+    store = Store(tmp_path / "checkpoint")
+    places = SubmapIndex(tmp_path / "out", store.identity)
+    snapshot = replace(make_snapshot(), cameras=cameras)
+    places.update(make_submap_record("scene-0001", SubmapState.LEFT, "scene-0001", snapshot, [], []))
+    answer = Daemon._answer(make_daemon(store, places), RemoveKeyframe("middle_100"))
+    assert answer.done and answer.message.endswith("with it left_100, right_100, taken at the same time")
+    output = SimpleNamespace(places=places, complain=pytest.fail)
+    left = InactiveSubmaps(store, ReconstructionConfig(), output, SimpleNamespace(remove_scene=lambda _: None))  # pyright: ignore
+    left._remove_keyframes()
+    assert store.ledger.retracted == ()
+    with closing(Store(store.directory / "left" / "scene-0001")) as kept:
+        assert kept.names == set() and len(kept.frames_dropped) == 3
     store.close()
 
 

@@ -370,8 +370,8 @@ def test_a_finished_place_is_kept_and_taken_back(open_store):
     assert not (ledger_module.make_finished_path(store.directory, "scene-0001") / "scene").exists()
 
     store = open_store()
-    store.request_removal("0.png", ["scene-0001"])
-    store.request_removal("0.png", ["scene-0001"])
+    store.forget_frames([], "retracted", [("scene-0001", "0.png")])
+    store.forget_frames([], "retracted", [("scene-0001", "0.png")])
     store = open_store()
     assert store.ledger.retracted == (("scene-0001", "0.png"),)
     assert ledger_module.reopen(store.directory, "scene-0007") is None
