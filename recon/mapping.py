@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import logging
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.keyframe_selection import group_frame_sets
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import is_shortage
@@ -28,7 +30,7 @@ from splatnode.capture.process.terminal import ProgressStep, format_times, is_in
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import ArrivedKeyframe, Event, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps
 from splatnode.recon.preparation import prepare
@@ -38,6 +40,7 @@ from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import hold_result_folder
 from splatnode.recon.result.submap_index import FILE
+from splatnode.recon.rig_choice import choose_recording_rig, place_on_rig
 
 log = logging.getLogger(__name__)
 
@@ -98,11 +101,11 @@ def make_scenes(
             show(MapProgress(taken, worker.map_counts[0], worker.num_unfinished, *worker.map_counts[1:]))
 
         with _run_worker(worker, stopping) as check:
-            for sequence, frame in enumerate(frames):
-                if sequence >= taken:
-                    received = ReceivedFrame(identity, sequence, frame)
-                    _enqueue_frame(received, node.reconstruction, store, inbox, stopping, check)
-                    taken = sequence + 1
+            for together in _receive_sets(frames, identity, node.frame_set_tolerance_s):
+                new = [each for each in together if each.sequence >= taken]
+                if new:
+                    _enqueue_frames(new, node.reconstruction, store, inbox, stopping, check)
+                    taken = new[-1].sequence + 1
                     tell(taken)
             rests = worker.rests
             while worker.rests < rests + 2:  # the first of them may have begun before the last keyframe came
@@ -142,28 +145,40 @@ def _run_worker(worker: Worker, stopping: threading.Event) -> Iterator[Callable[
         thread.join()
 
 
-def _enqueue_frame(
-    received: ReceivedFrame, config: ReconstructionConfig, store: Store, inbox: Inbox, stopping: threading.Event,
-    check: Callable[[], None],
+def _receive_sets(
+    frames: Iterable[Frame | DroppedFrame], identity: str, tolerance_s: float
+) -> Iterator[list[ReceivedFrame]]:
+    """The frames with their numbers, those that several cameras took together as one."""
+    numbers = itertools.count()
+    for each in group_frame_sets(frames, tolerance_s):
+        together = each if isinstance(each, tuple) else (each,)
+        yield [ReceivedFrame(identity, next(numbers), frame) for frame in together]
+
+
+def _enqueue_frames(
+    together: Sequence[ReceivedFrame], config: ReconstructionConfig, store: Store, inbox: Inbox,
+    stopping: threading.Event, check: Callable[[], None],
 ) -> None:  # fmt: skip
     """Waits while the worker has enough to do. A frame that cannot be used is recorded with the reason."""
-    stored = store.add_frame(received)
-    if stored is None:
-        return
-    name = stored.frame.name
-    try:
-        keyframe = prepare(stored.frame, config)
-    except Exception as error:
-        if is_shortage(error):
-            raise
-        log.warning("%s cannot be used: %s", name, error)
-        store.forget(name, f"cannot be used: {error}")
-        inbox.enqueue(RemovedFrame(name), stopping, check)
-        return
-    inbox.enqueue(ArrivedKeyframe(keyframe, time.monotonic()), stopping, check)
+    stored = store.add_frames(together)
+    events: list[Event] = []
+    for each in stored:
+        name = each.frame.name
+        try:
+            keyframe = prepare(each.frame, config)
+        except Exception as error:
+            if is_shortage(error):
+                raise
+            log.warning("%s cannot be used: %s", name, error)
+            store.forget(name, f"cannot be used: {error}")
+            events.insert(0, RemovedFrame(name))  # first: nothing is between the others
+        else:
+            events.append(ArrivedKeyframe(keyframe, time.monotonic(), stored[0].number if len(stored) > 1 else None))
+    if events:
+        inbox.enqueue_together(events, stopping, check)
 
 
-_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "rig")
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
 
 
 def replay_map(args: argparse.Namespace, request: Request, config: ReconstructionConfig) -> int:
@@ -175,13 +190,16 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
     with show_progress(quiet=args.json) as tell:
         source = load_recording(request, tell)
         tell(str(source.choice))
+        rig, config = choose_recording_rig(source, config, args.rig, tell)
     began_s = time.monotonic()
     with hold_result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         remove_result(args.out)  # of one scene, beside which nobody would find the map's
         frames = _write_frames(source, args.out) if source.photographs is None else source.frames()
+        if rig is not None:
+            frames = map(partial(place_on_rig, rig=rig), frames)
         told = _ProgressPrinter(args.json, len(source.choice.names))
         with _limit_log_level():
-            make_scenes(frames, source.identity(config), make_node_config(config, args.out), told)
+            make_scenes(frames, source.identity(config, rig), make_node_config(config, args.out), told)
         progress("")
         reports = write_maps(args.out, args.out, partial(compute_gaussian_limit, args), quiet=args.json)
         report = _make_report(source, args.out, reports, time.monotonic() - began_s)

@@ -34,7 +34,7 @@ from splatnode.capture.process.terminal import Tell, ignore_progress, report_ite
 from splatnode.capture.process.text import sanitize_name, sanitize_text
 from splatnode.capture.quality import Limits
 from splatnode.capture.rgbd_folder import find_photographs
-from splatnode.capture.rig import TOLERANCE_S, form_frame_sets
+from splatnode.capture.rig import TOLERANCE_S, Rig, form_frame_sets
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 
 Array = npt.NDArray[np.float64]
@@ -112,6 +112,7 @@ class ReplayRecording:
 
     request: Request
     choice: Choice
+    images: frozenset[tuple[str, str, str, int, int]] = frozenset()  # as `Lenses.check` asks of all that there are
 
     @property
     def path(self) -> Path:
@@ -122,8 +123,8 @@ class ReplayRecording:
         """The folder in which the keyframes lie; None: they lie in none, as a film's."""
         return self.request.photographs
 
-    def identity(self, config: Reconstruction) -> str:
-        """32 hexadecimal digits that tell it, reconstructed in this way, from others.
+    def identity(self, config: Reconstruction, rig: Rig | None = None) -> str:
+        """32 hexadecimal digits that tell it, reconstructed in this way, its cameras on this rig, from others.
 
         Of a folder the names count: it may hold the results, too, which change when it was last written.
         """
@@ -134,6 +135,8 @@ class ReplayRecording:
             known.append(str(request.masks.resolve()))
         if request.lenses is not None:
             known.append(request.lenses)
+        if rig is not None:
+            known.append(rig)
         if cameras is not None:
             known += [[each.camera_id, str(each.path.resolve())] for each in cameras.cameras]
             known.append(cameras.tolerance_s)
@@ -231,7 +234,7 @@ def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayReco
     choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request), request.tolerance_s)
     if request.lenses is not None:
         request.lenses.check(images)
-    return ReplayRecording(request, choice)
+    return ReplayRecording(request, choice, frozenset(images))
 
 
 def load_source(request: Request, tell: Tell = ignore_progress) -> Source:

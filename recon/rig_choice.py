@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from os import PathLike
@@ -12,7 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import Lenses, describe_image
 from splatnode.capture.multi_camera import CameraSet
 from splatnode.capture.process.notices import notify
@@ -21,7 +21,7 @@ from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import read_rig
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.replay_source import Source
+from splatnode.recon.replay_source import ReplayRecording, Source
 
 log = logging.getLogger(__name__)
 
@@ -50,23 +50,57 @@ def apply_rig(
     return with_lenses, hold_rig(config, rig)
 
 
+def choose_recording_rig(
+    recording: ReplayRecording, config: ReconstructionConfig, file: str | PathLike[str] | None, tell: Tell
+) -> tuple[Rig | None, ReconstructionConfig]:
+    """As `apply_rig`, of a recording whose frames are not in memory: `place_on_rig` is for each of them."""
+    rig = choose_rig(None if file is None else Path(file), recording.request.cameras, tell)
+    if rig is None:
+        return None, config
+    ids = [camera_id for _, _, camera_id, *_ in recording.images]
+    _check_mounts(rig, ids)
+    if len(rig.cameras) < 2:
+        return rig, config
+    _check_names(rig, ids)
+    lenses = _collect_lenses(rig, ids)
+    lenses.check(recording.images)
+    for text in describe_rig_use(rig, ids):
+        notify(log, text)
+    return rig, hold_rig(config, rig)
+
+
+def place_on_rig(each: Frame | DroppedFrame, rig: Rig) -> Frame | DroppedFrame:
+    """The frame with where its camera stands on the base, and with the rig's lens where its own is not trusted."""
+    if not isinstance(each, Frame):
+        return each
+    mount = rig.find_mount(each.camera_id)
+    placed = replace(each, T_base_camera=mount) if mount else each
+    return (
+        placed
+        if len(rig.cameras) < 2 or not _lacks_lens(each)
+        else _collect_lenses(rig, [each.camera_id]).apply(placed)
+    )
+
+
 def add_mounts(given: Source, rig: Rig) -> Source:
     """The frames with where their camera stands on the robot's base, as far as the rig tells it.
 
     Raises ValueError where it tells it of no camera of the frames.
     """
-    if not rig.is_base:
-        return given
+    _check_mounts(rig, [each.camera_id for each in given.frames if isinstance(each, Frame)])
     told = {each.name: rig.find_mount(each.camera_id) for each in given.frames if isinstance(each, Frame)}
-    if told and not any(told.values()):
+    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
+              for each in given.frames)  # fmt: skip
+    return replace(given, frames=tuple(frames))
+
+
+def _check_mounts(rig: Rig, camera_ids: Sequence[str]) -> None:
+    if rig.is_base and camera_ids and not any(map(rig.find_mount, camera_ids)):
         names = ", ".join(each.camera_id for each in rig.cameras)
         raise ValueError(
             f"the rig has T_base_camera of {sanitize_text(names, 200)}, and no image is of such a camera. Name the "
             "cameras as the rig does: --cameras A,B"
         )
-    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
-              for each in given.frames)  # fmt: skip
-    return replace(given, frames=tuple(frames))
 
 
 def describe_rig_use(rig: Rig, camera_ids: Iterable[str]) -> Iterator[str]:
@@ -152,19 +186,27 @@ def add_rig_lenses(given: Source, rig: Rig) -> Source:
     Raises ValueError where fewer than two of the rig's cameras took frames, or a lens is of none of their aspect ratio.
     """
     frames = [each for each in given.frames if isinstance(each, Frame)]
-    _check_names(rig, frames)
-    lensless = [each for each in frames if each.intrinsics is None or each.intrinsics.source not in _TRUSTED]
-    used = {each.camera_id for each in lensless}
-    lenses = Lenses({each.camera_id: each.intrinsics for each in rig.cameras
-                     if each.intrinsics is not None and each.camera_id in used})  # fmt: skip
+    _check_names(rig, [each.camera_id for each in frames])
+    lensless = [each for each in frames if _lacks_lens(each)]
+    lenses = _collect_lenses(rig, [each.camera_id for each in lensless])
     lenses.check(map(describe_image, lensless))
     added = {each.name: lenses.apply(each) for each in lensless}
     return replace(given, frames=tuple(added.get(each.name, each) for each in given.frames))
 
 
-def _check_names(rig: Rig, frames: list[Frame]) -> None:
-    there = {frame.camera_id for frame in frames} - {""}
-    if frames and sum(camera.camera_id in there for camera in rig.cameras) < 2:
+def _lacks_lens(frame: Frame) -> bool:
+    return frame.intrinsics is None or frame.intrinsics.source not in _TRUSTED
+
+
+def _collect_lenses(rig: Rig, camera_ids: Collection[str]) -> Lenses:
+    """The lenses that the rig has of these cameras."""
+    return Lenses({each.camera_id: each.intrinsics for each in rig.cameras
+                   if each.intrinsics is not None and each.camera_id in camera_ids})  # fmt: skip
+
+
+def _check_names(rig: Rig, camera_ids: Collection[str]) -> None:
+    there = set(camera_ids) - {""}
+    if camera_ids and sum(camera.camera_id in there for camera in rig.cameras) < 2:
         raise ValueError(
             f"a rig must name two or more of the cameras of the images; it has "
             f"{_join(each.camera_id for each in rig.cameras)}, and the "

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -21,8 +22,10 @@ from splatnode.capture.process.notices import InputWarning, give_warnings
 from splatnode.capture.process.terminal import ignore_progress
 from splatnode.capture.rig import Rig, RigCamera
 from splatnode.capture.rig_file import format_rig, read_rig
+from splatnode.recon import mapping
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import ReconstructionConfig, apply_changes
+from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.preparation import load_prior
 from splatnode.recon.replay_source import Source
@@ -258,3 +261,33 @@ def test_a_rig_stays_where_further_settings_change() -> None:
     rig = Rig((RigCamera("a", tuple(np.eye(4).ravel().tolist())), RigCamera("b")))
     config = apply_changes(hold_rig(ReconstructionConfig(), rig), {"registration": {"trust_poses": True}})
     assert config.registration.rig == rig and config.registration.trust_poses
+
+
+def test_a_long_recording_of_a_rig_is_a_map_in_metres(walk: RigWalk, tmp_path: Path, monkeypatch) -> None:
+    """Each scene has the rig, also one that was left and comes from its checkpoint; frame sets are stored as one."""
+    folder, out, quick = write_folders(walk, tmp_path / "shots"), tmp_path / "out", tmp_path / "quick.yaml"
+    quick.write_text(json.dumps({"size": 128, "optimize": {"iterations": 2}}))
+    camchain, real, stored = write_camchain(walk, tmp_path / "camchain.yaml"), mapping.make_node_config, []
+    monkeypatch.setattr(mapping, "make_node_config", lambda *of: msgspec.structs.replace(real(*of), max_views=6))
+    add = Store.add_frames
+    monkeypatch.setattr(Store, "add_frames", lambda self, each: (stored.append(len(each)), add(self, each))[1])
+    arguments = ["--cameras", "all", "--rig", str(camchain), "--config", str(quick), "--out", str(out)]
+    assert command_line.main(["replay", str(folder), "--map", "--every-frame", *arguments]) == 0
+    assert stored == [2] * 5
+    (merged,) = out.glob("map-*")
+    scenes = [json.loads(path.read_text()) for path in sorted(out.glob("scene-*/cameras.json"))]
+    assert len(scenes) > 1 and all("rig of 2 cameras" in scene["scale_source"] for scene in scenes)
+    cameras = json.loads((merged / "cameras.json").read_text())
+    assert cameras["scale"] == "metric"
+    called = {f"{IDS[frame.camera_id]}/{name_of(frame)}": frame.name for frame in walk.frames}
+    check_metres(
+        {called[each["name"]]: np.array(each["T_world_camera"])[:3, 3] for each in cameras["cameras"]}, walk, 0.05
+    )
+
+
+def test_a_map_of_a_rig_that_is_of_other_cameras_is_refused_at_once(walk: RigWalk, tmp_path: Path, capsys) -> None:
+    folder, rig = write_folders(walk, tmp_path / "shots"), tmp_path / "rig.yaml"
+    rig.write_text("cameras: {a: {}, b: {}}")
+    arguments = ["--cameras", "all", "--rig", str(rig), "--out", str(tmp_path / "out")]
+    assert command_line.main(["replay", str(folder), "--map", *arguments]) == 2
+    assert "it has a, b, and the images are of cam0, cam1" in capsys.readouterr().err

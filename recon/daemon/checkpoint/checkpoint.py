@@ -35,8 +35,10 @@ def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     store.save("graph", *checkpoint_store.make_graph_message(work.graph))
     save_fallbacks(store, work)
     estimate = work.find_reconstruction()
-    # Cameras that given poses hold have no evidence, and are estimated anew after a restart.
-    if estimate is not None and estimate.publishable and estimate.evidence is not None:
+    # Cameras that given poses hold have no evidence, and the rig of others is not kept, nor its metres: they are
+    # estimated anew after a restart.
+    is_kept = estimate is not None and estimate.publishable and estimate.evidence is not None
+    if estimate is not None and is_kept and (estimate.registration is None or estimate.registration.rig is None):
         store.save("judgement", *checkpoint_store.make_reconstruction_message(estimate, work.publishable_names))
     if work.scene is not None:
         store.save("pointmaps", *checkpoint_store.make_pointmaps_message(work.state.pointmaps))
