@@ -16,7 +16,7 @@ from splatnode.capture.frame import Stamp
 from splatnode.capture.rig import FrameSet, Rig, form_frame_sets
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.registration import bundle_adjustment, known_poses, rig_poses
-from splatnode.recon.registration.given_rig import GivenMounts, fit_given_rig
+from splatnode.recon.registration.given_rig import GivenMounts, MountResidual, fit_given_rig
 from splatnode.recon.registration.incremental_mapper import Map
 from splatnode.recon.registration.rig_constraint import RigConstraint
 from splatnode.recon.registration.rig_poses import RelativePoses
@@ -72,6 +72,8 @@ class RigEstimate:
     metres_per_unit: float | None  # by the given rig; None: it tells none
     scale_sigma: float  # standard deviation of its logarithm
     placed: tuple[int, ...]  # keyframes that the rig alone places
+    residuals: tuple[MountResidual, ...] = ()  # of refuted cameras
+    is_inverse: bool = False  # the images fit the inverses of all given poses
 
     @property
     def is_finite(self) -> bool:
@@ -277,7 +279,8 @@ def _describe(
     again = given.fit_scale(told)
     placed = tuple(v for v in range(len(problem.rotations)) if rig.set_of_camera[v] >= 0 and v not in adjusted.views)
     changes = _find_changes(sets, measured, reference)
-    return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed)
+    told_of_given = given.residuals, given.is_inverse
+    return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed, *told_of_given)
 
 
 def _mount_covariances(adjusted: Map) -> Array:

@@ -277,6 +277,9 @@ def test_a_camera_that_is_given_wrongly_is_named_and_not_believed() -> None:
     found, keyframes, worlds = make_drive()
     adjusted, rig = find_rig(found, keyframes, make_rig(left=3.0))
     assert rig.refuted == ("left",)
+    (off,) = rig.residuals
+    assert off.camera_id == "left" and off.beside in ("front", "right") and off.degrees == pytest.approx(3.0, abs=0.3)
+    assert off.metres < 0.02 and off.sigma_deg < 0.3 and off.sigma_m < 0.02 and not rig.is_inverse
     assert not any(mount.given for mount in rig.mounts if mount.camera_id == "left")
     assert rig.metres_per_unit == pytest.approx(scale_of(adjusted, worlds), rel=0.03)
 
@@ -286,3 +289,13 @@ def test_nothing_of_a_rig_is_believed_where_it_is_wrong_and_nothing_tells_in_wha
     rig = find_rig(found, keyframes, make_rig(left=3.0, right=-4.0, front=5.0))[1]
     assert set(rig.refuted) == set(IDS)
     assert rig.metres_per_unit is None and not any(mount.given for mount in rig.mounts)
+    assert len(rig.residuals) == 2 and max(each.degrees for each in rig.residuals) > 5.0 and not rig.is_inverse
+
+
+def test_a_rig_whose_poses_are_inverses_is_recognized() -> None:
+    """As when the poses of a file lead from the rig to its cameras."""
+    found, keyframes, _ = make_drive()
+    inverses = [replace(each, T_rig_camera=tuple(np.linalg.inv(each.matrix).ravel().tolist()))
+                for each in make_rig().cameras if each.matrix is not None]  # fmt: skip
+    rig = find_rig(found, keyframes, Rig(tuple(inverses)))[1]
+    assert set(rig.refuted) == set(IDS) and rig.is_inverse
