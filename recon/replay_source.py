@@ -167,7 +167,7 @@ def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
             raise FileNotFoundError(f"{str(path)!r} is not there; give a folder, a video, or photographs of one folder")
         if path.parent.resolve() != first.parent.resolve():
             raise ValueError(f"{str(path)!r} lies in another folder than {str(first)!r}; put them into one folder")
-    return first.parent, tuple(folder.frame_name(path) for path in paths)
+    return first.parent, tuple(folder.name_photographs(paths))
 
 
 def parse_sources(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -304,6 +304,20 @@ def frame_name(path: Path) -> str:
     So would two frames of one name: files whose names differ have names that differ.
     """
     return sanitize_name(path.name)
+
+
+def name_photographs(paths: Sequence[Path]) -> list[str]:
+    """The names of photographs by their files: of a recording, those that its frames have.
+
+    A recording's right and depth images go with their frames, and have none. Raises ValueError for a file that is none
+    of its recording's, and RecordingError.
+    """
+    recordings = {
+        folder: recording.read(folder) for folder in {path.parent for path in paths} if recording.is_recording(folder)
+    }
+    names = ([frame_name(path)] if path.parent not in recordings else recordings[path.parent].name_files([path.name])
+             for path in paths)  # fmt: skip
+    return [name for found in names for name in found]
 
 
 def image_paths(folder: Path) -> list[Path]:
