@@ -27,6 +27,7 @@ Array = npt.NDArray[np.float64]
 MOST_DEG = 10.0  # standard deviation of up by gravity, beyond which it tells no upright frame
 # Standard deviation of a floor's normal against gravity: how level floors are, and how well their plane is found
 FLOOR_SIGMA_DEG = 1.0
+BASE_SIGMA_DEG = 5.0  # of a base's z axis against gravity where nothing tells it: how level robots stand
 FARTHEST_MOUNT_M = 20.0  # of a camera from its base; beyond, the mount is probably in millimetres, which is told
 CONTRADICTED_DEG = 20.0  # between gravity and the floor, from which on this is told: a sign is wrong, or it is no floor
 _STRAIGHT = 1e-3  # length of a camera's forward axis in the level plane, below which it looks straight up or down
@@ -35,9 +36,7 @@ USE_FIRST = "Or ask for frame: first_camera."
 
 
 class UnknownFrame(ValueError):
-    """The frame of reference cannot be had; the text says what is missing and what to do."""
-
-    exit_code = 65
+    """What was given cannot tell the frame of reference; the text says what is missing and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +93,8 @@ def express_in_frame(snapshot: Snapshot, config: MetricConfig, evidence: Evidenc
     T_frame_first_camera = np.eye(4) if name is FrameName.FIRST_CAMERA else moved.cameras[0].T_world_camera
     frame = ReferenceFrame(name, found.source, found.sigma_deg, encode_matrix(T_frame_first_camera))
     up = moved.up
+    if name is FrameName.BASE and up is None:
+        up = Up((0.0, 0.0, 1.0), BASE_SIGMA_DEG, "the z axis of the robot's base, which is taken to stand level")
     if name is FrameName.UPRIGHT and found.sigma_deg is not None and found.source is not None:
         up = Up((0.0, 0.0, 1.0), found.sigma_deg, found.source)
     return replace(moved, up=up, scale=replace(moved.scale, frame=frame))
