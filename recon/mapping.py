@@ -33,6 +33,8 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Event, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, compute_gaussian_limit, write_maps
+from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.reference_frame import check_frame
 from splatnode.recon.preparation import prepare
 from splatnode.recon.replay_source import IMAGES, ReplayRecording, Request, load_recording
 from splatnode.recon.result.export import read_cameras, remove_result, write_files
@@ -178,7 +180,7 @@ def _enqueue_frames(
         inbox.enqueue_together(events, stopping, check)
 
 
-_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "gravity")
 
 
 def replay_map(args: argparse.Namespace, request: Request, config: ReconstructionConfig) -> int:
@@ -191,6 +193,12 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
         source = load_recording(request, tell)
         tell(str(source.choice))
         rig, config = choose_recording_rig(source, config, args.rig, tell)
+        mounts = (
+            {}
+            if rig is None
+            else {each.camera_id: each.matrix for each in rig.cameras if rig.is_base and each.matrix is not None}
+        )
+        check_frame(config.metric, source.evidence.merge(Evidence(mounts=mounts)))
     began_s = time.monotonic()
     with hold_result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         remove_result(args.out)  # of one scene, beside which nobody would find the map's

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -36,6 +36,7 @@ from splatnode.capture.quality import Limits
 from splatnode.capture.rgbd_folder import find_photographs
 from splatnode.capture.rig import TOLERANCE_S, Rig, form_frame_sets
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
+from splatnode.recon.metric.evidence import NOTHING, Evidence
 
 Array = npt.NDArray[np.float64]
 
@@ -113,6 +114,7 @@ class ReplayRecording:
     request: Request
     choice: Choice
     images: frozenset[tuple[str, str, str, int, int]] = frozenset()  # as `Lenses.check` asks of all that there are
+    evidence: Evidence = NOTHING  # poses, motions and mounts that came with images: of each kind one, if there is any
 
     @property
     def path(self) -> Path:
@@ -230,11 +232,12 @@ def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayReco
     """As `load_source`, without a limit to the number of keyframes."""
     _check_there(request)
     images: set[tuple[str, str, str, int, int]] = set()
-    looked_through = _record_sizes(_stream_candidates(request, tell), images)
+    came: dict[str, dict[str, Any]] = {"tracked": {}, "motions": {}, "mounts": {}}
+    looked_through = _record_content(_stream_candidates(request, tell), images, came)
     choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request), request.tolerance_s)
     if request.lenses is not None:
         request.lenses.check(images)
-    return ReplayRecording(request, choice, frozenset(images))
+    return ReplayRecording(request, choice, frozenset(images), Evidence(**came))
 
 
 def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
@@ -376,13 +379,22 @@ def _stream_candidates(request: Request, tell: Tell) -> Iterator[Frame | Dropped
     return report_items(_stream(request), tell, doing, of, _unit_name(request))
 
 
-def _record_sizes(
-    frames: Iterator[Frame | DroppedFrame], images: set[tuple[str, str, str, int, int]]
+def _record_content(
+    frames: Iterator[Frame | DroppedFrame],
+    images: set[tuple[str, str, str, int, int]],
+    came: Mapping[str, dict[str, Any]],
 ) -> Iterator[Frame | DroppedFrame]:
-    """The frames, whose names, cameras and sizes are added to `images` as they pass."""
+    """The frames, whose names, cameras and sizes are added to `images` as they pass.
+
+    The first pose, motion and mount that there is go to `came`, as `Evidence` has them.
+    """
     for each in frames:
         if isinstance(each, Frame):
             images.add(describe_image(each))
+            told = {"tracked": each.given_pose, "motions": each.motion, "mounts": each.mount}
+            for kind, value in told.items():
+                if value is not None and not came[kind]:
+                    came[kind][each.name] = value
         yield each
 
 
