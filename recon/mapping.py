@@ -27,6 +27,7 @@ from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.process.records import record_in
 from splatnode.capture.process.system import is_shortage
 from splatnode.capture.process.terminal import ProgressStep, format_times, is_interactive, progress, say, show_progress
+from splatnode.capture.rig import Rig
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint.store import Store
@@ -193,12 +194,7 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
         source = load_recording(request, tell)
         tell(str(source.choice))
         rig, config = choose_recording_rig(source, config, args.rig, tell)
-        mounts = (
-            {}
-            if rig is None
-            else {each.camera_id: each.matrix for each in rig.cameras if rig.is_base and each.matrix is not None}
-        )
-        check_frame(config.metric, source.evidence.merge(Evidence(mounts=mounts)))
+        _check_frame(config, source, rig)
     began_s = time.monotonic()
     with hold_result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         remove_result(args.out)  # of one scene, beside which nobody would find the map's
@@ -218,6 +214,13 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
     else:
         _print_report(report, args.out)
     return EXIT_GOOD if reports else EXIT_REFUSED
+
+
+def _check_frame(config: ReconstructionConfig, source: ReplayRecording, rig: Rig | None) -> None:
+    """Raises UnknownFrame where neither the recording nor the rig can tell the frame of reference."""
+    on_base = rig.cameras if rig is not None and rig.is_base else ()
+    mounts = {each.camera_id: each.matrix for each in on_base if each.matrix is not None}
+    check_frame(config.metric, source.evidence.merge(Evidence(mounts=mounts)))
 
 
 @contextlib.contextmanager
