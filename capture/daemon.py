@@ -294,7 +294,7 @@ class CaptureSession:
         return decision
 
     def _decide_again(self, frame: Frame) -> Decision:
-        """Decides about a frame that another camera's keyframe wants; this camera loses nothing by one that is unusable."""
+        """Decides about a frame that another camera's keyframe wants. An unusable one is no loss of this camera's own."""
         decision = self._find_selector(frame).add(frame, TOGETHER)
         return decision if decision.take else replace(decision, candidate=False)
 

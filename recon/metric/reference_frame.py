@@ -36,7 +36,7 @@ USE_FIRST = "Or ask for frame: first_camera."
 
 
 class UnknownFrame(ValueError):
-    """What was given cannot tell the frame of reference; the text says what is missing and what to do."""
+    """Nothing that was given tells the frame of reference; the text says what is missing and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
