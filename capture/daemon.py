@@ -294,7 +294,7 @@ class CaptureSession:
         return decision
 
     def _decide_again(self, frame: Frame) -> Decision:
-        """Decides about a frame that another camera's keyframe wants. An unusable one is no loss of this camera's own."""
+        """Decides about a frame that another camera's keyframe wants. An unusable one is not counted as such."""
         decision = self._find_selector(frame).add(frame, TOGETHER)
         return decision if decision.take else replace(decision, candidate=False)
 

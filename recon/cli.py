@@ -20,6 +20,7 @@ from splatnode.capture.lens_file import Lenses, read_lenses
 from splatnode.capture.pose_files import Trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.terminal import ProgressStep, Tell, say, show_progress
+from splatnode.capture.rig_file import read_rig
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.mapping import replay_map
 from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
@@ -86,6 +87,8 @@ def replay(args: argparse.Namespace) -> int:
         raise ValueError("--multi-view-only is for one scene: a merged map does not tell what two photographs confirm")
     if args.map and args.depths is not None:
         raise ValueError("--depths is for one scene; with --map give a folder whose layout has depth (docs/inputs.md)")
+    if args.rig is not None:
+        read_rig(args.rig)  # before images are read, which takes longer
     if args.map:
         return replay_map(args, request, config)
     with show_progress(quiet=args.json) as tell:

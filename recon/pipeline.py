@@ -264,7 +264,7 @@ def reconstruct_source(
         notify(log, doubt)
     with threads.apply_thread_limit(most_threads):
         evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
-        check_frame(config.metric, evidence)
+        check_frame(config.metric, evidence, has_lengths=config.registration.rig is not None)
         snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)
     snapshot = _add_given_lenses(snapshot, source.frames)
     if without_guesses:

@@ -115,6 +115,7 @@ class ReplayRecording:
     choice: Choice
     images: frozenset[tuple[str, str, str, int, int]] = frozenset()  # as `Lenses.check` asks of all that there are
     evidence: Evidence = NOTHING  # poses, motions and mounts that came with images: of each kind one, if there is any
+    has_depth: bool = False  # some images came with a right image or a depth image
 
     @property
     def path(self) -> Path:
@@ -233,11 +234,12 @@ def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayReco
     _check_there(request)
     images: set[tuple[str, str, str, int, int]] = set()
     came: dict[str, dict[str, Any]] = {"tracked": {}, "motions": {}, "mounts": {}}
-    looked_through = _record_content(_stream_candidates(request, tell), images, came)
+    beside: set[str] = set()
+    looked_through = _record_content(_stream_candidates(request, tell), images, came, beside)
     choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request), request.tolerance_s)
     if request.lenses is not None:
         request.lenses.check(images)
-    return ReplayRecording(request, choice, frozenset(images), Evidence(**came))
+    return ReplayRecording(request, choice, frozenset(images), Evidence(**came), has_depth=bool(beside))
 
 
 def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
@@ -383,10 +385,12 @@ def _record_content(
     frames: Iterator[Frame | DroppedFrame],
     images: set[tuple[str, str, str, int, int]],
     came: Mapping[str, dict[str, Any]],
+    beside: set[str],
 ) -> Iterator[Frame | DroppedFrame]:
     """The frames, whose names, cameras and sizes are added to `images` as they pass.
 
-    The first pose, motion and mount that there is go to `came`, as `Evidence` has them.
+    The first pose, motion and mount that there is go to `came`, as `Evidence` has them, and the names of frames that
+    have a right or a depth image to `beside`.
     """
     for each in frames:
         if isinstance(each, Frame):
@@ -395,6 +399,8 @@ def _record_content(
             for kind, value in told.items():
                 if value is not None and not came[kind]:
                     came[kind][each.name] = value
+            if each.right is not None or each.depth is not None:
+                beside.add(each.name)
         yield each
 
 

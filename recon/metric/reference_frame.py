@@ -33,6 +33,10 @@ CONTRADICTED_DEG = 20.0  # between gravity and the floor, from which on this is 
 _STRAIGHT = 1e-3  # length of a camera's forward axis in the level plane, below which it looks straight up or down
 
 USE_FIRST = "Or ask for frame: first_camera."
+_GIVE_METRES = (
+    "Give something that tells metres: a marker, a distance, poses, wheels, stereo, depth, or a rig of several "
+    f"cameras. {USE_FIRST}"
+)
 
 
 class UnknownFrame(ValueError):
@@ -56,11 +60,24 @@ class _Found:
     sigma_deg: float | None = None
 
 
-def check_frame(config: MetricConfig, evidence: Evidence) -> None:
-    """Raises UnknownFrame before the work where it is known already that the frame cannot be had."""
-    missing = None if config.frame is None else _find_missing_evidence(parse_frame_name(config.frame), evidence)
+def check_frame(config: MetricConfig, evidence: Evidence, has_lengths: bool = False) -> None:
+    """Raises UnknownFrame before the work where it is known already that the frame cannot be had.
+
+    `has_lengths`: something beside both may tell metres, as a rig that is given.
+    """
+    if config.frame is None:
+        return
+    name = parse_frame_name(config.frame)
+    missing = _find_missing_evidence(name, evidence)
+    if missing is None and name is FrameName.BASE and not (has_lengths or _may_tell_metres(config, evidence)):
+        missing = _Missing("nothing that was given tells metres, in which T_base_camera is", _GIVE_METRES)
     if missing is not None:
         raise UnknownFrame(f"frame: {config.frame} was asked for, and {missing.what}. {missing.advice}")
+
+
+def _may_tell_metres(config: MetricConfig, evidence: Evidence) -> bool:
+    asked = config.baselines, config.marker_size_m, config.depth_network
+    return any((*asked, evidence.poses, evidence.tracked, evidence.motions, evidence.pairs, evidence.depths))
 
 
 def _find_missing_evidence(name: FrameName, evidence: Evidence) -> _Missing | None:
@@ -133,7 +150,7 @@ def _find_base(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) ->
         why = f": {snapshot.scale.source}" if snapshot.scale.source else ""
         return _Missing(
             f"the scene has no metres, in which T_base_camera is{why}",
-            f"Give something that tells metres: a marker, a distance, poses, wheels, stereo or depth. {USE_FIRST}",
+            _GIVE_METRES,
         )
     mount = evidence.mounts[first.name]
     source, away_m = f"T_base_camera of {first.name}", float(np.linalg.norm(mount[:3, 3]))

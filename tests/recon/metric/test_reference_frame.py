@@ -225,6 +225,11 @@ def test_what_is_missing_from_the_beginning_is_told_before_the_work():
     check_frame(asked("upright"), NOTHING)  # a floor may be found
     check_frame(asked("base"), Evidence(mounts=mounts()))
     check_frame(asked(None), NOTHING)
+    bare = msgspec.structs.replace(asked("base"), baseline=None)
+    with pytest.raises(UnknownFrame, match="nothing that was given tells metres"):
+        check_frame(bare, Evidence(mounts=mounts()))
+    check_frame(bare, Evidence(mounts=mounts()), has_lengths=True)
+    check_frame(msgspec.structs.replace(bare, marker_size_m=0.1), Evidence(mounts=mounts()))
 
 
 def test_a_refused_snapshot_keeps_its_reason():
