@@ -62,8 +62,7 @@ class FrameSetSelection:
             self._held.setdefault(frame.camera_id, deque(maxlen=MOST_HELD)).append(frame)
 
     def mark_taken(self, frame: Frame) -> None:
-        """The frame became a keyframe: none before it is wanted of its camera."""
-        self._held.pop(frame.camera_id, None)
+        """The frame became a keyframe, and its camera gives no other to a time that is near."""
         if frame.captured_at is not None:
             self._taken.append((frame.camera_id, frame.captured_at))
             for each in self._wanted:

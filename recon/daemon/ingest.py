@@ -276,10 +276,6 @@ def _do_nothing() -> None:
     """Nobody waits for the one that puts."""
 
 
-def _are_both_keyframes(one: Event, other: Event) -> bool:
-    return isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)
-
-
 def are_one_set(one: Event, other: Event) -> bool:
     """Whether both are keyframes that were taken together."""
     if not (isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)):
@@ -321,22 +317,23 @@ class Inbox:
             self._events.extend(events)
             self._changed.notify_all()
 
-    def enqueue_now(self, event: RemovedFrame) -> None:
+    def enqueue_now(self, *events: RemovedFrame) -> None:
         """Also where the inbox is full: who gives commands does not wait for the work."""
         with self._changed:
-            self._events.append(event)
+            self._events.extend(events)
             self._changed.notify_all()
 
     def dequeue(self, timeout_s: float) -> list[Event]:
         """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time.
 
-        Keyframes of one frame set are never apart: with them there may be more.
+        Keyframes of one frame set are never apart: with them there may be more. After a removal with all that follow.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []
-            while self._events and events and _are_both_keyframes(events[0], self._events[0]):
-                if len(events) >= BATCH and not are_one_set(events[-1], self._events[0]):
+            while self._events and events and type(events[0]) is type(self._events[0]):
+                is_full = isinstance(events[0], ArrivedKeyframe) and len(events) >= BATCH
+                if is_full and not are_one_set(events[-1], self._events[0]):
                     break
                 events.append(self._events.popleft())
             self._changed.notify_all()

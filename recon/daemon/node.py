@@ -397,8 +397,7 @@ class Daemon:
             self._store.forget_frames(here, "retracted", left)
         except OSError as error:
             return Answer(False, sanitize_text(f"{name} cannot be removed ({error.strerror}): make room on the disk"))
-        for each in here:
-            self._inbox.enqueue_now(RemovedFrame(each))
+        self._inbox.enqueue_now(*map(RemovedFrame, here))
         scenes = ", ".join(dict.fromkeys(scene for scene, _ in left))
         event(log, logging.INFO, "retracted", frame=",".join(names), left=scenes)
         those = f"{scenes}, which the camera has left, is built anew without it when no keyframe waits"

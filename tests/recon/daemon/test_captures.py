@@ -271,9 +271,7 @@ def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path, monkeypatch):
     assert answer.done and answer.message.endswith("with it left_100, taken at the same time")
     assert store.names == {"left_300", "_100"}
     assert len(ledgers) == 1, "at once: no kill leaves half of it"
-    assert node._inbox.dequeue(0) == [RemovedFrame("right_105")] and node._inbox.dequeue(0) == [
-        RemovedFrame("left_100")
-    ]
+    assert node._inbox.dequeue(0) == [RemovedFrame("right_105"), RemovedFrame("left_100")], "at once"
     assert Daemon._answer(node, RemoveKeyframe("left_300")).message == (
         "left_300 is removed; the scene is built anew without it"
     )
