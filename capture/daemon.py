@@ -21,7 +21,7 @@ from splatnode.capture.config import CaptureConfig, camera_opener, encode_previe
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.frame_set_selection import FrameSetSelection
 from splatnode.capture.keyframe_selection import TOGETHER, Decision, Selector
-from splatnode.capture.messaging.frame_set_link import FrameSetLink
+from splatnode.capture.messaging.frame_set_link import FULL_S, FrameSetLink
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer
 from splatnode.capture.messaging.network import (
     CAPTURE_CONTROL,
@@ -178,6 +178,8 @@ class CaptureSession:
             0.0 if config.selection.every_frame else config.selection.frame_set_tolerance_s
         )
         self._link = _open_link(config, resources)
+        self._full_from = math.inf  # with so many keyframes or more in the spool there is no room for another
+        self._next_word_s = -math.inf  # when the others are told that there is none (monotonic)
         self._problems = Problems()
         self._commands = resources.enter_context(
             CommandServer(CAPTURE_CONTROL.select_capture(config.camera_id), config.network, MarkProblemsSeen)
@@ -244,7 +246,14 @@ class CaptureSession:
         """Answers recon's requests, and whoever has seen the problems."""
         self._server.serve(0)
         self._commands.serve(0, self._answer)
-        for stamp in self._link.receive() if self._link is not None and not self.is_waiting else ():
+        if self._link is None or self.is_waiting:
+            return
+        if self._server.num_queued < self._full_from:
+            self._full_from = math.inf
+        elif time.monotonic() >= self._next_word_s:
+            self._next_word_s = time.monotonic() + FULL_S / 4
+            self._link.announce_full()
+        for stamp in self._link.receive():
             self._take_wanted(self._together.want(stamp))
 
     def _take_wanted(self, frames: Sequence[Frame]) -> None:
@@ -399,7 +408,9 @@ class CaptureSession:
         Raises what is_shortage tells: then the frame waits, and not the disk is to blame.
         """
         try:
-            self._server.offer(item)
+            if self._link is not None and isinstance(item, Frame) and self._link.is_another_full:
+                raise SpoolFull("the spool of another camera is full, and no part of a frame set is kept")
+            self._store(item)
         except WireError as error:
             self.not_taken += 1
             if is_logged(self._problems.add("keyframes too large to be sent", error)):
@@ -416,6 +427,14 @@ class CaptureSession:
             event(log, logging.INFO, "spool_has_room", not_taken=self.not_taken)
             self._spool_full = ""
         return True
+
+    def _store(self, item: Frame | DroppedFrame) -> None:
+        """Puts a frame into the spool. Raises as `KeyframeServer.offer`, and remembers that there is no room."""
+        try:
+            self._server.offer(item)
+        except SpoolFull:
+            self._full_from = self._server.num_queued
+            raise
 
     def _send_preview(self, frame: Frame, decision: Decision, state: ReaderState) -> None:
         rate = self.config.preview.fps

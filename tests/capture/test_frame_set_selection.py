@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -75,10 +76,11 @@ def photograph(texture: np.ndarray, offset: int) -> np.ndarray:
     return np.ascontiguousarray(texture[:, offset : offset + 320])
 
 
-def open_session(folder: Path, camera_id: str, resources: ExitStack, **selection) -> CaptureSession:
+def open_session(folder: Path, camera_id: str, resources: ExitStack, most: int = 200, **selection) -> CaptureSession:
     given = {
         "camera": {"kind": "synthetic"}, "camera_id": camera_id, "selection": selection, "preview": {"fps": 0.0},
-        "spool": {"directory": str(folder / "state")}, "network": {"directory": str(folder / "run")},
+        "spool": {"directory": str(folder / "state"), "max_frames": most},
+        "network": {"directory": str(folder / "run")},
     }  # fmt: skip
     config = parse_config(given, CaptureConfig)
     server = KeyframeServer(config.network, Spool(config.spool, camera_id), camera_id)
@@ -137,3 +139,27 @@ def test_each_camera_selects_by_itself_where_it_is_told_to(texture, tmp_path):
                 sessions[each.camera_id].take(each, ReaderState.STREAMING)
                 sessions[each.camera_id].serve()
     assert sessions["right"].keyframes < sessions["left"].keyframes
+
+
+def test_no_part_of_a_frame_set_is_kept_where_one_camera_has_no_room(texture, tmp_path):
+    """The left spool holds three keyframes; nobody takes them. Once one is taken, whole sets are kept again."""
+    with ExitStack() as resources:
+        left, right = (open_session(tmp_path, each, resources, most=most) for each, most in (("left", 3), ("right", 9)))
+        pairs = list(walk(texture))
+
+        def take(pair):
+            for each, session in zip(pair, (left, right), strict=True):
+                session.take(each, ReaderState.STREAMING)
+                session.serve()
+                (right if session is left else left).serve()
+
+        for pair in pairs[:8]:
+            take(pair)
+        assert left._server.num_queued == 3 and right._server.num_queued <= 4 and right.not_taken > 0
+        assert "another camera is full" in right._spool_full
+        left._server.spool.remove(next(iter(left._server.spool)))
+        left.serve()
+        right._link._full_s = -math.inf  # two seconds later
+        before = right._server.num_queued
+        take((frame("left", 60_000, photograph(texture, 600)), frame("right", 60_004, photograph(texture, 900))))
+        assert left._server.num_queued == 3 and right._server.num_queued == before + 1

@@ -8,7 +8,8 @@ import struct
 import pytest
 
 from splatnode.capture.frame import LARGEST_NS, Clock, Stamp
-from splatnode.capture.messaging.frame_set_link import FrameSetLink
+from splatnode.capture.messaging import frame_set_link
+from splatnode.capture.messaging.frame_set_link import FULL_S, FrameSetLink
 from splatnode.capture.messaging.network import Network
 
 AT = Stamp(1_700_000_000_123_456_789, Clock.UTC)
@@ -59,3 +60,13 @@ def test_what_no_capture_sends_is_no_time(network):
         ):
             stranger.sendto(data, str(left._path))
         assert left.receive() == []
+
+
+def test_one_that_has_no_room_says_so_for_a_while(network, monkeypatch):
+    with FrameSetLink(network, "left") as left, FrameSetLink(network, "right") as right:
+        assert not right.is_another_full
+        left.announce_full()
+        assert right.receive() == [] and right.is_another_full and not left.is_another_full
+        now_s = frame_set_link.time.monotonic()
+        monkeypatch.setattr(frame_set_link.time, "monotonic", lambda: now_s + FULL_S + 0.1)
+        assert not right.is_another_full
