@@ -239,7 +239,8 @@ def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayReco
     choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request), request.tolerance_s)
     if request.lenses is not None:
         request.lenses.check(images)
-    return ReplayRecording(request, choice, frozenset(images), Evidence(**came), has_depth=bool(beside))
+    evidence = Evidence(tracked=came["tracked"], motions=came["motions"], mounts=came["mounts"])
+    return ReplayRecording(request, choice, frozenset(images), evidence, has_depth=bool(beside))
 
 
 def load_source(request: Request, tell: Tell = ignore_progress) -> Source:

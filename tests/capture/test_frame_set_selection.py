@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -97,14 +97,24 @@ def walk(texture: np.ndarray) -> Iterator[tuple[Frame, Frame]]:
         )
 
 
+def record(offer: Callable[[Frame], object], taken: list[Frame]) -> Callable[[Frame], object]:
+    """Makes `offer` write down what it gets."""
+
+    def offer_and_record(item: Frame) -> object:
+        taken.append(item)
+        return offer(item)
+
+    return offer_and_record
+
+
 @pytest.mark.parametrize("right_first", [False, True])
-def test_two_captures_take_whole_frame_sets(texture, tmp_path, right_first):
+def test_two_captures_take_whole_frame_sets(texture, tmp_path, monkeypatch, right_first):
     taken: dict[str, list[Frame]] = {"left": [], "right": []}
     with ExitStack() as resources:
         sessions = {each: open_session(tmp_path, each, resources) for each in taken}
         for each, session in sessions.items():
             offer = session._server.offer
-            session._server.offer = lambda item, of=taken[each], offer=offer: (of.append(item), offer(item))[1]
+            monkeypatch.setattr(session._server, "offer", record(offer, taken[each]))
         for left, right in walk(texture):
             for each in (right, left) if right_first else (left, right):
                 sessions[each.camera_id].serve()
@@ -116,12 +126,12 @@ def test_two_captures_take_whole_frame_sets(texture, tmp_path, right_first):
     assert len(sets) > 5 and all(len(each.names) == 2 for each in sets)
 
 
-def test_one_process_with_two_cameras_takes_whole_frame_sets(texture, tmp_path):
+def test_one_process_with_two_cameras_takes_whole_frame_sets(texture, tmp_path, monkeypatch):
     taken, reasons = list[Frame](), set[str]()
     with ExitStack() as resources:
         session = open_session(tmp_path, "", resources)
         offer = session._server.offer
-        session._server.offer = lambda item: (taken.append(item), offer(item))[1]
+        monkeypatch.setattr(session._server, "offer", record(offer, taken))
         for pair in walk(texture):
             decisions = [session.push(each) for each in pair]
             assert decisions[0].take == decisions[1].take

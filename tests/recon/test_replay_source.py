@@ -256,7 +256,8 @@ def test_files_of_a_recording_are_its_frames(tmp_path):
     path, listed, cameras = parse_sources(files[2:])
     found = load_source(Request(path, listed, cameras=cameras))
     assert [each.name for each in found.frames] == ["000001.png", "000000.png"]
-    assert np.array_equal(found.frames[1].image, images[2]) and found.frames[1].right is not None
+    last = found.frames[1]
+    assert isinstance(last, Frame) and np.array_equal(last.image, images[2]) and last.right is not None
     assert names_of(files) == ["000002.png", "000001.png", "000000.png"]
     (folder / "stray.png").write_bytes(files[0].read_bytes())
     with pytest.raises(ValueError, match="'stray.png' is no image of the recording"):

@@ -80,7 +80,7 @@ def test_the_base_tells_up_where_nothing_else_does():
     moved = apply_metric_scale(scene(), asked("base"), Evidence(mounts=mounts()))
     assert moved.up is not None and moved.up.direction == (0.0, 0.0, 1.0) and "taken to stand level" in moved.up.source
     report = build_report(moved, seed=0, preset="fast", peak_rss_mb=None)
-    assert report["up"]["direction"] == (0.0, 0.0, 1.0)
+    assert json.loads(json.dumps(report))["up"]["direction"] == [0.0, 0.0, 1.0]
     known = apply_metric_scale(scene(), asked("base"), Evidence(mounts=mounts(), gravities=gravities()))
     expected = AHEAD[:3, :3] @ TRUE[0][:3, :3].T @ UP
     assert known.up is not None and "level" not in known.up.source
