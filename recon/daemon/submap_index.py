@@ -237,9 +237,9 @@ class SubmapIndex:
         return {camera.name: camera.T_world_camera for camera in self._read_cameras(scene_id)}
 
     def _read_cameras(self, scene_id: str) -> Sequence[CameraEstimate]:
-        """The cameras of a scene as it was written; none where they cannot be read."""
+        """The cameras of a scene as it was written; none where it was refused, or they cannot be read."""
         place = next((each for each in self._index.places if each.scene_id == scene_id), None)
-        if place is None or place.folder is None:
+        if place is None or place.folder is None or not place.publishable:
             return ()
         try:
             return read_cameras(self._path.parent / place.folder / "cameras.json")

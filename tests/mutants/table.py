@@ -571,6 +571,11 @@ MUTANTS = (
             "gone=ledger.gone[-REMEMBERED:],",
         ),
         (
+            "a part of a frame set stays after a kill",
+            "if last is None or not last.following or self._next > last.number + 1:",
+            "if last is None or last.following or self._next > last.number + 1:",
+        ),
+        (
             "a new frame may get the name of one that is there",
             "taken = {*self._names, *others, *(dropped for dropped, _ in self.ledger.dropped)}",
             "taken = {*others, *(dropped for dropped, _ in self.ledger.dropped)}",
