@@ -220,7 +220,7 @@ def _check_frame(config: ReconstructionConfig, source: ReplayRecording, rig: Rig
     """Raises UnknownFrame where neither the recording nor the rig can tell the frame of reference."""
     on_base = rig.cameras if rig is not None and rig.is_base else ()
     mounts = {each.camera_id: each.matrix for each in on_base if each.matrix is not None}
-    has_lengths = source.has_depth or config.registration.rig is not None
+    has_lengths = source.has_depth or config.registration.rig is not None or len(source.evidence.mounts) > 1
     check_frame(config.metric, source.evidence.merge(Evidence(mounts=mounts)), has_lengths)
 
 

@@ -114,7 +114,8 @@ class ReplayRecording:
     request: Request
     choice: Choice
     images: frozenset[tuple[str, str, str, int, int]] = frozenset()  # as `Lenses.check` asks of all that there are
-    evidence: Evidence = NOTHING  # poses, motions and mounts that came with images: of each kind one, if there is any
+    # Of poses and motions that came with images one each, if there is any, and a mount of each camera, by its id
+    evidence: Evidence = NOTHING
     has_depth: bool = False  # some images came with a right image or a depth image
 
     @property
@@ -390,16 +391,17 @@ def _record_content(
 ) -> Iterator[Frame | DroppedFrame]:
     """The frames, whose names, cameras and sizes are added to `images` as they pass.
 
-    The first pose, motion and mount that there is go to `came`, as `Evidence` has them, and the names of frames that
-    have a right or a depth image to `beside`.
+    The first pose and motion that there is go to `came`, as `Evidence` has them, the first mount of each camera by its
+    id, and the names of frames that have a right or a depth image to `beside`.
     """
     for each in frames:
         if isinstance(each, Frame):
             images.add(describe_image(each))
-            told = {"tracked": each.given_pose, "motions": each.motion, "mounts": each.mount}
-            for kind, value in told.items():
+            for kind, value in (("tracked", each.given_pose), ("motions", each.motion)):
                 if value is not None and not came[kind]:
                     came[kind][each.name] = value
+            if each.mount is not None:
+                came["mounts"].setdefault(each.camera_id, each.mount)
             if each.right is not None or each.depth is not None:
                 beside.add(each.name)
         yield each

@@ -18,15 +18,14 @@ from splatnode.capture.multi_camera import CameraSet
 from splatnode.capture.process.notices import notify
 from splatnode.capture.process.terminal import Tell
 from splatnode.capture.process.text import sanitize_text
-from splatnode.capture.rig import Rig, RigCamera
+from splatnode.capture.rig import MOUNT_SIGMA_DEG, MOUNT_SIGMA_M, Rig, RigCamera
 from splatnode.capture.rig_file import read_rig
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.replay_source import ReplayRecording, Source
 
 log = logging.getLogger(__name__)
 
-# Standard deviations of a camera's pose by a log's static transforms, which are drawn more often than calibrated
-DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = 0.005, 0.5
+DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = MOUNT_SIGMA_M, MOUNT_SIGMA_DEG  # by a log's static transforms
 LONGEST_BASELINE_M = 20.0  # between two cameras of a robot; beyond, the file is probably in millimetres
 _TRUSTED = ("given", "calibration")  # sources of a lens that a rig's does not replace
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.config_keys import Internal
-from splatnode.capture.rig import TOLERANCE_S, Rig
+from splatnode.capture.rig import TOLERANCE_S, Rig, form_mounted_rig
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import undistort_rays
 from splatnode.recon.matching.pair_matching import TwoView
@@ -134,7 +134,8 @@ def register(
     scales = [grouping.scales[i] for i in rank]
     alone = make_registration(found.relabel(order), keyframes, scales, config)
     pause()
-    on_rig = rigs.adjust_with_rig(found, ordered, config.rig, tolerance_s)
+    given = config.rig or form_mounted_rig(each.frame for each in keyframes)
+    on_rig = rigs.adjust_with_rig(found, ordered, given, tolerance_s)
     if on_rig is None:
         return alone
     adjusted, rig = on_rig[0].relabel(order), on_rig[1].relabel(order)

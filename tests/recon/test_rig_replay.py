@@ -291,3 +291,13 @@ def test_a_map_of_a_rig_that_is_of_other_cameras_is_refused_at_once(walk: RigWal
     arguments = ["--cameras", "all", "--rig", str(rig), "--out", str(tmp_path / "out")]
     assert command_line.main(["replay", str(folder), "--map", *arguments]) == 2
     assert "it has a, b, and the images are of cam0, cam1" in capsys.readouterr().err
+
+
+def test_mounts_of_several_cameras_give_metres(walk: RigWalk) -> None:
+    """T_base_camera of each camera, as capture's configuration or Python tells it, and no rig beside it."""
+    mounts = true_mounts()
+    frames = [replace(each, T_base_camera=tuple(mounts[each.camera_id].ravel().tolist())) for each in walk.frames]
+    config = apply_changes(ReconstructionConfig(), {"size": 160})
+    estimate, _ = estimate_frame_cameras(frames, load_prior(config), config, Clock())
+    assert estimate.rig is not None and estimate.rig.metres_per_unit is not None and not estimate.rig.refuted
+    assert estimate.rig.num_given == 2

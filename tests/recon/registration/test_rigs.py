@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Clock as StampClock
 from splatnode.capture.frame import Frame, Stamp
-from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera
+from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera, form_mounted_rig
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.registration import bundle_adjustment, rigs
@@ -271,6 +271,24 @@ def test_only_cameras_that_have_images_and_are_given_count_for_the_rig() -> None
     assert rig.num_given == 2
     assert find_rig(found, keyframes, make_rig(left=3.0))[1].num_given == 2, "a camera that is not believed"
     assert find_rig(found, keyframes)[1].num_given == 0
+
+
+def test_cameras_whose_place_on_the_base_is_told_are_a_rig() -> None:
+    """As capture's configuration tells it, with each image; a camera on an arm is none of it."""
+    _, keyframes, _ = make_drive()
+    mounts = {camera: tuple(T.ravel().tolist()) for camera, T in true_mounts().items()}
+    told = [replace(each.frame, T_base_camera=mounts[each.frame.camera_id]) for each in keyframes]
+    rig = form_mounted_rig(told)
+    assert rig is not None and rig.is_base and {each.camera_id for each in rig.cameras} == set(IDS)
+    assert {each.sigma_m for each in rig.cameras} == {0.005}
+    found = make_drive()[0]
+    assert find_rig(found, keyframes, rig)[1].metres_per_unit is not None
+    moves = [replace(each, T_base_camera=mounts[IDS[index % 2]]) if each.camera_id == "right" else each
+             for index, each in enumerate(told)]  # fmt: skip
+    rig = form_mounted_rig(moves)
+    assert rig is not None and "right" not in {each.camera_id for each in rig.cameras}
+    assert form_mounted_rig(each for each in told if each.camera_id == "left") is None
+    assert form_mounted_rig(each.frame for each in keyframes) is None
 
 
 def test_a_camera_that_is_given_wrongly_is_named_and_not_believed() -> None:
