@@ -60,6 +60,7 @@ BENCHMARKS = {
         "lens_assumptions",
         "registrations",
         "known_poses",
+        "odometry_sets",
         "several_cameras",
         "rigs",
         "rgbd",
