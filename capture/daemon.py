@@ -8,8 +8,10 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -18,7 +20,9 @@ import msgspec
 
 from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live, mount_camera, name_camera
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.keyframe_selection import Decision, Selector
+from splatnode.capture.frame_set_selection import FrameSetSelection
+from splatnode.capture.keyframe_selection import TOGETHER, Decision, Selector
+from splatnode.capture.messaging.frame_set_link import FULL_S, FrameSetLink
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer, QuarantinedKeyframe, Spool, SpoolFull
 from splatnode.capture.messaging.messages import Amount, Count, Header, Name, Numbering, Text, WireError
 from splatnode.capture.messaging.network import (
@@ -353,6 +357,12 @@ class CaptureSession:
         self._started = False
         self._server = server
         self._selectors: dict[str, Selector] = {}  # by camera id: each camera has views of its own
+        self._together = FrameSetSelection(
+            0.0 if config.selection.every_frame else config.selection.frame_set_tolerance_s
+        )
+        self._link = _open_link(config, resources)
+        self._full_from = math.inf  # with so many keyframes or more in the spool there is no room for another
+        self._next_word_s = -math.inf  # when the others are told that there is none (monotonic)
         self._problems = Problems()
         self._commands = resources.enter_context(
             CommandServer(CAPTURE_CONTROL.select_capture(config.camera_id), config.network, MarkProblemsSeen)
@@ -369,21 +379,22 @@ class CaptureSession:
         self._began = self._next_beat = time.monotonic()
         self._rate = _Rate()
         self._heart, self._preview = Unfailing("the heartbeat"), Unfailing("the preview")
-        self._postponed: tuple[str, Callable[[], object]] | None = None  # a frame, and what is to be done with it
+        self._postponed: list[tuple[str, Callable[[], object]]] = []  # frames, and what is to be done with each
 
     @property
     def is_waiting(self) -> bool:
         """Whether a frame waits for memory or a file that this process may open: no further one is read meanwhile."""
-        return self._postponed is not None
+        return bool(self._postponed)
 
     def waits(self, pause_s: float) -> bool:
         """Whether a frame still waits, after another try and a pause."""
-        if self._postponed is None:
+        if not self._postponed:
             return False
-        (name, step), self._postponed = self._postponed, None
-        self._attempt(name, step)
-        if self._postponed is None:
-            event(log, logging.INFO, "goes_on", frame=name)
+        postponed, self._postponed = self._postponed, []
+        for name, step in postponed:
+            self._attempt(name, step)
+        if not self._postponed:
+            event(log, logging.INFO, "goes_on", frame=postponed[-1][0])
             return False
         time.sleep(pause_s)
         return True
@@ -408,7 +419,7 @@ class CaptureSession:
         except Exception as error:
             why = f"{name}: {type(error).__name__}: {error}"
             if is_shortage(error):
-                self._postponed = name, step
+                self._postponed.append((name, step))
                 if is_logged(self._problems.add(f"times that a frame had to wait ({SHORT_OF_MEMORY})", why)):
                     event(log, logging.WARNING, "waits", frame=name, why=why)
             elif is_logged(self._problems.add("frames that could not be handled", why)):
@@ -418,12 +429,31 @@ class CaptureSession:
         """Answers recon's requests, and whoever has seen the problems."""
         self._server.serve(0)
         self._commands.serve(0, self._answer)
+        if self._link is None or self.is_waiting:
+            return
+        if self._server.num_queued < self._full_from:
+            self._full_from = math.inf
+        elif time.monotonic() >= self._next_word_s:
+            self._next_word_s = time.monotonic() + FULL_S / 4
+            self._link.announce_full()
+        for stamp in self._link.receive():
+            self._take_wanted(self._together.want(stamp))
+
+    def _take_wanted(self, frames: Sequence[Frame]) -> None:
+        """Frames that became no keyframes, until another camera took one with them."""
+        for frame in frames:
+            decision = self._decide_again(frame)
+            if decision.take:
+                self._together.mark_taken(frame)
+                self._attempt(frame.name, partial(self._offer, frame, decision))
 
     def take(self, frame: Frame, state: ReaderState) -> None:
         """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
         decision = self._decide(frame)
         if decision.take:
             self._attempt(frame.name, lambda: self._offer(frame, decision))
+        elif not decision.candidate:
+            self._together.hold(frame)
         self._preview.do(lambda: self._send_preview(frame, decision, state))
 
     def push(self, frame: Frame) -> Decision:
@@ -444,10 +474,29 @@ class CaptureSession:
         decision = self._find_selector(frame).decide(frame, waiting=self._server.num_queued)
         self.frames += 1
         self._rate.count()
+        if decision.take:
+            self._tell_others(frame)
+        elif not decision.candidate and self._together.is_wanted(frame):
+            decision = self._decide_again(frame)
+        if decision.take:
+            self._together.mark_taken(frame)
         self.unusable += decision.candidate and not decision.take
         if decision.candidate:
             self.last_decision = f"{frame.name}: {'taken' if decision.take else 'not taken'}: {decision.reason}"
         return decision
+
+    def _decide_again(self, frame: Frame) -> Decision:
+        """Decides about a frame that another camera's keyframe wants. An unusable one is not counted as such."""
+        decision = self._find_selector(frame).add(frame, TOGETHER)
+        return decision if decision.take else replace(decision, candidate=False)
+
+    def _tell_others(self, frame: Frame) -> None:
+        """Wants of the other cameras what they took with this keyframe, unless there is no room for it."""
+        if frame.captured_at is None or not frame.camera_id or self._spool_full:
+            return
+        if self._link is not None:
+            self._link.announce(frame.captured_at)
+        self._take_wanted(self._together.want(frame.captured_at, frame.camera_id))
 
     def _find_selector(self, frame: Frame) -> Selector:
         """Returns the selector of the frame's camera, which begins with its first frame."""
@@ -542,7 +591,9 @@ class CaptureSession:
         Raises what is_shortage tells: then the frame waits, and not the disk is to blame.
         """
         try:
-            self._server.offer(item)
+            if self._link is not None and isinstance(item, Frame) and self._link.is_another_full:
+                raise SpoolFull("the spool of another camera is full, and no part of a frame set is kept")
+            self._store(item)
         except WireError as error:
             self.not_taken += 1
             if is_logged(self._problems.add("keyframes too large to be sent", error)):
@@ -560,6 +611,14 @@ class CaptureSession:
             self._spool_full = ""
         return True
 
+    def _store(self, item: Frame | DroppedFrame) -> None:
+        """Puts a frame into the spool. Raises as `KeyframeServer.offer`, and remembers that there is no room."""
+        try:
+            self._server.offer(item)
+        except SpoolFull:
+            self._full_from = self._server.num_queued
+            raise
+
     def _send_preview(self, frame: Frame, decision: Decision, state: ReaderState) -> None:
         rate = self.config.preview.fps
         if rate == 0 or frame.stamp_ns < self._next_preview_ns:
@@ -574,6 +633,18 @@ class CaptureSession:
             reason=decision.reason,
         )
         self._previews.send(header, arrays)
+
+
+def _open_link(config: CaptureConfig, resources: ExitStack) -> FrameSetLink | None:
+    """The link to the captures of other cameras; None where there are none, or each camera selects by itself."""
+    selection = config.selection
+    if not config.camera_id or selection.every_frame or not selection.frame_set_tolerance_s:
+        return None
+    try:
+        return resources.enter_context(FrameSetLink(config.network, config.camera_id))
+    except OSError as error:
+        log.warning("this camera selects keyframes by itself, not by frame sets: %s", error)
+        return None
 
 
 class _Rate:

@@ -243,6 +243,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_fps: Annotated[float, msgspec.Meta(gt=0)] = 8.0
     # Until the next frame is examined, after one that would have been taken but is unusable
     patience_s: Internal[Annotated[float, msgspec.Meta(ge=0)]] = 0.3
+    # Live, of several cameras with ids: a keyframe of one makes keyframes of what the others took within so many
+    # seconds of it, if that is usable and no copy. 0: each camera selects by itself
+    frame_set_tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_S
     # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
     backlog: Annotated[int, msgspec.Meta(ge=1)] = 8
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -185,6 +185,21 @@ class FrameRecording:
     def names(self) -> list[str]:
         """Returns the names of the recorded frames, in their order."""
         return [line.name for line in self.lines if isinstance(line, _Line)]
+
+    def name_files(self, files: Iterable[str]) -> list[str]:
+        """The names of the frames whose images are these files, in their order.
+
+        A right or depth image goes with its frame and is none itself. Raises ValueError for a file of no frame.
+        """
+        frames = [line for line in self.lines if isinstance(line, _Line)]
+        owners = {file: line for line in frames for file in _files_of(line)}
+        listed = list(files)
+        if missing := [file for file in listed if file not in owners]:
+            raise ValueError(
+                f"{sanitize_text(missing[0], LONGEST_NAME)!r} is no image of the recording {str(self.folder)!r}, which "
+                f"{INDEX} lists; give the folder, or files of its frames"
+            )
+        return [owners[file].name for file in listed if owners[file].file == file]
 
     def frames(self, names: tuple[str, ...] = (), max_pixels: int = MAX_PIXELS) -> Iterator[Frame | DroppedFrame]:
         """The frames as they were seen, or those called `names`. Raises ValueError where one of these is missing."""

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.frame import LARGEST_M, LEAST_SIGMA, Intrinsics, Stamp, rigid_problem
+from splatnode.capture.frame import LARGEST_M, LEAST_SIGMA, Frame, Intrinsics, Stamp, rigid_problem
 from splatnode.capture.lenses import UnusableLens, read_lenses
 from splatnode.capture.process.config import MAX_BYTES, ConfigError, parse_yaml, record_of
 from splatnode.capture.process.files import read_text
@@ -22,6 +22,8 @@ from splatnode.capture.process.text import LONGEST_NAME, guard_untrusted, saniti
 
 TOLERANCE_S = 0.02  # between images that were taken together, where nobody tells any
 SIGMA_M, SIGMA_DEG = 0.001, 0.1  # of a camera's pose on its rig, where nobody tells any: as calibrated with a board
+# Of a camera's pose on the robot's base, by a log's static transforms or a configuration: drawn, not calibrated
+MOUNT_SIGMA_M, MOUNT_SIGMA_DEG = 0.005, 0.5
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,17 @@ def form_frame_sets(frames: Iterable[tuple[str, str, Stamp]], tolerance_s: float
         else:
             sets.append(({camera_id: name}, stamp))
     return [FrameSet(MappingProxyType(names), first) for names, first in sets]
+
+
+def form_mounted_rig(frames: Iterable[Frame]) -> Rig | None:
+    """Forms the rig of where the frames' cameras stand on the robot's base; None where fewer than two stand still."""
+    mounts: dict[str, set[tuple[float, ...]]] = {}
+    for frame in frames:
+        if frame.camera_id and frame.T_base_camera is not None:
+            mounts.setdefault(frame.camera_id, set()).add(frame.T_base_camera)
+    still = [RigCamera(camera_id, *each, sigma_m=MOUNT_SIGMA_M, sigma_deg=MOUNT_SIGMA_DEG)
+             for camera_id, each in sorted(mounts.items()) if len(each) == 1]  # fmt: skip
+    return Rig(tuple(still), is_base=True) if len(still) > 1 else None
 
 
 # Rigs in files: rig.yaml, COLMAP's rig_config.json, or a camchain of Kalibr.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import logging
 import shutil
@@ -25,7 +26,7 @@ import numpy as np
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.keyframe_selection import THINNED
+from splatnode.capture.keyframe_selection import THINNED, group_frame_sets
 from splatnode.capture.lenses import Lenses, read_lenses
 from splatnode.capture.messaging.messages import Numbering, ReceivedFrame
 from splatnode.capture.messaging.network import RECON_DEPTH, RECON_SCENE, Network
@@ -43,15 +44,16 @@ from splatnode.capture.process.terminal import (
     say,
     show_progress,
 )
+from splatnode.capture.rig import Rig, read_rig
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
 from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint import Store
-from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
+from splatnode.recon.daemon.ingest import ArrivedKeyframe, Event, Inbox, RemovedFrame
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.estimation import prepare
 from splatnode.recon.merging import Reports, compute_gaussian_limit, write_maps
 from splatnode.recon.metric.arguments import collect_drift_changes, collect_metric_changes, trusts_poses
-from splatnode.recon.metric.metres import Evidence
+from splatnode.recon.metric.metres import Evidence, check_frame
 from splatnode.recon.metric.stereo import make_pairs, stream_right_images
 from splatnode.recon.pipeline import check_baseline, ignore_snapshot, reconstruct_source, set_preview_interval
 from splatnode.recon.replay_source import (
@@ -62,9 +64,11 @@ from splatnode.recon.replay_source import (
     add_depth_folder,
     add_poses,
     apply_rig,
+    choose_recording_rig,
     load_recording,
     load_source,
     parse_sources,
+    place_on_rig,
 )
 from splatnode.recon.result.export import LIVE_PICTURE, read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file
@@ -195,6 +199,8 @@ def replay(args: argparse.Namespace) -> int:
         raise ValueError("--multi-view-only is for one scene: a merged map does not tell what two photographs confirm")
     if args.map and args.depths is not None:
         raise ValueError("--depths is for one scene; with --map give a folder whose layout has depth (docs/inputs.md)")
+    if args.rig is not None:
+        read_rig(args.rig)  # before images are read, which takes longer
     if args.map:
         return replay_map(args, request, config)
     with show_progress(quiet=args.json) as tell:
@@ -351,11 +357,11 @@ def make_scenes(
             show(MapProgress(taken, worker.map_counts[0], worker.num_unfinished, *worker.map_counts[1:]))
 
         with _run_worker(worker, stopping) as check:
-            for sequence, frame in enumerate(frames):
-                if sequence >= taken:
-                    received = ReceivedFrame(identity, sequence, frame)
-                    _enqueue_frame(received, node.reconstruction, store, inbox, stopping, check)
-                    taken = sequence + 1
+            for together in _receive_sets(frames, identity, node.frame_set_tolerance_s):
+                new = [each for each in together if each.sequence >= taken]
+                if new:
+                    _enqueue_frames(new, node.reconstruction, store, inbox, stopping, check)
+                    taken = new[-1].sequence + 1
                     tell(taken)
             rests = worker.rests
             while worker.rests < rests + 2:  # the first of them may have begun before the last keyframe came
@@ -395,28 +401,40 @@ def _run_worker(worker: Worker, stopping: threading.Event) -> Iterator[Callable[
         thread.join()
 
 
-def _enqueue_frame(
-    received: ReceivedFrame, config: ReconstructionConfig, store: Store, inbox: Inbox, stopping: threading.Event,
-    check: Callable[[], None],
+def _receive_sets(
+    frames: Iterable[Frame | DroppedFrame], identity: str, tolerance_s: float
+) -> Iterator[list[ReceivedFrame]]:
+    """The frames with their numbers, those that several cameras took together as one."""
+    numbers = itertools.count()
+    for each in group_frame_sets(frames, tolerance_s):
+        together = each if isinstance(each, tuple) else (each,)
+        yield [ReceivedFrame(identity, next(numbers), frame) for frame in together]
+
+
+def _enqueue_frames(
+    together: Sequence[ReceivedFrame], config: ReconstructionConfig, store: Store, inbox: Inbox,
+    stopping: threading.Event, check: Callable[[], None],
 ) -> None:  # fmt: skip
     """Waits while the worker has enough to do. A frame that cannot be used is recorded with the reason."""
-    stored = store.add_frame(received)
-    if stored is None:
-        return
-    name = stored.frame.name
-    try:
-        keyframe = prepare(stored.frame, config)
-    except Exception as error:
-        if is_shortage(error):
-            raise
-        log.warning("%s cannot be used: %s", name, error)
-        store.forget(name, f"cannot be used: {error}")
-        inbox.enqueue(RemovedFrame(name), stopping, check)
-        return
-    inbox.enqueue(ArrivedKeyframe(keyframe, time.monotonic()), stopping, check)
+    stored = store.add_frames(together)
+    events: list[Event] = []
+    for each in stored:
+        name = each.frame.name
+        try:
+            keyframe = prepare(each.frame, config)
+        except Exception as error:
+            if is_shortage(error):
+                raise
+            log.warning("%s cannot be used: %s", name, error)
+            store.forget(name, f"cannot be used: {error}")
+            events.insert(0, RemovedFrame(name))  # first: nothing is between the others
+        else:
+            events.append(ArrivedKeyframe(keyframe, time.monotonic(), stored[0].number if len(stored) > 1 else None))
+    if events:
+        inbox.enqueue_together(events, stopping, check)
 
 
-_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "rig")
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "gravity")
 
 
 def replay_map(args: argparse.Namespace, request: Request, config: ReconstructionConfig) -> int:
@@ -428,13 +446,17 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
     with show_progress(quiet=args.json) as tell:
         source = load_recording(request, tell)
         tell(str(source.choice))
+        rig, config = choose_recording_rig(source, config, args.rig, tell)
+        _check_frame(config, source, rig)
     began_s = time.monotonic()
     with hold_result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         remove_result(args.out)  # of one scene, beside which nobody would find the map's
         frames = _write_frames(source, args.out) if source.photographs is None else source.frames()
+        if rig is not None:
+            frames = map(partial(place_on_rig, rig=rig), frames)
         told = _ProgressPrinter(args.json, len(source.choice.names))
         with _limit_log_level():
-            make_scenes(frames, source.identity(config), make_node_config(config, args.out), told)
+            make_scenes(frames, source.identity(config, rig), make_node_config(config, args.out), told)
         progress("")
         reports = write_maps(args.out, args.out, partial(compute_gaussian_limit, args), quiet=args.json)
         report = _make_report(source, args.out, reports, time.monotonic() - began_s)
@@ -445,6 +467,14 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
     else:
         _print_report(report, args.out)
     return EXIT_GOOD if reports else EXIT_REFUSED
+
+
+def _check_frame(config: ReconstructionConfig, source: ReplayRecording, rig: Rig | None) -> None:
+    """Raises UnknownFrame where neither the recording nor the rig can tell the frame of reference."""
+    on_base = rig.cameras if rig is not None and rig.is_base else ()
+    mounts = {each.camera_id: each.matrix for each in on_base if each.matrix is not None}
+    has_lengths = source.has_depth or config.registration.rig is not None or len(source.evidence.mounts) > 1
+    check_frame(config.metric, source.evidence.merge(Evidence(mounts=mounts)), has_lengths)
 
 
 @contextlib.contextmanager

@@ -20,6 +20,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import is_resampled
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, notify, report_items
 from splatnode.capture.process.text import sanitize_text
+from splatnode.capture.rig import form_mounted_rig
 from splatnode.recon import threads
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import (
@@ -267,7 +268,9 @@ def reconstruct_source(
         notify(log, doubt)
     with threads.apply_thread_limit(most_threads):
         evidence = given.merge(gather_evidence(source.frames, config.metric, tell))
-        check_frame(config.metric, evidence)
+        known = (each for each in source.frames if isinstance(each, Frame))
+        has_rig = config.registration.rig is not None or form_mounted_rig(known) is not None
+        check_frame(config.metric, evidence, has_lengths=has_rig)
         snapshot = apply_metric_scale(run(source.frames, config, show, tell), config.metric, evidence)
     snapshot = _add_given_lenses(snapshot, source.frames)
     if without_guesses:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -34,9 +34,10 @@ from splatnode.capture.lenses import Lenses, describe_image
 from splatnode.capture.masks import Find, mask_frames, open_masks
 from splatnode.capture.process.terminal import Tell, ignore_progress, notify, report_items
 from splatnode.capture.process.text import sanitize_name, sanitize_text
-from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera, form_frame_sets, read_rig
+from splatnode.capture.rig import MOUNT_SIGMA_DEG, MOUNT_SIGMA_M, TOLERANCE_S, Rig, RigCamera, form_frame_sets, read_rig
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
+from splatnode.recon.metric.metres import NOTHING, Evidence
 
 Array = npt.NDArray[np.float64]
 
@@ -113,6 +114,10 @@ class ReplayRecording:
 
     request: Request
     choice: Choice
+    images: frozenset[tuple[str, str, str, int, int]] = frozenset()  # as `Lenses.check` asks of all that there are
+    # Of poses and motions that came with images one each, if there is any, and a mount of each camera, by its id
+    evidence: Evidence = NOTHING
+    has_depth: bool = False  # some images came with a right image or a depth image
 
     @property
     def path(self) -> Path:
@@ -123,8 +128,8 @@ class ReplayRecording:
         """The folder in which the keyframes lie; None: they lie in none, as a film's."""
         return self.request.photographs
 
-    def identity(self, config: Reconstruction) -> str:
-        """32 hexadecimal digits that tell it, reconstructed in this way, from others.
+    def identity(self, config: Reconstruction, rig: Rig | None = None) -> str:
+        """32 hexadecimal digits that tell it, reconstructed in this way, its cameras on this rig, from others.
 
         Of a folder the names count: it may hold the results, too, which change when it was last written.
         """
@@ -135,6 +140,8 @@ class ReplayRecording:
             known.append(str(request.masks.resolve()))
         if request.lenses is not None:
             known.append(request.lenses)
+        if rig is not None:
+            known.append(rig)
         if cameras is not None:
             known += [[each.camera_id, str(each.path.resolve())] for each in cameras.cameras]
             known.append(cameras.tolerance_s)
@@ -165,7 +172,7 @@ def parse_paths(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
             raise FileNotFoundError(f"{str(path)!r} is not there; give a folder, a video, or photographs of one folder")
         if path.parent.resolve() != first.parent.resolve():
             raise ValueError(f"{str(path)!r} lies in another folder than {str(first)!r}; put them into one folder")
-    return first.parent, tuple(folder.frame_name(path) for path in paths)
+    return first.parent, tuple(folder.name_photographs(paths))
 
 
 def parse_sources(
@@ -228,11 +235,14 @@ def load_recording(request: Request, tell: Tell = ignore_progress) -> ReplayReco
     """As `load_source`, without a limit to the number of keyframes."""
     _check_there(request)
     images: set[tuple[str, str, str, int, int]] = set()
-    looked_through = _record_sizes(_stream_candidates(request, tell), images)
+    came: dict[str, dict[str, Any]] = {"tracked": {}, "motions": {}, "mounts": {}}
+    beside: set[str] = set()
+    looked_through = _record_content(_stream_candidates(request, tell), images, came, beside)
     choice = choose(looked_through, _selection(request), Limits(), None, _unit_name(request), request.tolerance_s)
     if request.lenses is not None:
         request.lenses.check(images)
-    return ReplayRecording(request, choice)
+    evidence = Evidence(tracked=came["tracked"], motions=came["motions"], mounts=came["mounts"])
+    return ReplayRecording(request, choice, frozenset(images), evidence, has_depth=bool(beside))
 
 
 def load_source(request: Request, tell: Tell = ignore_progress) -> Source:
@@ -374,13 +384,27 @@ def _stream_candidates(request: Request, tell: Tell) -> Iterator[Frame | Dropped
     return report_items(_stream(request), tell, doing, of, _unit_name(request))
 
 
-def _record_sizes(
-    frames: Iterator[Frame | DroppedFrame], images: set[tuple[str, str, str, int, int]]
+def _record_content(
+    frames: Iterator[Frame | DroppedFrame],
+    images: set[tuple[str, str, str, int, int]],
+    came: Mapping[str, dict[str, Any]],
+    beside: set[str],
 ) -> Iterator[Frame | DroppedFrame]:
-    """The frames, whose names, cameras and sizes are added to `images` as they pass."""
+    """The frames, whose names, cameras and sizes are added to `images` as they pass.
+
+    The first pose and motion that there is go to `came`, as `Evidence` has them, the first mount of each camera by its
+    id, and the names of frames that have a right or a depth image to `beside`.
+    """
     for each in frames:
         if isinstance(each, Frame):
             images.add(describe_image(each))
+            for kind, value in (("tracked", each.given_pose), ("motions", each.motion)):
+                if value is not None and not came[kind]:
+                    came[kind][each.name] = value
+            if each.mount is not None:
+                came["mounts"].setdefault(each.camera_id, each.mount)
+            if each.right is not None or each.depth is not None:
+                beside.add(each.name)
         yield each
 
 
@@ -459,8 +483,7 @@ def _space_evenly(count: int, wanted: int) -> list[int]:
 
 log = logging.getLogger(__name__)
 
-# Standard deviations of a camera's pose by a log's static transforms, which are drawn more often than calibrated
-DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = 0.005, 0.5
+DRAWN_SIGMA_M, DRAWN_SIGMA_DEG = MOUNT_SIGMA_M, MOUNT_SIGMA_DEG  # by a log's static transforms
 LONGEST_BASELINE_M = 20.0  # between two cameras of a robot; beyond, the file is probably in millimetres
 _TRUSTED = ("given", "calibration")  # sources of a lens that a rig's does not replace
 
@@ -484,23 +507,57 @@ def apply_rig(
     return with_lenses, hold_rig(config, rig)
 
 
+def choose_recording_rig(
+    recording: ReplayRecording, config: ReconstructionConfig, file: str | PathLike[str] | None, tell: Tell
+) -> tuple[Rig | None, ReconstructionConfig]:
+    """As `apply_rig`, of a recording whose frames are not in memory: `place_on_rig` is for each of them."""
+    rig = choose_rig(None if file is None else Path(file), recording.request.cameras, tell)
+    if rig is None:
+        return None, config
+    ids = [camera_id for _, _, camera_id, *_ in recording.images]
+    _check_mounts(rig, ids)
+    if len(rig.cameras) < 2:
+        return rig, config
+    _check_names(rig, ids)
+    lenses = _collect_lenses(rig, ids)
+    lenses.check(recording.images)
+    for text in describe_rig_use(rig, ids):
+        notify(log, text)
+    return rig, hold_rig(config, rig)
+
+
+def place_on_rig(each: Frame | DroppedFrame, rig: Rig) -> Frame | DroppedFrame:
+    """The frame with where its camera stands on the base, and with the rig's lens where its own is not trusted."""
+    if not isinstance(each, Frame):
+        return each
+    mount = rig.find_mount(each.camera_id)
+    placed = replace(each, T_base_camera=mount) if mount else each
+    return (
+        placed
+        if len(rig.cameras) < 2 or not _lacks_lens(each)
+        else _collect_lenses(rig, [each.camera_id]).apply(placed)
+    )
+
+
 def add_mounts(given: Source, rig: Rig) -> Source:
     """The frames with where their camera stands on the robot's base, as far as the rig tells it.
 
     Raises ValueError where it tells it of no camera of the frames.
     """
-    if not rig.is_base:
-        return given
+    _check_mounts(rig, [each.camera_id for each in given.frames if isinstance(each, Frame)])
     told = {each.name: rig.find_mount(each.camera_id) for each in given.frames if isinstance(each, Frame)}
-    if told and not any(told.values()):
+    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
+              for each in given.frames)  # fmt: skip
+    return replace(given, frames=tuple(frames))
+
+
+def _check_mounts(rig: Rig, camera_ids: Sequence[str]) -> None:
+    if rig.is_base and camera_ids and not any(map(rig.find_mount, camera_ids)):
         names = ", ".join(each.camera_id for each in rig.cameras)
         raise ValueError(
             f"the rig has T_base_camera of {sanitize_text(names, 200)}, and no image is of such a camera. Name the "
             "cameras as the rig does: --cameras A,B"
         )
-    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
-              for each in given.frames)  # fmt: skip
-    return replace(given, frames=tuple(frames))
 
 
 def describe_rig_use(rig: Rig, camera_ids: Iterable[str]) -> Iterator[str]:
@@ -586,19 +643,27 @@ def add_rig_lenses(given: Source, rig: Rig) -> Source:
     Raises ValueError where fewer than two of the rig's cameras took frames, or a lens is of none of their aspect ratio.
     """
     frames = [each for each in given.frames if isinstance(each, Frame)]
-    _check_names(rig, frames)
-    lensless = [each for each in frames if each.intrinsics is None or each.intrinsics.source not in _TRUSTED]
-    used = {each.camera_id for each in lensless}
-    lenses = Lenses({each.camera_id: each.intrinsics for each in rig.cameras
-                     if each.intrinsics is not None and each.camera_id in used})  # fmt: skip
+    _check_names(rig, [each.camera_id for each in frames])
+    lensless = [each for each in frames if _lacks_lens(each)]
+    lenses = _collect_lenses(rig, [each.camera_id for each in lensless])
     lenses.check(map(describe_image, lensless))
     added = {each.name: lenses.apply(each) for each in lensless}
     return replace(given, frames=tuple(added.get(each.name, each) for each in given.frames))
 
 
-def _check_names(rig: Rig, frames: list[Frame]) -> None:
-    there = {frame.camera_id for frame in frames} - {""}
-    if frames and sum(camera.camera_id in there for camera in rig.cameras) < 2:
+def _lacks_lens(frame: Frame) -> bool:
+    return frame.intrinsics is None or frame.intrinsics.source not in _TRUSTED
+
+
+def _collect_lenses(rig: Rig, camera_ids: Collection[str]) -> Lenses:
+    """The lenses that the rig has of these cameras."""
+    return Lenses({each.camera_id: each.intrinsics for each in rig.cameras
+                   if each.intrinsics is not None and each.camera_id in camera_ids})  # fmt: skip
+
+
+def _check_names(rig: Rig, camera_ids: Collection[str]) -> None:
+    there = set(camera_ids) - {""}
+    if camera_ids and sum(camera.camera_id in there for camera in rig.cameras) < 2:
         raise ValueError(
             f"a rig must name two or more of the cameras of the images; it has "
             f"{_join(each.camera_id for each in rig.cameras)}, and the "

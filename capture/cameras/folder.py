@@ -515,6 +515,20 @@ def frame_name(path: Path) -> str:
     return sanitize_name(path.name)
 
 
+def name_photographs(paths: Sequence[Path]) -> list[str]:
+    """The names of photographs by their files: of a recording, those that its frames have.
+
+    A recording's right and depth images go with their frames, and have none. Raises ValueError for a file that is none
+    of its recording's, and RecordingError.
+    """
+    recordings = {
+        folder: recording.read(folder) for folder in {path.parent for path in paths} if recording.is_recording(folder)
+    }
+    names = ([frame_name(path)] if path.parent not in recordings else recordings[path.parent].name_files([path.name])
+             for path in paths)  # fmt: skip
+    return [name for found in names for name in found]
+
+
 def image_paths(folder: Path) -> list[Path]:
     """The photographs that lie in `folder` itself, by their suffix, in natural order; hidden files are not for us.
 

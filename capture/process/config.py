@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import enum
 import functools
 import logging
 import math
@@ -427,7 +428,11 @@ def build_config(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
             return record_of(_check_keys(raw, schema, where), schema, dec_hook=_decode)
         except msgspec.ValidationError as error:
             message, _, path = str(error).partition(" - at `$")
-            key = join_keys(where, path.rstrip("`").lstrip("."))
+            below = path.rstrip("`").lstrip(".")
+            key = join_keys(where, below)
+            if message.startswith(_NO_CHOICE) and (choices := _list_choices(schema, below)):
+                got = message.removeprefix(_NO_CHOICE).strip()
+                message = f"Expected one of {', '.join(choices)}, got {got}"
             raise ConfigError(
                 f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}"
             ) from error
@@ -545,6 +550,26 @@ def _struct_in(annotation: Any) -> Any:
     if typing.get_origin(annotation) is Mapping:
         return annotation
     return next((choice for choice in typing.get_args(annotation) if has_fields(choice)), annotation)
+
+
+_NO_CHOICE = "Invalid enum value"  # as msgspec begins what it says of a value that is none of those there are
+
+
+def _list_choices(schema: Any, path: str) -> list[str]:
+    """The values that the key at this path of a `schema` may have; none where it may have others, too."""
+    annotation = schema
+    for key in path.split("."):
+        struct = _struct_in(annotation)
+        annotation = typing.get_type_hints(struct).get(key) if has_fields(struct) else None
+    return _list_values(annotation)
+
+
+def _list_values(annotation: Any) -> list[str]:
+    if typing.get_origin(annotation) is typing.Literal:
+        return [str(value) for value in typing.get_args(annotation)]
+    if isinstance(annotation, type) and issubclass(annotation, enum.Enum):
+        return [str(each.value) for each in annotation]
+    return [value for inner in typing.get_args(annotation) for value in _list_values(inner)]
 
 
 def _decode(kind: type, value: Any) -> Any:

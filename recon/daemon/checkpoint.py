@@ -12,7 +12,8 @@
     codes               in the folder of a place that was left: that it is judged, and by what it is recognised
 
 Graph, judgement, fallbacks, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged
-once its file is there. Every file is whole or not there, and has a checksum. A place is what one scene shows.
+once its file is there, those of a frame set once all are: where a kill left some of a set out, the next start forgets
+the others, and all come again. Every file is whole or not there, and has a checksum. A place is what one scene shows.
 """
 
 from __future__ import annotations
@@ -79,6 +80,14 @@ REMEMBERED_DROPPED = 1000  # names and reasons, of a place
 _INSTEAD = "--checkpoint (or $XDG_STATE_HOME)"
 
 
+class UnstorableFrame(ValueError):
+    """A frame cannot be stored because of what it is."""
+
+    def __init__(self, received: ReceivedFrame, error: Exception) -> None:
+        super().__init__(f"it cannot be stored: {type(error).__name__}: {error}")
+        self.received = received
+
+
 class Store:
     """Reads and writes a checkpoint, from any thread. One process at a time uses a directory."""
 
@@ -108,6 +117,7 @@ class Store:
         self._next = self.ledger.next
         self._writing = threading.RLock()
         self._found = deque(self._read_frames())
+        self._remove_incomplete_set()
 
     def close(self) -> None:
         self._resources.close()
@@ -177,36 +187,84 @@ class Store:
             self._remember(stored)
             yield stored
 
+    def _remove_incomplete_set(self) -> None:
+        """Forgets the last frames where others that were to be stored together with them are not there.
+
+        A kill came in between: nobody has acknowledged any of them, and all come again.
+        """
+        last = self._found[-1] if self._found else None
+        if last is None or not last.following or self._next > last.number + 1:
+            return
+        if (self._frames / file_name(last.number + 1)).with_suffix(".damaged").exists():  # it was there
+            return
+        expected = last.following
+        while self._found and self._found[-1].following == expected:
+            stored = self._found.pop()
+            self._remove(stored.number)
+            self._forget_frame(stored.frame.name, stored.number)
+            self._next, expected = stored.number, expected + 1
+
     def add_frame(self, received: ReceivedFrame) -> StoredFrame | None:
         """Returns when the frame is on the disk, under a name that no other has; None for one that was dropped.
 
         Raises OSError where the disk does not take it.
         """
-        key, frame = (received.session, received.sequence), received.frame
+        return next(iter(self.add_frames([received])), None)
+
+    def add_frames(self, together: Sequence[ReceivedFrame]) -> list[StoredFrame]:
+        """As `add_frame`, of frames that were taken together: all are stored or none is, also if the process is killed.
+
+        Raises OSError, and UnstorableFrame, which tells the one that no disk would take.
+        """
         with self._writing:
-            if isinstance(frame, DroppedFrame):
-                self._drop_frame({}, key, (frame.name, frame.reason))
-                return None
-            number = self._next
-            name = self._make_unique_name(frame.name, number)
-            write_frame(self._frames / file_name(number), key, replace(frame, name=name))
-            stored = StoredFrame(number, key, replace(frame, frame_id=number, name=name, encoded=None))
-            self._next = number + 1
-            self._remember(stored)
-            return stored
+            for each in together:
+                if isinstance(each.frame, DroppedFrame):
+                    self._drop_frames({}, [(each.session, each.sequence)], [(each.frame.name, each.frame.reason)])
+            images = [each for each in together if isinstance(each.frame, Frame)]
+            found: list[StoredFrame] = []
+            try:
+                for following, received in zip(reversed(range(len(images))), images, strict=True):
+                    found.append(self._write_frame(received, [each.frame.name for each in found], following))
+            except BaseException:
+                for stored in found:
+                    self._remove(stored.number)
+                raise
+            self._next += len(found)
+            for stored in found:
+                self._remember(stored)
+            return found
+
+    def _write_frame(self, received: ReceivedFrame, others: Sequence[str], following: int) -> StoredFrame:
+        """Writes one of frames that are stored together: the `others` before it, so many `following` it.
+
+        Raises OSError, UnstorableFrame, and what tells a shortage of memory.
+        """
+        number, key, frame = self._next + len(others), (received.session, received.sequence), received.frame
+        assert isinstance(frame, Frame)
+        try:
+            name = self._make_unique_name(frame.name, number, others)
+            write_frame(self._frames / file_name(number), key, replace(frame, name=name), following)
+            return StoredFrame(number, key, replace(frame, frame_id=number, name=name, encoded=None), following)
+        except Exception as error:
+            if isinstance(error, OSError) or is_shortage(error):
+                raise
+            raise UnstorableFrame(received, error) from error
 
     def forget(self, name: str, reason: str) -> None:
         """Removes a frame, if it is there, and records it with the reason as dropped. Raises OSError."""
-        with self._writing:
-            if name in self._names:
-                number = self._names[name]
-                self._drop_frame({number: name}, self._keys[number], (name, reason))
+        self.forget_frames([name], reason)
 
-    def request_removal(self, name: str, scenes: Iterable[str]) -> None:
-        """Records that these scenes, whose places were left, are to lose a frame. Raises OSError."""
+    def forget_frames(self, names: Iterable[str], reason: str, elsewhere: Iterable[tuple[str, str]] = ()) -> None:
+        """As `forget`, of several frames at once, so that no kill leaves half of a frame set. Raises OSError.
+
+        `elsewhere`: ids of scenes whose places were left, each with a name; these scenes are to lose such a frame.
+        """
         with self._writing:
-            retracted = dict.fromkeys((*self.ledger.retracted, *((scene, name) for scene in scenes)))
-            self._write(msgspec.structs.replace(self.ledger, retracted=tuple(retracted)))
+            here = {self._names[name]: name for name in names if name in self._names}
+            retracted = tuple(dict.fromkeys((*self.ledger.retracted, *elsewhere)))
+            if here or retracted != self.ledger.retracted:
+                keys = [self._keys[number] for number in here]
+                self._drop_frames(here, keys, [(name, reason) for name in here.values()], retracted)
 
     def confirm_removal(self, scene: str, name: str) -> None:
         """Records that the scene has lost the frame. Raises OSError."""
@@ -284,23 +342,35 @@ class Store:
         """
         records.move_to_finished(self.directory, _INSTEAD)
 
-    def _drop_frame(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
+    def _drop_frames(
+        self,
+        frames: Mapping[int, str],
+        keys: Iterable[tuple[str, int]],
+        dropped: Iterable[tuple[str, str]],
+        retracted: tuple[tuple[str, str], ...] | None = None,
+    ) -> None:
+        """Records names as `dropped`, with the reason, and removes those that are stored `frames`."""
         ledger = self.ledger
-        shown = sanitize_text(dropped[0], LONGEST_NAME), sanitize_text(dropped[1])
+        shown = [(sanitize_text(name, LONGEST_NAME), sanitize_text(reason)) for name, reason in dropped]
         self._write(
             msgspec.structs.replace(
                 ledger,
                 next=self._next,
-                gone=(*ledger.gone, key)[-REMEMBERED:],
-                dropped=(*ledger.dropped, shown)[-REMEMBERED_DROPPED:],
+                gone=(*ledger.gone, *keys)[-REMEMBERED:],
+                dropped=(*ledger.dropped, *shown)[-REMEMBERED_DROPPED:],
+                retracted=ledger.retracted if retracted is None else retracted,
             )
         )
         self._unlink(frames)
 
-    def _unlink(self, frames: dict[int, str]) -> None:
+    def _unlink(self, frames: Mapping[int, str]) -> None:
         for number, name in frames.items():
             self._remove(number)
-            del self._names[name], self._keys[number]
+            self._forget_frame(name, number)
+
+    def _forget_frame(self, name: str, number: int) -> None:
+        del self._names[name], self._keys[number]
+        self._taken.pop(name, None)
 
     def _remove(self, number: int) -> None:
         """The ledger says already that the frame is gone: where the disk keeps the file, the next start removes it."""
@@ -315,12 +385,12 @@ class Store:
         if stored.frame.camera_id and stored.frame.captured_at is not None:
             self._taken[stored.frame.name] = stored.frame.camera_id, stored.frame.captured_at
 
-    def _make_unique_name(self, name: str, number: int) -> str:
-        """The name, or one made of it that no other frame has."""
+    def _make_unique_name(self, name: str, number: int, others: Collection[str] = ()) -> str:
+        """The name, or one made of it that no other frame has, nor one of the `others`."""
         further = (f"{number:06d}-{copy}-{name}" for copy in itertools.count(2))
         names = (each[:LONGEST_NAME] for each in itertools.chain((name, f"{number:06d}-{name}"), further))
         # What is saved of a frame that was dropped may still be on the disk: no other gets its name.
-        taken = {*self._names, *(dropped for dropped, _ in self.ledger.dropped)}
+        taken = {*self._names, *others, *(dropped for dropped, _ in self.ledger.dropped)}
         return next(each for each in names if each not in taken)
 
     def _write(self, ledger: Ledger) -> None:
@@ -590,8 +660,10 @@ def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     store.save("graph", *make_graph_message(work.graph))
     save_fallbacks(store, work)
     estimate = work.find_reconstruction()
-    # Cameras that given poses hold have no evidence, and are estimated anew after a restart.
-    if estimate is not None and estimate.publishable and estimate.evidence is not None:
+    # Cameras that given poses hold have no evidence, and the rig of others is not kept, nor its metres: they are
+    # estimated anew after a restart.
+    is_kept = estimate is not None and estimate.publishable and estimate.evidence is not None
+    if estimate is not None and is_kept and (estimate.registration is None or estimate.registration.rig is None):
         store.save("judgement", *make_reconstruction_message(estimate, work.publishable_names))
     if work.scene is not None:
         store.save("pointmaps", *make_pointmaps_message(work.state.pointmaps))

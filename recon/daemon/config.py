@@ -47,3 +47,9 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     export_interval_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # between provisional results, while a submap grows
     # Between messages on the state of the process, which `splatnode status` shows
     status_interval_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0
+
+    @property
+    def frame_set_tolerance_s(self) -> float:
+        """Between images that were taken together, for all that the node does, seconds."""
+        own = self.frame_sets.tolerance_s
+        return self.reconstruction.frame_set_tolerance_s if own is None else own

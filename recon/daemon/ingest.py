@@ -24,13 +24,15 @@ from splatnode.capture.messaging.keyframe_queue import READY_EVERY_S, KeyframeCl
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network, NotAllowed, find_captures
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage
-from splatnode.capture.process.terminal import Problems, is_logged
+from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.capture.rig import TOLERANCE_S, are_taken_together
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon.checkpoint import Store
+from splatnode.recon.daemon.checkpoint import Store, UnstorableFrame
 from splatnode.recon.daemon.ledger import StoredFrame
 from splatnode.recon.estimation import prepare
 from splatnode.recon.keyframes import Keyframe
+
+log = logging.getLogger(__name__)
 
 LOOK_S = 0.5  # between looks at whether another capture has come
 MOST_CAPTURES = 32
@@ -41,8 +43,9 @@ ACTIVE_S = 3.0  # a camera that has sent a keyframe within so many seconds is wa
 class FrameSetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Which keyframes of several cameras belong together."""
 
-    # Between images that were taken together, seconds. Higher: cameras that are not triggered together form sets, too
-    tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = TOLERANCE_S
+    # Between images that were taken together, seconds; None: reconstruction.frame_set_tolerance_s. Higher: cameras that
+    # are not triggered together form sets, too
+    tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=10)] | None = None
     # A keyframe waits so long for those that other cameras took with it, seconds; where there is one camera, not at all
     wait_s: Annotated[float, msgspec.Meta(ge=0, le=10)] = 0.3
 
@@ -75,9 +78,11 @@ class FrameSetQueue:
     """Frames of all captures in the order of their times, those that were taken together as one."""
 
     def __init__(self, config: FrameSetConfig) -> None:
-        self._config = config
+        self._wait_s = config.wait_s
+        self._tolerance_s = TOLERANCE_S if config.tolerance_s is None else config.tolerance_s
         self._waiting: list[WaitingFrame] = []
         self._heard_s: dict[str, float] = {}  # of each camera, when its last keyframe came
+        self._missed: set[str] = set()  # cameras that are not waited for, which was told
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -86,6 +91,9 @@ class FrameSetQueue:
         self._waiting.append(frame)
         if frame.camera_id:
             self._heard_s[frame.camera_id] = frame.arrived_s
+        if frame.camera_id in self._missed:
+            self._missed.discard(frame.camera_id)
+            event(log, logging.INFO, "camera_is_back", camera_id=frame.camera_id)
 
     def take(self, now_s: float, complete: bool = True) -> list[WaitingFrame]:
         """The frames that are next, taken together; none where there are none, or others may still belong to them.
@@ -100,9 +108,10 @@ class FrameSetQueue:
         is_whole = alone is not None or self._is_whole(now_s)
         if alone is None and not complete:
             return []
-        if not is_whole and now_s - first.arrived_s < self._config.wait_s:
+        if not is_whole and now_s - first.arrived_s < self._wait_s:
             return []
         found = [first] if alone else self._find_set(first)
+        self._tell_missed(now_s)
         self._waiting = [each for each in self._waiting if each not in found]
         return found
 
@@ -111,12 +120,25 @@ class FrameSetQueue:
         active = {camera for camera, heard_s in self._heard_s.items() if now_s - heard_s < ACTIVE_S}
         return active <= {each.camera_id for each in self._waiting}
 
+    def _tell_missed(self, now_s: float) -> None:
+        """Tells, once, that frame sets are complete without a camera from which nothing comes any more."""
+        silent = {camera for camera, heard_s in self._heard_s.items() if now_s - heard_s >= ACTIVE_S}
+        if len(silent) == len(self._heard_s):  # nothing comes from any: the robot stands still
+            return
+        for camera in sorted(silent - self._missed):
+            self._missed.add(camera)
+            event(
+                log, logging.WARNING, "camera_is_missed", camera_id=camera,
+                why=f"no keyframe has come from it for {ACTIVE_S:g} s, and keyframes come from others: frame sets are "
+                "complete without it until one comes",
+            )  # fmt: skip
+
     def _find_set(self, first: WaitingFrame) -> list[WaitingFrame]:
         """The first frame, and the earliest of each other camera that was taken with it, in order of time."""
         begun, found = first.captured_at, {first.camera_id: first}
         for each in sorted(self._waiting, key=lambda each: each.capture_ns):
             stamp = each.captured_at
-            if begun and stamp and are_taken_together(begun, stamp, self._config.tolerance_s):
+            if begun and stamp and are_taken_together(begun, stamp, self._tolerance_s):
                 found.setdefault(each.camera_id, each)
         return sorted(found.values(), key=lambda each: each.capture_ns)
 
@@ -254,10 +276,6 @@ def _do_nothing() -> None:
     """Nobody waits for the one that puts."""
 
 
-def _are_both_keyframes(one: Event, other: Event) -> bool:
-    return isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)
-
-
 def are_one_set(one: Event, other: Event) -> bool:
     """Whether both are keyframes that were taken together."""
     if not (isinstance(one, ArrivedKeyframe) and isinstance(other, ArrivedKeyframe)):
@@ -299,33 +317,42 @@ class Inbox:
             self._events.extend(events)
             self._changed.notify_all()
 
-    def enqueue_now(self, event: RemovedFrame) -> None:
+    def enqueue_now(self, *events: RemovedFrame) -> None:
         """Also where the inbox is full: who gives commands does not wait for the work."""
         with self._changed:
-            self._events.append(event)
+            self._events.extend(events)
             self._changed.notify_all()
 
     def dequeue(self, timeout_s: float) -> list[Event]:
         """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time.
 
-        Keyframes of one frame set are never apart: with them there may be more.
+        Keyframes of one frame set are never apart: with them there may be more. After a removal with all that follow.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []
-            while self._events and events and _are_both_keyframes(events[0], self._events[0]):
-                if len(events) >= BATCH and not are_one_set(events[-1], self._events[0]):
+            while self._events and events and type(events[0]) is type(self._events[0]):
+                is_full = isinstance(events[0], ArrivedKeyframe) and len(events) >= BATCH
+                if is_full and not are_one_set(events[-1], self._events[0]):
                     break
                 events.append(self._events.popleft())
             self._changed.notify_all()
             return events
 
 
-log = logging.getLogger(__name__)
-
 RECEIVE_S = 0.2  # between looks at whether the daemon stops
 RETRY_S = 1.0  # after a frame could not be written, or the connection failed
 ANOTHER_IS_SERVED = "capture gives its keyframes to another splatnode recon; stop one of the two"
+
+
+def _refuse_unstorable(waiting: Sequence[WaitingFrame], error: Exception) -> list[WaitingFrame]:
+    """Refuses the frame that cannot be stored because of what it is, all where nobody knows which; returns the rest."""
+    one = error.received if isinstance(error, UnstorableFrame) else None
+    why = str(error) if one else f"it cannot be stored: {type(error).__name__}: {error}"
+    for each in waiting:
+        if one is None or each.received is one:
+            each.client.refuse(each.received.key, why)
+    return [each for each in waiting if one is not None and each.received is not one]
 
 
 class Intake:
@@ -376,31 +403,41 @@ class Intake:
             if captures.is_served is not None:
                 self._report_unconnected("" if captures.is_served else ANOTHER_IS_SERVED)
             arrived_s = time.monotonic()
-            stored = [each for frame in together if (each := self._store_received(captures, frame)) is not None]
+            stored = self._store_together(captures, together)
             if stored:  # what the camera could not give is told with the next scene, and disturbs none
                 self._enqueue_keyframes(captures, stored, arrived_s)
 
-    def _store_received(self, captures: Captures, waiting: WaitingFrame) -> StoredFrame | None:
-        """The frame as it is stored, and acknowledged; None where it is refused, or no image."""
-        client, received = waiting.client, waiting.received
-        while not self._stopping.is_set():
+    def _store_together(self, captures: Captures, together: Sequence[WaitingFrame]) -> list[StoredFrame]:
+        """Frames that were taken together, as they are stored, all of them before one is acknowledged.
+
+        Without those that are refused, or no image: none where the daemon stops before.
+        """
+        waiting = list(together)
+        while waiting and not self._stopping.is_set():
             try:
-                stored = self._store.add_frame(received)
+                stored = self._store_all([each.received for each in waiting])
             except Exception as error:
+                name = waiting[0].received.frame.name
                 if is_shortage(error):
-                    self._wait_for_memory(captures, received.frame.name)
-                    continue
-                if not isinstance(error, OSError):
-                    client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
-                    return None
-                self._report_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
-                self._stopping.wait(RETRY_S)
-                captures.say_ready()
+                    self._wait_for_memory(captures, name)
+                elif isinstance(error, OSError):
+                    self._report_full(f"{name} cannot be stored ({error.strerror}): make room on the disk")
+                    self._stopping.wait(RETRY_S)
+                    captures.say_ready()
+                else:
+                    waiting = _refuse_unstorable(waiting, error)
                 continue
             self.full = ""
-            client.acknowledge(received)
+            for each in waiting:
+                each.client.acknowledge(each.received)
             return stored
-        return None
+        return []
+
+    def _store_all(self, received: Sequence[ReceivedFrame]) -> list[StoredFrame]:
+        if len(received) > 1:
+            return self._store.add_frames(received)
+        stored = self._store.add_frame(received[0])
+        return [] if stored is None else [stored]
 
     def _enqueue_keyframes(self, captures: Captures, together: Sequence[StoredFrame], arrived_s: float) -> None:
         """Hands keyframes that were taken together to the worker, as one."""

@@ -34,8 +34,9 @@ from splatnode.capture.process.system import raise_shortage
 log = logging.getLogger(__name__)
 
 # Of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes, 5 neither given
-# poses nor lenses that were estimated, 6 one radial coefficient of a lens, 7 nothing brighter than white.
-VERSION = 8
+# poses nor lenses that were estimated, 6 one radial coefficient of a lens, 7 nothing brighter than white, 8 no frames
+# that were stored together.
+VERSION = 9
 LEDGER_FILE = "ledger"
 # Of what this process wrote itself.
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
@@ -261,6 +262,7 @@ class FrameRecord(StoredFrameMeta, frozen=True, forbid_unknown_fields=True, kw_o
     version: int
     session: str
     sequence: int
+    following: int = 0  # so many frames after it were stored together with it
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,16 +270,22 @@ class StoredFrame:
     number: int
     key: tuple[str, int]  # session and sequence
     frame: Frame  # its frame_id is the number
+    following: int = 0  # so many frames after it were stored together with it
 
 
 def file_name(number: int) -> str:
     return f"{number:012d}.frame"
 
 
-def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
-    """Whole or not at all; `key` is its session and sequence. Raises OSError."""
+def write_frame(path: Path, key: tuple[str, int], frame: Frame, following: int = 0) -> None:
+    """Whole or not at all; `key` is its session and sequence. Raises OSError.
+
+    `following`: so many frames that are stored together with it have the numbers after its own.
+    """
     session, sequence = key
-    header = FrameRecord(version=VERSION, session=session, sequence=sequence, **describe_stored_frame(frame))
+    header = FrameRecord(
+        version=VERSION, session=session, sequence=sequence, following=following, **describe_stored_frame(frame)
+    )
     write_message(path, encode(header, arrays_of(frame)))
 
 
@@ -287,4 +295,5 @@ def read_frame(path: Path) -> StoredFrame:
     header = message.header
     if not is_readable(header.version):
         raise WireError(f"frame {number} is of version {header.version}")
-    return StoredFrame(number, (header.session, header.sequence), frame_in(header, number, message.arrays))
+    frame = frame_in(header, number, message.arrays)
+    return StoredFrame(number, (header.session, header.sequence), frame, header.following)

@@ -16,7 +16,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import msgspec
 
@@ -232,7 +232,8 @@ class Daemon:
         self._inbox = Inbox()
         self._newest = _NewestSnapshot()
         self._problems = Problems()
-        several = config.frame_sets, config.further_captures
+        together = msgspec.structs.replace(config.frame_sets, tolerance_s=config.frame_set_tolerance_s)
+        several = together, config.further_captures
         self._intake = Intake(
             network, config.reconstruction, self._store, self._inbox, self._problems, stopping, *several
         )
@@ -386,32 +387,27 @@ class Daemon:
                 return Answer(False, f"not finished: {self.left}")
             doing = "merging" if self._merged is not None else self._describe_left() or "making the last scene final"
             return Answer(True, f"finishing; {doing}")
-        together = self._store.find_frame_set(command.name, self._config.frame_sets.tolerance_s)
-        others = [name for name in together if name != command.name]
-        answer = self._remove_keyframe(command.name)
-        removed = [name for name in others if answer.done and self._remove_keyframe(name).done]
-        if not removed:
-            return answer
-        return Answer(True, sanitize_text(f"{answer.message}; with it {', '.join(removed)}, taken at the same time"))
+        return self._retract(self._worker.find_frame_set(command.name))
 
-    def _remove_keyframe(self, name: str) -> Answer:
-        left, here = self._worker.find_inactive_scenes(name), name in self._store.names
+    def _retract(self, names: Sequence[str]) -> Answer:
+        """Takes out a keyframe, the first, with all that other cameras took at the same time: all at once."""
+        left = [(scene, each) for each in names for scene in self._worker.find_inactive_scenes(each)]
+        there = self._store.names
+        here, (name, *others) = [each for each in names if each in there], names
         if not left and not here:
-            known = ", ".join(sorted(self._store.names)) or "none yet"
+            known = ", ".join(sorted(there)) or "none yet"
             return Answer(False, sanitize_text(f"no keyframe {name!r}; there are: {known}"))
         try:
-            if left:
-                self._store.request_removal(name, left)
-            if here:
-                self._store.forget(name, "retracted")
+            self._store.forget_frames(here, "retracted", left)
         except OSError as error:
             return Answer(False, sanitize_text(f"{name} cannot be removed ({error.strerror}): make room on the disk"))
-        if here:
-            self._inbox.enqueue_now(RemovedFrame(name))
-        event(log, logging.INFO, "retracted", frame=name, left=",".join(left))
-        those = f"{', '.join(left)}, which the camera has left, is built anew without it when no keyframe waits"
+        self._inbox.enqueue_now(*map(RemovedFrame, here))
+        scenes = ", ".join(dict.fromkeys(scene for scene, _ in left))
+        event(log, logging.INFO, "retracted", frame=",".join(names), left=scenes)
+        those = f"{scenes}, which the camera has left, is built anew without it when no keyframe waits"
         told = [*(["the scene is built anew without it"] if here else []), *([those] if left else [])]
-        return Answer(True, sanitize_text(f"{name} is removed; {'; '.join(told)}"))
+        together = f"; with it {', '.join(others)}, taken at the same time" if others else ""
+        return Answer(True, sanitize_text(f"{name} is removed; {'; '.join(told)}{together}"))
 
     def _make_status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None

@@ -22,6 +22,7 @@ from splatnode.capture.process.config import record_in
 from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage, raise_shortage, resident_mb
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import guard_untrusted
+from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.daemon import SubmapStatus, checkpoint
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
@@ -46,7 +47,7 @@ from splatnode.recon.result.export import SceneFileError, read_cameras, remove_r
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.report import write_result_folder
-from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Code
 
 # places.json: all places that the node has seen, what became of each, and of each photograph that was taken there.
@@ -181,6 +182,13 @@ class SubmapIndex:
         """The ids of the scenes that have a camera of this photograph."""
         return [place.scene_id for place in self._index.places if name in place.frames_used]
 
+    def find_frame_set(self, scene_id: str, name: str, tolerance_s: float) -> list[str]:
+        """The photographs of a scene that several cameras took together with this one, which is among them."""
+        cameras = self._read_cameras(scene_id)
+        timed = [(each.name, each.camera_id, each.captured_at) for each in cameras if each.captured_at is not None]
+        sets = (list(each.names.values()) for each in form_frame_sets(timed, tolerance_s))
+        return next((names for names in sets if name in names), [name])
+
     def mark_finished(self, scene_id: str) -> None:
         """Says that the camera has left a place whose scene is final. Raises ResultWriteError."""
         for place in (place for place in self._index.places if place.scene_id == scene_id):
@@ -246,16 +254,19 @@ class SubmapIndex:
 
     def load_cameras(self, scene_id: str) -> dict[str, npt.NDArray[np.float64]]:
         """T_world_camera (4, 4) by the names of the photographs, as the scene was written; none that cannot be read."""
+        return {camera.name: camera.T_world_camera for camera in self._read_cameras(scene_id)}
+
+    def _read_cameras(self, scene_id: str) -> Sequence[CameraEstimate]:
+        """The cameras of a scene as it was written; none where it was refused, or they cannot be read."""
         place = next((each for each in self._index.places if each.scene_id == scene_id), None)
-        if place is None or place.folder is None:
-            return {}
+        if place is None or place.folder is None or not place.publishable:
+            return ()
         try:
-            cameras = read_cameras(self._path.parent / place.folder / "cameras.json")
+            return read_cameras(self._path.parent / place.folder / "cameras.json")
         except (OSError, SceneFileError) as error:
             raise_shortage(error)
             log.warning("the cameras of %s cannot be read: %s", scene_id, error)
-            return {}
-        return {camera.name: camera.T_world_camera for camera in cameras}
+            return ()
 
     def _write(self, index: _Index) -> None:
         if index != self._index:

@@ -31,6 +31,7 @@ from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import SceneWithVerdict
+from splatnode.recon.registration.rigs import form_sets
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -154,8 +155,17 @@ def find_contradicting(work: IncrementalReconstruction, pause: Pause = ignore_ca
 
 
 def select_newest(work: IncrementalReconstruction, count: int) -> list[Keyframe]:
-    """So many keyframes of the scene, of those whose frames came last."""
-    return sorted(work.graph.keyframes, key=lambda keyframe: keyframe.frame.frame_id)[-max(count, NEWEST) :]
+    """So many keyframes of the scene, of those whose frames came last; more where these leave part of a frame set."""
+    ordered = sorted(work.graph.keyframes, key=lambda keyframe: keyframe.frame.frame_id)
+    newest = ordered[-max(count, NEWEST) :]
+    together = find_frame_sets(work, [keyframe.name for keyframe in newest])
+    return [keyframe for keyframe in ordered if keyframe in newest or keyframe.name in together]
+
+
+def find_frame_sets(work: IncrementalReconstruction, names: Collection[str]) -> set[str]:
+    """The keyframes, and those of the scene that other cameras took together with them."""
+    sets = (set(each.names.values()) for each in form_sets(work.graph.keyframes, work.config.frame_set_tolerance_s))
+    return set(names).union(*(each for each in sets if not each.isdisjoint(names)))
 
 
 def find_most_redundant(graph: ViewGraph) -> str:
@@ -486,9 +496,10 @@ class ActiveSubmap:
         if len(self._work.names) > self._config.max_views:
             self._begin_overlapping_submap()
         while len(self._work.names) > max(self._config.max_views, NEWEST):
-            name = find_most_redundant(self._work.graph)
-            event(log, logging.INFO, "given_up", frame=name)
-            self._forget(name, "given up for newer views that show the same")
+            names = find_frame_sets(self._work, [find_most_redundant(self._work.graph)])
+            event(log, logging.INFO, "given_up", frame=",".join(sorted(names)))
+            self._store.forget_frames(names, "given up for newer views that show the same")
+            self._work.remove_keyframes(names)
 
     def detect_loops(self, atlas: LoopDetector) -> bool:
         """Links the scene with finished ones that show the same, if it is final and was not compared before.

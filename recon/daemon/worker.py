@@ -6,6 +6,7 @@ The scenes of places that the camera has left are finished by a finalizer.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import math
 import threading
@@ -57,7 +58,11 @@ class Worker:
         asked = config.reconstruction.fallbacks
         ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
         self._recipe = msgspec.structs.replace(
-            config.reconstruction, max_gaussians=limit, budget_s=None, fallbacks=ladder
+            config.reconstruction,
+            max_gaussians=limit,
+            budget_s=None,
+            fallbacks=ladder,
+            frame_set_tolerance_s=config.frame_set_tolerance_s,
         )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._report_problem)
@@ -104,6 +109,13 @@ class Worker:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
         return [scene for scene in self._output.places.find_scenes(name) if scene != self._store.scene_id]
 
+    def find_frame_set(self, name: str) -> list[str]:
+        """The photograph, and those that other cameras took with it, here and in places that the camera has left."""
+        tolerance_s, places = self._recipe.frame_set_tolerance_s, self._output.places
+        found = [self._store.find_frame_set(name, tolerance_s)]
+        found += [places.find_frame_set(scene, name, tolerance_s) for scene in self.find_inactive_scenes(name)]
+        return list(dict.fromkeys([name, *itertools.chain.from_iterable(found)]))
+
     @property
     def delay(self) -> tuple[float, str]:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
@@ -123,7 +135,7 @@ class Worker:
         found = self._restore()
         self.loading = 0
         if found is not None:
-            self._backlog = number_frame_sets(found.new, self._config.frame_sets.tolerance_s)
+            self._backlog = number_frame_sets(found.new, self._config.frame_set_tolerance_s)
             self._run_step(lambda: self.place.resume(found))
         give_back_memory()
         while not self._stopping.is_set():
@@ -382,7 +394,7 @@ class InactiveSubmaps:
             self._not_before_s.pop(folder, None)
             try:
                 with contextlib.closing(Store(folder)) as store:
-                    store.forget(name, "retracted")
+                    store.forget_frames(store.find_frame_set(name, self._config.frame_set_tolerance_s), "retracted")
             except CheckpointError as error:
                 raise_shortage(error)
                 self._output.complain(f"{name} cannot be taken out of {scene}: {error}")

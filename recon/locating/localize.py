@@ -499,7 +499,8 @@ def _stream_paths(paths: Sequence[Path]) -> Iterator[Frame | DroppedFrame]:
         if path.is_dir():
             yield from folder.stream(folder.Config(folder=path))
         elif path.is_file():
-            yield from folder.stream(folder.Config(folder=path.parent, names=(folder.frame_name(path),)))
+            for name in folder.name_photographs([path]):
+                yield from folder.stream(folder.Config(folder=path.parent, names=(name,)))
         else:
             raise FileNotFoundError(f"{str(path)!r} is not there; give photographs, or folders that hold some")
 

@@ -201,17 +201,20 @@ Array = npt.NDArray[np.float64]
 MOST_DEG = 10.0  # standard deviation of up by gravity, beyond which it tells no upright frame
 # Standard deviation of a floor's normal against gravity: how level floors are, and how well their plane is found
 FLOOR_SIGMA_DEG = 1.0
+BASE_SIGMA_DEG = 5.0  # of a base's z axis against gravity where nothing tells it: how level robots stand
 FARTHEST_MOUNT_M = 20.0  # of a camera from its base; beyond, the mount is probably in millimetres, which is told
 CONTRADICTED_DEG = 20.0  # between gravity and the floor, from which on this is told: a sign is wrong, or it is no floor
 _STRAIGHT = 1e-3  # length of a camera's forward axis in the level plane, below which it looks straight up or down
 
 USE_FIRST = "Or ask for frame: first_camera."
+_GIVE_METRES = (
+    "Give something that tells metres: a marker, a distance, poses, wheels, stereo, depth, or a rig of several "
+    f"cameras. {USE_FIRST}"
+)
 
 
 class UnknownFrame(ValueError):
-    """The frame of reference cannot be had; the text says what is missing and what to do."""
-
-    exit_code = 65
+    """Nothing that was given tells the frame of reference; the text says what is missing and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,11 +234,24 @@ class _Found:
     sigma_deg: float | None = None
 
 
-def check_frame(config: MetricConfig, evidence: Evidence) -> None:
-    """Raises UnknownFrame before the work where it is known already that the frame cannot be had."""
-    missing = None if config.frame is None else _find_missing_evidence(parse_frame_name(config.frame), evidence)
+def check_frame(config: MetricConfig, evidence: Evidence, has_lengths: bool = False) -> None:
+    """Raises UnknownFrame before the work where it is known already that the frame cannot be had.
+
+    `has_lengths`: something beside both may tell metres, as a rig that is given.
+    """
+    if config.frame is None:
+        return
+    name = parse_frame_name(config.frame)
+    missing = _find_missing_evidence(name, evidence)
+    if missing is None and name is FrameName.BASE and not (has_lengths or _may_tell_metres(config, evidence)):
+        missing = _Missing("nothing that was given tells metres, in which T_base_camera is", _GIVE_METRES)
     if missing is not None:
         raise UnknownFrame(f"frame: {config.frame} was asked for, and {missing.what}. {missing.advice}")
+
+
+def _may_tell_metres(config: MetricConfig, evidence: Evidence) -> bool:
+    asked = config.baselines, config.marker_size_m, config.depth_network
+    return any((*asked, evidence.poses, evidence.tracked, evidence.motions, evidence.pairs, evidence.depths))
 
 
 def _find_missing_evidence(name: FrameName, evidence: Evidence) -> _Missing | None:
@@ -268,6 +284,8 @@ def express_in_frame(snapshot: Snapshot, config: MetricConfig, evidence: Evidenc
     T_frame_first_camera = np.eye(4) if name is FrameName.FIRST_CAMERA else moved.cameras[0].T_world_camera
     frame = ReferenceFrame(name, found.source, found.sigma_deg, encode_matrix(T_frame_first_camera))
     up = moved.up
+    if name is FrameName.BASE and up is None:
+        up = Up((0.0, 0.0, 1.0), BASE_SIGMA_DEG, "the z axis of the robot's base, which is taken to stand level")
     if name is FrameName.UPRIGHT and found.sigma_deg is not None and found.source is not None:
         up = Up((0.0, 0.0, 1.0), found.sigma_deg, found.source)
     return replace(moved, up=up, scale=replace(moved.scale, frame=frame))
@@ -306,7 +324,7 @@ def _find_base(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) ->
         why = f": {snapshot.scale.source}" if snapshot.scale.source else ""
         return _Missing(
             f"the scene has no metres, in which T_base_camera is{why}",
-            f"Give something that tells metres: a marker, a distance, poses, wheels, stereo or depth. {USE_FIRST}",
+            _GIVE_METRES,
         )
     mount = evidence.mounts[first.name]
     source, away_m = f"T_base_camera of {first.name}", float(np.linalg.norm(mount[:3, 3]))

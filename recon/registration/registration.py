@@ -16,7 +16,7 @@ from splatnode.capture import lenses as opencv
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import SQUARE_TOLERANCE, undistort_frame
 from splatnode.capture.process.config import Internal
-from splatnode.capture.rig import TOLERANCE_S, Rig
+from splatnode.capture.rig import TOLERANCE_S, Rig, form_mounted_rig
 from splatnode.recon.geometry import distortion, undistort_rays
 from splatnode.recon.keyframes import (
     Features,
@@ -147,7 +147,8 @@ def register(
     scales = [grouping.scales[i] for i in rank]
     alone = make_registration(found.relabel(order), keyframes, scales, config)
     pause()
-    on_rig = rigs.adjust_with_rig(found, ordered, config.rig, tolerance_s)
+    given = config.rig or form_mounted_rig(each.frame for each in keyframes)
+    on_rig = rigs.adjust_with_rig(found, ordered, given, tolerance_s)
     if on_rig is None:
         return alone
     adjusted, rig = on_rig[0].relabel(order), on_rig[1].relabel(order)

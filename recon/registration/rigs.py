@@ -190,6 +190,18 @@ _ROUNDS = 20  # of the fit of the scale
 _LEAST_BASELINE = 2.0  # sigmas by which two cameras must be apart to tell a scale
 
 
+@dataclass(frozen=True)
+class MountResidual:
+    """How far a camera of the given rig is from where the images have it."""
+
+    camera_id: str
+    beside: str  # the camera from which both are counted
+    degrees: float
+    metres: float
+    sigma_deg: float  # of both together, by the given sigmas and what the images leave open
+    sigma_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class GivenMounts:
     """The given mounts that are believed, in the frame of the reference, metres."""
@@ -198,6 +210,8 @@ class GivenMounts:
     refuted: tuple[str, ...]
     metres_per_unit: float | None
     reference: str
+    residuals: tuple[MountResidual, ...] = ()  # of cameras that are not believed
+    is_inverse: bool = False  # the images fit the inverses of all given poses
 
     def hold(self, camera: str) -> tuple[Array, Array, tuple[float, float]]:
         """Rotation, centre and sigmas by which the adjustment holds a mount, in the unit of the map."""
@@ -223,11 +237,44 @@ def fit_given_rig(rig: Rig | None, reference: str, told: Told) -> GivenMounts:
     fits = [chosen for chosen in _choices(names) if _is_consistent(known, told, chosen, reference)]
     best = [chosen for chosen in fits if len(chosen) == len(fits[0])]
     if len(best) != 1:
-        return GivenMounts({}, tuple(names), None, reference)
+        residuals = [_measure_residual(known, told, camera, names[0], reference) for camera in names[1:]]
+        turned = {camera: _invert(each) for camera, each in known.items()}
+        is_inverse = _is_consistent(turned, told, names, reference)
+        return GivenMounts({}, tuple(names), None, reference, tuple(residuals), is_inverse)
     believed = _relative_to(known, reference, best[0]) if reference in best[0] else {}
     fitted = _fit(told, believed, list(believed)) if believed else None
     refuted = tuple(camera for camera in names if camera not in best[0])
-    return GivenMounts(believed, refuted, None if fitted is None else fitted[0], reference)
+    first = reference if reference in best[0] else best[0][0]
+    residuals = tuple(_measure_residual(known, told, camera, first, reference) for camera in refuted)
+    return GivenMounts(believed, refuted, None if fitted is None else fitted[0], reference, residuals)
+
+
+def _measure_residual(
+    known: Mapping[str, RigCamera], told: Told, camera: str, first: str, reference: str
+) -> MountResidual:
+    """How far the given pose of a camera beside `first` is from the images', in the unit that fits all given ones."""
+    given = _relative_to(known, first, list(known))
+    seen = {c: told[c] if first == reference else _between(told, first, c, reference)
+            for c in given if c == reference or c in told}  # fmt: skip
+    lengths = [(float(np.linalg.norm(given[c][1])), float(np.linalg.norm(seen[c][1]))) for c in seen]
+    unit = sum(apart for _, apart in lengths)
+    scale = sum(metres for metres, _ in lengths) / unit if unit > 0.0 else 0.0
+    (R, c, of_seen), (R_given, c_given, of_given) = seen[camera], given[camera]
+    both = np.diag([1.0] * 3 + [scale] * 3) @ of_seen @ np.diag([1.0] * 3 + [scale] * 3) + of_given
+    turn, shift = (float(np.sqrt(np.trace(both[b, b]) / 3.0)) for b in (slice(0, 3), slice(3, 6)))
+    return MountResidual(
+        camera,
+        first,
+        degrees=float(np.degrees(Rotation.from_matrix(R_given @ R.T).magnitude())),
+        metres=float(np.linalg.norm(c_given - scale * c)),
+        sigma_deg=float(np.degrees(turn)),
+        sigma_m=shift,
+    )
+
+
+def _invert(camera: RigCamera) -> RigCamera:
+    """The camera with the inverse of its given pose."""
+    return replace(camera, T_rig_camera=tuple(np.linalg.inv(_matrix(camera)).ravel().tolist()))
 
 
 def _choices(names: Sequence[str]) -> list[tuple[str, ...]]:
@@ -379,6 +426,8 @@ class RigEstimate:
     metres_per_unit: float | None  # by the given rig; None: it tells none
     scale_sigma: float  # standard deviation of its logarithm
     placed: tuple[int, ...]  # keyframes that the rig alone places
+    residuals: tuple[MountResidual, ...] = ()  # of refuted cameras
+    is_inverse: bool = False  # the images fit the inverses of all given poses
 
     @property
     def is_finite(self) -> bool:
@@ -584,7 +633,8 @@ def _describe(
     again = given.fit_scale(told)
     placed = tuple(v for v in range(len(problem.rotations)) if rig.set_of_camera[v] >= 0 and v not in adjusted.views)
     changes = _find_changes(sets, measured, reference)
-    return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed)
+    told_of_given = given.residuals, given.is_inverse
+    return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed, *told_of_given)
 
 
 def _mount_covariances(adjusted: Map) -> Array:

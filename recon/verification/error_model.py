@@ -21,7 +21,7 @@ from splatnode.recon import verification
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.known_poses import Deviation, GivenWorld
 from splatnode.recon.registration.registration import Registration
-from splatnode.recon.registration.rigs import Mount, RigChange, RigEstimate
+from splatnode.recon.registration.rigs import Mount, MountResidual, RigChange, RigEstimate
 from splatnode.recon.result.snapshot import format_rounded_up
 from splatnode.recon.result.verdict import (
     Array,
@@ -307,8 +307,14 @@ def describe_rig(verdict: Verdict, graph: ViewGraph, rig: RigEstimate) -> Verdic
     if rig.refuted:
         names = ", ".join(map(sanitize_text, rig.refuted))
         which = "is not where the given rig has it" if len(rig.refuted) == 1 else "are not where the given rig has them"
-        sentences.append(f"The photographs contradict the given rig, which is not believed there: {names} {which}.")
-        advice.append("Calibrate the rig anew, or leave it out: it is estimated then.")
+        off = "; ".join(map(_format_residual, rig.residuals[:_MOST_NAMED]))
+        sentences.append(
+            f"The photographs contradict the given rig, which is not believed there: {names} {which}"
+            f"{f' ({off})' if off else ''}."
+        )
+        if rig.metres_per_unit is None:
+            sentences.append("The rig gives no metres.")
+        advice.append(_advise_on_refuted(rig))
     left = tuple(name for name in verdict.frames if name not in {graph.names[i] for i in rig.placed})
     return replace(verdict, message=" ".join(sentences), advice=" ".join(filter(None, advice)), frames=left)
 
@@ -318,6 +324,27 @@ def _format_change(change: RigChange) -> str:
     return (
         f"{named} from frame set {change.first + 1} on ({change.count} sets) by {change.degrees:.2g} degrees and "
         f"{100 * change.shift:.2g} % of the distance"
+    )
+
+
+def _format_residual(residual: MountResidual) -> str:
+    camera, beside = sanitize_text(residual.camera_id), sanitize_text(residual.beside)
+    return (
+        f"{camera} beside {beside} by {residual.degrees:.2g} degrees and {residual.metres:.2g} m, where "
+        f"{residual.sigma_deg:.2g} degrees and {residual.sigma_m:.2g} m are one standard deviation"
+    )
+
+
+def _advise_on_refuted(rig: RigEstimate) -> str:
+    if rig.is_inverse:
+        return (
+            "The photographs fit the inverses of the given poses: T_rig_camera leads from the camera to the rig "
+            "(p_rig = T_rig_camera @ p_camera). Invert them."
+        )
+    return (
+        "See that each camera is called as in the rig, that its pose leads from the camera to the rig, in metres, and "
+        "that sigma_m and sigma_deg are not too small. Calibrate the rig anew, or leave it out: it is estimated "
+        "then."
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.api.arguments import DepthOf, Lens, check_camera_id, make_intrinsics, parse_optional_depth
-from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name
+from splatnode.capture.cameras.folder import SUFFIXES, describe_value_range, frame_name, name_photographs
 from splatnode.capture.depth_image import DepthImage, find_depth_files
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, Stamp, rigid_problem
 from splatnode.capture.image_file import (
@@ -122,6 +122,8 @@ def names_of(images: Images) -> list[str]:
     given = list_images(images)
     if len(given) == 1 and isinstance(given[0], (str, PathLike)) and Path(given[0]).suffix.lower() not in SUFFIXES:
         raise TypeError("a list goes with a list of photographs, one for each; of a folder or a video, give names")
+    if all(isinstance(each, (str, PathLike)) for each in given):
+        return name_photographs([Path(fspath(each)) for each in given])  # pyright: ignore[reportArgumentType]
     return [
         frame_name(Path(fspath(each))) if isinstance(each, (str, PathLike)) else picture_name(index)
         for index, each in enumerate(given)
@@ -282,12 +284,12 @@ def make_mask_finder(masks: Masks, images: Images) -> Find:
     given, of = list_images(images), list(masks)
     if len(given) == 1 and isinstance(given[0], (str, PathLike)) and Path(given[0]).is_dir():
         raise TypeError("masks must be a folder of masks where images is a folder, got a list")
-    if len(of) != len(given):
+    names = names_of(images)
+    if len(of) != len(names):
         raise ValueError(
-            f"masks must be one for each of the {len(given)} photographs (None: all is used), got {len(of)}"
+            f"masks must be one for each of the {len(names)} photographs (None: all is used), got {len(of)}"
         )
-    names = [frame_name(Path(fspath(each))) if isinstance(each, (str, PathLike)) else None for each in given]
-    by_name = {name or picture_name(index): mask for index, (name, mask) in enumerate(zip(names, of, strict=True))}
+    by_name = dict(zip(names, of, strict=True))
     return lambda frame: _mask(by_name.get(frame.name), frame)
 
 

@@ -94,6 +94,9 @@ def _spool_after(disk: Path, told: list[str]) -> None:
 # The checkpoint: what `put` has returned from is there until it is forgotten; what is computed is whole or missing.
 
 
+TOGETHER = (7, 8, 9)  # that several cameras took together
+
+
 class _Thing(msgspec.Struct, frozen=True):
     number: int
 
@@ -127,9 +130,10 @@ def _storing(disk: Path, tell: Tell) -> None:
     first = store._names.get("4.png", store._next)
     doing("place", lambda: store.leave_submap(first))
     doing("put 5", lambda: store.add_frame(ReceivedFrame(SESSION, 5, _frame(5))))
+    doing("put set", lambda: store.add_frames([ReceivedFrame(SESSION, each, _frame(each)) for each in TOGETHER]))
     doing("save graph 2", lambda: store.save("graph", _Thing(2), _arrays(2)))
     doing("finish", lambda: _finishing(store))
-    doing("retract 0", lambda: store.request_removal("0.png", ["scene-0001"]))
+    doing("retract 0", lambda: store.forget_frames([], "retracted", [("scene-0001", "0.png")]))
     doing("retracting 0", lambda: _retracting(store))
     store.close()
 
@@ -149,7 +153,7 @@ def _retracting(store: Store) -> None:
         folder = ledger.reopen(store.directory, scene)
         if folder is not None:
             with contextlib.closing(Store(folder)) as kept:
-                kept.forget(name, "retracted")
+                kept.forget_frames([name], "retracted")
         store.confirm_removal(scene, name)
 
 
@@ -171,8 +175,10 @@ def _store_after(disk: Path, told: list[str]) -> None:
     for stored in frames.values():
         assert np.array_equal(stored.frame.image, _frame(stored.key[1]).image)
     promised = {sequence for sequence in (0, 1, 2, 4, 5) if f"put {sequence}" in told}
+    promised |= set(TOGETHER) if "put set" in told else set()
     seen = {sequence for _, sequence in store.frame_keys}
     assert promised <= seen, f"would be taken twice: {promised - seen}"
+    assert len(seen & set(TOGETHER)) in (0, len(TOGETHER)), "a part of a frame set is there"
     gone = {1} if "begin forget 1" in told else set()
     gone |= {0, 1, 2} if "begin place" in told else set()
     assert promised - gone <= set(frames), f"lost: {promised - gone - set(frames)}"

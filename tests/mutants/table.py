@@ -567,13 +567,18 @@ MUTANTS = (
         "recon/daemon/checkpoint.py",
         (
             "a frame that was removed may come again",
-            "gone=(*ledger.gone, key)[-REMEMBERED:],",
+            "gone=(*ledger.gone, *keys)[-REMEMBERED:],",
             "gone=ledger.gone[-REMEMBERED:],",
         ),
         (
+            "a part of a frame set stays after a kill",
+            "if last is None or not last.following or self._next > last.number + 1:",
+            "if last is None or last.following or self._next > last.number + 1:",
+        ),
+        (
             "a new frame may get the name of one that is there",
-            "taken = {*self._names, *(dropped for dropped, _ in self.ledger.dropped)}",
-            "taken = {dropped for dropped, _ in self.ledger.dropped}",
+            "taken = {*self._names, *others, *(dropped for dropped, _ in self.ledger.dropped)}",
+            "taken = {*others, *(dropped for dropped, _ in self.ledger.dropped)}",
         ),
     ),
     *_list_mutants(

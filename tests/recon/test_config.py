@@ -59,3 +59,18 @@ def test_what_no_scene_can_have_is_refused_by_name(changes):
     ((name, value),) = changes.items()
     with pytest.raises(ConfigError, match=name if not isinstance(value, dict) else f"{name}.{next(iter(value))}"):
         apply_changes(ReconstructionConfig(), changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (
+            {"metric": {"frame": "Base"}},
+            "metric.frame: expected one of first_camera, base, odometry, upright, base_link, odom, got 'Base'",
+        ),
+        ({"device": "gpu"}, "device: expected one of cpu, cuda, auto, got 'gpu'"),
+    ],
+)
+def test_a_value_that_is_none_of_those_there_are_is_refused_with_these(changes, said):
+    with pytest.raises(ConfigError, match=f"^{said}$"):
+        apply_changes(ReconstructionConfig(), changes)

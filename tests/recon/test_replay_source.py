@@ -10,13 +10,15 @@ import cv2
 import numpy as np
 import pytest
 
+from splatnode.api.photographs import names_of
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import Baseline, DroppedFrame, Frame, Intrinsics, RightImage
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.capture.lenses import ALL, Lenses
+from splatnode.capture.recording import Recorder
 from splatnode.recon import replay_source
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.replay_source import Request, load_recording, load_source, select_frames
+from splatnode.recon.replay_source import Request, load_recording, load_source, parse_sources, select_frames
 
 WALK = synthetic.Config(views=6, width=160, height=120)
 STEPS = 36
@@ -239,3 +241,24 @@ def test_each_camera_gets_its_lens(walk, tmp_path):
     for read in (load_source, load_recording):
         with pytest.raises(ValueError, match=r"a lens of 'left', which is no photograph's: they are called 000"):
             read(Request(folder, lenses=Lenses({"left": one, "*": other})))
+
+
+def test_files_of_a_recording_are_its_frames(tmp_path):
+    """As a glob of the folder gives them: frames have their recorded names, right images go with theirs."""
+    rng, folder = np.random.default_rng(0), tmp_path / "recording"
+    images = [rng.integers(0, 255, (144, 192, 3), np.uint8) for _ in range(3)]
+    with Recorder(folder) as recorder:
+        for index, image in enumerate(images):  # names that are those of other frames' files
+            right = RightImage(np.ascontiguousarray(image[..., 0]), Baseline(0.1))
+            recorder.write(Frame(index, f"00000{2 - index}.png", index * 10**9, image, None, right=right))
+    files = sorted(folder.glob("*.png"))
+    assert len(files) == 6
+    path, listed, cameras = parse_sources(files[2:])
+    found = load_source(Request(path, listed, cameras=cameras))
+    assert [each.name for each in found.frames] == ["000001.png", "000000.png"]
+    last = found.frames[1]
+    assert isinstance(last, Frame) and np.array_equal(last.image, images[2]) and last.right is not None
+    assert names_of(files) == ["000002.png", "000001.png", "000000.png"]
+    (folder / "stray.png").write_bytes(files[0].read_bytes())
+    with pytest.raises(ValueError, match="'stray.png' is no image of the recording"):
+        parse_sources([folder / "stray.png"])

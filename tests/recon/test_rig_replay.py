@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -19,7 +20,9 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.terminal import InputWarning, give_warnings, ignore_progress
 from splatnode.capture.rig import Rig, RigCamera, format_rig, read_rig
+from splatnode.recon import cli
 from splatnode.recon.config import ReconstructionConfig, apply_changes
+from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.estimation import load_prior
 from splatnode.recon.pipeline import estimate_frame_cameras
 from splatnode.recon.replay_source import (
@@ -256,3 +259,43 @@ def test_a_rig_stays_where_further_settings_change() -> None:
     rig = Rig((RigCamera("a", tuple(np.eye(4).ravel().tolist())), RigCamera("b")))
     config = apply_changes(hold_rig(ReconstructionConfig(), rig), {"registration": {"trust_poses": True}})
     assert config.registration.rig == rig and config.registration.trust_poses
+
+
+def test_a_long_recording_of_a_rig_is_a_map_in_metres(walk: RigWalk, tmp_path: Path, monkeypatch) -> None:
+    """Each scene has the rig, also one that was left and comes from its checkpoint; frame sets are stored as one."""
+    folder, out, quick = write_folders(walk, tmp_path / "shots"), tmp_path / "out", tmp_path / "quick.yaml"
+    quick.write_text(json.dumps({"size": 128, "optimize": {"iterations": 2}}))
+    camchain, real, stored = write_camchain(walk, tmp_path / "camchain.yaml"), cli.make_node_config, []
+    monkeypatch.setattr(cli, "make_node_config", lambda *of: msgspec.structs.replace(real(*of), max_views=6))
+    add = Store.add_frames
+    monkeypatch.setattr(Store, "add_frames", lambda self, each: (stored.append(len(each)), add(self, each))[1])
+    arguments = ["--cameras", "all", "--rig", str(camchain), "--config", str(quick), "--out", str(out)]
+    assert command_line.main(["replay", str(folder), "--map", "--every-frame", *arguments]) == 0
+    assert stored == [2] * 5
+    (merged,) = out.glob("map-*")
+    scenes = [json.loads(path.read_text()) for path in sorted(out.glob("scene-*/cameras.json"))]
+    assert len(scenes) > 1 and all("rig of 2 cameras" in scene["scale_source"] for scene in scenes)
+    cameras = json.loads((merged / "cameras.json").read_text())
+    assert cameras["scale"] == "metric"
+    called = {f"{IDS[frame.camera_id]}/{name_of(frame)}": frame.name for frame in walk.frames}
+    check_metres(
+        {called[each["name"]]: np.array(each["T_world_camera"])[:3, 3] for each in cameras["cameras"]}, walk, 0.05
+    )
+
+
+def test_a_map_of_a_rig_that_is_of_other_cameras_is_refused_at_once(walk: RigWalk, tmp_path: Path, capsys) -> None:
+    folder, rig = write_folders(walk, tmp_path / "shots"), tmp_path / "rig.yaml"
+    rig.write_text("cameras: {a: {}, b: {}}")
+    arguments = ["--cameras", "all", "--rig", str(rig), "--out", str(tmp_path / "out")]
+    assert command_line.main(["replay", str(folder), "--map", *arguments]) == 2
+    assert "it has a, b, and the images are of cam0, cam1" in capsys.readouterr().err
+
+
+def test_mounts_of_several_cameras_give_metres(walk: RigWalk) -> None:
+    """T_base_camera of each camera, as capture's configuration or Python tells it, and no rig beside it."""
+    mounts = true_mounts()
+    frames = [replace(each, T_base_camera=tuple(mounts[each.camera_id].ravel().tolist())) for each in walk.frames]
+    config = apply_changes(ReconstructionConfig(), {"size": 160})
+    estimate, _ = estimate_frame_cameras(frames, load_prior(config), config, Clock())
+    assert estimate.rig is not None and estimate.rig.metres_per_unit is not None and not estimate.rig.refuted
+    assert estimate.rig.num_given == 2

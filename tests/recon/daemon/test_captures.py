@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -9,7 +10,8 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,9 +25,9 @@ from splatnode.capture.messaging.network import AlreadyRunning, Network, find_ca
 from splatnode.capture.process.terminal import Problems
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.daemon import ingest
+from splatnode.recon.daemon import checkpoint as checkpoint_store
+from splatnode.recon.daemon import ingest, ledger
 from splatnode.recon.daemon.checkpoint import Store
-from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import (
     ArrivedKeyframe,
     FrameSetConfig,
@@ -36,9 +38,13 @@ from splatnode.recon.daemon.ingest import (
 )
 from splatnode.recon.daemon.ledger import read_frame
 from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
-from splatnode.recon.daemon.worker import number_frame_sets
+from splatnode.recon.daemon.output import SubmapIndex, SubmapState, make_submap_record
+from splatnode.recon.daemon.worker import InactiveSubmaps, Worker, number_frame_sets
+from splatnode.recon.result.export import write_files
+from splatnode.recon.result.export.stored import encode_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
+from tests.support.exported import make_camera, make_snapshot
 from tests.support.three_captures import STEP_NS, install_camera
 
 IMAGE = np.zeros((12, 16, 3), np.uint8)
@@ -81,6 +87,24 @@ def test_a_frame_waits_for_the_other_cameras_and_no_longer_than_it_is_told():
     assert take_all(queue, 0.46) == [["right_200", "left_210"]]
     queue.add(waiting(frame("right", 9000), 9.0))
     assert take_all(queue, 9.0) == [["right_9000"]]  # left has been silent for long
+
+
+def test_a_camera_that_is_waited_for_no_more_is_told_once_until_it_is_back(caplog):
+    """It died while others go on: each of their keyframes waits .3 s at most, and after 3 s not at all."""
+    queue = FrameSetQueue(FrameSetConfig(wait_s=0.3))
+    queue.add(waiting(frame("right", 0), 0.0))
+    waited = []
+    with caplog.at_level(logging.INFO):
+        for tenths in range(0, 60, 5):
+            at_s = tenths / 10
+            queue.add(waiting(frame("left", 100 * tenths), at_s))
+            until_s = next(at_s + step / 20 for step in range(100) if take_all(queue, at_s + step / 20))
+            waited.append(round(until_s - at_s, 2))
+        assert max(waited) <= 0.35 and waited[6:] == [0.0] * 6
+        assert len([each for each in caplog.records if "camera_is_missed" in each.getMessage()]) == 1
+        assert "right" in caplog.text and "3 s" in caplog.text
+        queue.add(waiting(frame("right", 6000), 6.0))
+    assert "camera_is_back" in caplog.text
 
 
 def test_frames_wait_until_captures_that_were_just_found_have_sent_something():
@@ -168,25 +192,112 @@ def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_p
     assert {server.acknowledged for server in servers.values()} == {3}
 
 
-def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path):
+def test_no_image_of_a_frame_set_is_acknowledged_before_all_are_stored(tmp_path, plain, monkeypatch):
+    """The disk takes the second of three images only the third time; what is odd of another set is refused alone."""
+    monkeypatch.setattr(ingest, "CONNECT_S", 30.0)
+    monkeypatch.setattr(ingest, "RETRY_S", 0.05)
+    network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
+    real, failures, acknowledged = ledger.write_frame, [OSError(28, "No space left"), MemoryError()], []
+
+    def write(path, key, one, following=0):
+        acknowledged.append(sum(server.acknowledged for server in servers.values()))
+        if one.name == "middle_1" and failures:
+            raise failures.pop()
+        if one.name == "left_200":
+            raise ArithmeticError("odd")
+        real(path, key, one, following)
+
+    monkeypatch.setattr(checkpoint_store, "write_frame", write)
+    with ExitStack() as resources:
+        servers = {
+            each: resources.enter_context(
+                KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "state"), each), each)
+            )
+            for each in IDS
+        }
+        for ms in (0, 200):
+            for offset, (camera_id, server) in enumerate(servers.items()):
+                server.offer(frame(camera_id, ms + offset))
+        store = Store(tmp_path / "checkpoint")
+        resources.callback(store.close)
+        sets = FrameSetConfig(wait_s=30.0)
+        intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping, sets)
+        thread = threading.Thread(target=intake.run)
+        thread.start()
+        found: list = []
+
+        def come():
+            for server in servers.values():
+                server.serve(0.01)
+            found.extend(inbox.dequeue(0))
+            return len(found) == 5 and not any(server.num_queued for server in servers.values())
+
+        try:
+            wait_for(come, 30.0)
+        finally:
+            stopping.set()
+            thread.join()
+    assert not failures and acknowledged[:7] == [0] * 7  # two times of two images, then all three
+    assert [each.frame_set for each in found] == [0, 0, 0, 3, 3]
+    assert [server.acknowledged for server in servers.values()] == [1, 2, 2]
+    assert servers["left"].set_aside == 1 and store.names == {each.keyframe.name for each in found}
+
+
+def make_daemon(store: Store, places=None) -> SimpleNamespace:
+    """What of a daemon answers who takes a keyframe back."""
+    places = places or SimpleNamespace(find_scenes=lambda name: [])
+    worker = SimpleNamespace(
+        _store=store, _recipe=ReconstructionConfig(), _output=SimpleNamespace(places=places),
+        find_inactive_scenes=lambda name: Worker.find_inactive_scenes(worker, name),
+        find_frame_set=lambda name: Worker.find_frame_set(worker, name),
+    )  # fmt: skip
+    daemon = SimpleNamespace(
+        _store=store, _inbox=Inbox(), _worker=worker, _retract=lambda names: Daemon._retract(daemon, names)
+    )
+    return daemon
+
+
+def test_a_keyframe_is_retracted_with_its_frame_set(tmp_path, monkeypatch):
     store = Store(tmp_path / "checkpoint")
     for number, each in enumerate([frame("left", 100), frame("right", 105), frame("left", 300), frame("", 100)]):
         store.add_frame(ReceivedFrame("0" * 32, number, each))
-    inbox = Inbox()
-    node = SimpleNamespace(
-        _store=store,
-        _inbox=inbox,
-        _config=DaemonConfig(),
-        _worker=SimpleNamespace(find_inactive_scenes=lambda name: []),
-        _remove_keyframe=lambda name: Daemon._remove_keyframe(node, name),
-    )
+    node, ledgers = make_daemon(store), []
+    real = checkpoint_store.write_ledger
+    monkeypatch.setattr(checkpoint_store, "write_ledger", lambda *what: (ledgers.append(what), real(*what)))
     answer = Daemon._answer(node, RemoveKeyframe("right_105"))
     assert answer.done and answer.message.endswith("with it left_100, taken at the same time")
     assert store.names == {"left_300", "_100"}
+    assert len(ledgers) == 1, "at once: no kill leaves half of it"
+    assert node._inbox.dequeue(0) == [RemovedFrame("right_105"), RemovedFrame("left_100")], "at once"
     assert Daemon._answer(node, RemoveKeyframe("left_300")).message == (
         "left_300 is removed; the scene is built anew without it"
     )
     assert not Daemon._answer(node, RemoveKeyframe("right_105")).done
+    store.close()
+
+
+def test_a_frame_set_of_a_place_that_the_camera_has_left_is_retracted_as_one(tmp_path):
+    store = Store(tmp_path / "checkpoint")
+    store.add_frames([ReceivedFrame("0" * 32, number, frame(each, 100)) for number, each in enumerate(IDS)])
+    store.leave_submap(3)
+    store.close()
+    at = Stamp(10**8, Clock.UTC)
+    cameras = tuple(
+        replace(make_camera(i), name=f"{each}_100", camera_id=each, captured_at=at) for i, each in enumerate(IDS)
+    )
+    write_files(tmp_path / "out" / "scene-0001", {"cameras.json": encode_cameras(cameras)})
+    store = Store(tmp_path / "checkpoint")
+    places = SubmapIndex(tmp_path / "out", store.identity)
+    snapshot = replace(make_snapshot(), cameras=cameras)
+    places.update(make_submap_record("scene-0001", SubmapState.LEFT, "scene-0001", snapshot, [], []))
+    answer = Daemon._answer(make_daemon(store, places), RemoveKeyframe("middle_100"))
+    assert answer.done and answer.message.endswith("with it left_100, right_100, taken at the same time")
+    output = SimpleNamespace(places=places, complain=pytest.fail)
+    left = InactiveSubmaps(store, ReconstructionConfig(), output, SimpleNamespace(remove_scene=lambda _: None))  # pyright: ignore
+    left._remove_keyframes()
+    assert store.ledger.retracted == ()
+    with closing(Store(store.directory / "left" / "scene-0001")) as kept:
+        assert kept.names == set() and len(kept.frames_dropped) == 3
     store.close()
 
 

@@ -102,14 +102,11 @@ def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
     for index in range(CAPACITY):
         inbox.enqueue(RemovedFrame(str(index)), threading.Event())
     daemon = SimpleNamespace(
-        _worker=SimpleNamespace(find_inactive_scenes=lambda _: []),
-        _store=SimpleNamespace(
-            names={"a.png"}, forget=lambda *what: forgotten.append(what), find_frame_set=lambda *_: ("a.png",)
-        ),
+        _worker=SimpleNamespace(find_inactive_scenes=lambda _: [], find_frame_set=lambda name: [name]),
+        _store=SimpleNamespace(names={"a.png"}, forget_frames=lambda *what: forgotten.append(what)),
         _inbox=inbox,
         _stopping=threading.Event(),
-        _config=SimpleNamespace(frame_sets=SimpleNamespace(tolerance_s=0.02)),
-        _remove_keyframe=lambda name: Daemon._remove_keyframe(daemon, name),
+        _retract=lambda names: Daemon._retract(daemon, names),
     )
     answers: list[Answer] = []
     asking = threading.Thread(
@@ -117,5 +114,5 @@ def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
     )
     asking.start()
     asking.join(60)
-    assert answers and answers[0].done and forgotten == [("a.png", "retracted")]
+    assert answers and answers[0].done and forgotten == [(["a.png"], "retracted", [])]
     assert len(inbox) == CAPACITY + 1

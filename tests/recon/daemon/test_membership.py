@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from splatnode.capture.frame import Clock, Stamp
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon import submap
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -202,6 +204,30 @@ def test_the_older_of_the_two_most_alike_is_given_up(matches, spared):
     pairs: Any = {pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()}
     graph = ViewGraph(matching.MatchingConfig(), tuple(keyframe(str(i)) for i in range(6)), pairs)
     assert submap.find_most_redundant(graph) == spared
+
+
+def of_rig(number: int) -> SimpleNamespace:
+    """Three cameras take a photograph each, every second."""
+    second, camera = divmod(number, 3)
+    at = Stamp(second * 10**9 + camera, Clock.UTC)
+    return SimpleNamespace(
+        name=str(number), frame=SimpleNamespace(frame_id=number, camera_id="abc"[camera], captured_at=at)
+    )
+
+
+def test_frame_sets_are_shared_with_the_next_scene_and_given_up_as_one():
+    keyframes, forgotten = [of_rig(number) for number in range(12)], []
+    pairs: Any = {(1, 4): SimpleNamespace(matches=range(400))}
+    work: Any = SimpleNamespace(config=ReconstructionConfig(), names=[each.name for each in keyframes])
+    work.graph = ViewGraph(matching.MatchingConfig(), tuple(keyframes), pairs)  # pyright: ignore[reportArgumentType]
+    assert [each.name for each in submap.select_newest(work, 4)] == ["6", "7", "8", "9", "10", "11"]
+    work.remove_keyframes = lambda names: setattr(work, "names", [each for each in work.names if each not in names])
+    full: Any = SimpleNamespace(
+        _work=work, _config=SimpleNamespace(max_views=11), _begin_overlapping_submap=lambda: None,
+        _store=SimpleNamespace(forget_frames=lambda names, reason: forgotten.append(sorted(names))),
+    )  # fmt: skip
+    submap.ActiveSubmap._limit_views(full)
+    assert forgotten == [["0", "1", "2"]] and work.names == [str(number) for number in range(3, 12)]
 
 
 def test_keyframes_that_only_each_other_join_are_a_place_of_their_own():

@@ -26,6 +26,7 @@ from splatnode.recon.daemon.output import Output, SubmapIndex, SubmapState, make
 from splatnode.recon.daemon.submap import ActiveSubmap
 from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.verdict import Code
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import (
     PATIENCE_S,
@@ -350,3 +351,15 @@ def test_an_index_of_another_checkpoint_or_a_damaged_one_begins_anew(tmp_path):
     (tmp_path / "places.json").write_bytes(np.random.default_rng(0).bytes(100))
     SubmapIndex(tmp_path, "one").update(place)
     assert "blurred" in (tmp_path / "places.json").read_text()
+
+
+def test_a_scene_that_was_refused_has_no_cameras_and_this_is_no_fault(tmp_path, caplog):
+    """Such as one whose frame of reference is not known yet: its folder has a report alone."""
+    places = SubmapIndex(tmp_path, "one")
+    refused = make_snapshot(Code.FRAME_UNKNOWN, publishable=False)
+    (tmp_path / "scene-0001-provisional").mkdir()
+    places.update(make_submap_record("scene-0001", SubmapState.LEFT, "scene-0001-provisional", refused, [], []))
+    assert places.load_cameras("scene-0001") == {} and not caplog.records
+    known = make_snapshot()
+    places.update(make_submap_record("scene-0001", SubmapState.LEFT, "scene-0001-provisional", known, [], []))
+    assert places.load_cameras("scene-0001") == {} and "cannot be read" in caplog.text

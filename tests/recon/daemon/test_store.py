@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import itertools
 import os
 import sys
 import threading
@@ -361,8 +362,8 @@ def test_a_finished_place_is_kept_and_taken_back(open_store):
     assert not (ledger_module.make_finished_path(store.directory, "scene-0001") / "scene").exists()
 
     store = open_store()
-    store.request_removal("0.png", ["scene-0001"])
-    store.request_removal("0.png", ["scene-0001"])
+    store.forget_frames([], "retracted", [("scene-0001", "0.png")])
+    store.forget_frames([], "retracted", [("scene-0001", "0.png")])
     store = open_store()
     assert store.ledger.retracted == (("scene-0001", "0.png"),)
     assert ledger_module.reopen(store.directory, "scene-0007") is None
@@ -431,3 +432,71 @@ def test_a_part_whose_making_was_interrupted_is_made_once(open_store, tmp_path, 
     assert place.split_off(["2.png", "3.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
     place.close()
     assert len(ledger_module.list_left_folders(tmp_path / "checkpoint")) == 2
+
+
+# Frames that were taken together.
+
+
+def together(*sequences: int) -> list[ReceivedFrame]:
+    return [received(sequence) for sequence in sequences]
+
+
+def numbers(store: Store) -> list[int]:
+    return [stored.number for stored in store.frames()]
+
+
+@pytest.mark.parametrize("written", (1, 2))
+def test_a_kill_between_two_frames_of_a_set_leaves_none_of_it(open_store, monkeypatch, written):
+    """Neither is acknowledged before both are there, so both come again; what was there before stays."""
+    store, real, count = open_store(), ledger_module.write_message, itertools.count()
+    store.add_frames(together(0, 1))
+
+    def write(path, parts):
+        if next(count) == written:
+            raise KeyboardInterrupt  # as a kill: nothing is put in order afterwards
+        real(path, parts)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ledger_module, "write_message", write)
+        patched.setattr(store, "_remove", lambda number: None)
+        with pytest.raises(KeyboardInterrupt):
+            store.add_frames(together(2, 3, 4))
+    assert len(list((store.directory / "frames").glob("*.frame"))) == 2 + written
+    again = open_store()
+    assert again.frame_keys == [(SESSION, 0), (SESSION, 1)] and numbers(again) == [0, 1]
+    assert [each.number for each in again.add_frames(together(2, 3, 4))] == [2, 3, 4]
+    assert numbers(open_store()) == [0, 1, 2, 3, 4]
+
+
+def test_what_the_disk_does_not_take_of_a_set_leaves_none_of_it(open_store, monkeypatch):
+    store, real = open_store(), ledger_module.write_message
+
+    def full(path, parts):
+        if path.name.startswith("000000000001"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(path, parts)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ledger_module, "write_message", full)
+        with pytest.raises(OSError, match="No space"):
+            store.add_frames(together(0, 1))
+    assert store.names == set() and not list((store.directory / "frames").iterdir())
+    assert [each.number for each in store.add_frames(together(0, 1))] == [0, 1]
+
+
+def test_a_set_of_which_a_frame_was_taken_out_or_is_damaged_stays(open_store):
+    store = open_store()
+    store.add_frames(together(0, 1))
+    store.forget("1.png", "retracted")
+    store = open_store()
+    assert numbers(store) == [0]
+    store.add_frames(together(2, 3))
+    last = store.directory / "frames" / "000000000003.frame"
+    last.write_bytes(last.read_bytes()[:-1])
+    assert numbers(open_store()) == [0, 2]
+    assert numbers(open_store()) == [0, 2], "the damaged one is not there under its name any more"
+
+
+def test_frames_of_a_set_with_one_name_get_their_own(open_store):
+    names = [each.frame.name for each in open_store().add_frames([received(i, "same.png") for i in range(3)])]
+    assert len(set(names)) == 3 and names[0] == "same.png"

@@ -298,7 +298,7 @@ def test_the_running_daemon_tells_what_was_refused_and_answers_what_fails(config
         wait_for(lambda: "8 keyframes that were refused" in problem())
         assert ask(RECON_CONTROL, config.network, MarkProblemsSeen(), Answer).done
         wait_for(lambda: problem() == "")
-        monkeypatch.setattr(Store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
+        monkeypatch.setattr(Store, "forget_frames", lambda *_: _raise(OSError(30, "Read-only file system")))
         answer = ask(RECON_CONTROL, config.network, RemoveKeyframe(taken.name), Answer)
         assert not answer.done and "Read-only" in answer.message
         monkeypatch.setattr("shutil.disk_usage", lambda _: _raise(OSError(5, "Input/output error")))

@@ -45,6 +45,21 @@ def test_what_is_about_one_scene_does_not_go_with_a_map(folder, tmp_path, capsys
     assert "does not go with what is about one: --views, --budget-s" in capsys.readouterr().err and not out.exists()
 
 
+@pytest.mark.parametrize("further", [[], ["--map"]])
+def test_a_frame_that_nothing_tells_is_a_usage_error_before_the_work(folder, tmp_path, capsys, further):
+    out = tmp_path / "out"
+    arguments = ["replay", str(folder), "--frame", "base", *further, "--out", str(out)]
+    assert command_line.main(arguments) == 2
+    assert "no image tells where its camera stands on the robot's base. Give T_base_camera" in capsys.readouterr().err
+    assert not out.exists() or not any(out.iterdir())
+
+
+def test_gravity_of_the_first_image_is_that_of_no_other_scene(folder, tmp_path, capsys):
+    arguments = ["replay", str(folder), "--map", "--gravity", "0,1,0", "--out", str(tmp_path / "out")]
+    assert command_line.main(arguments) == 2
+    assert "does not go with what is about one: --gravity" in capsys.readouterr().err
+
+
 def test_what_makes_no_scene_is_told(folder, tmp_path, capsys):
     for path in sorted(folder.iterdir())[1:]:
         path.unlink()

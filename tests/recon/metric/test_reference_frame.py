@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.diorama import look_at
 from splatnode.capture.frame import Gravity, Motion, make_given_pose
+from splatnode.command_line import exit_code
 from splatnode.recon.metric.measurement import Baseline, MetricConfig
 from splatnode.recon.metric.metres import (
     NOTHING,
@@ -77,6 +78,18 @@ def test_the_base_is_where_its_mount_says():
     assert_same_scene(moved)
     ahead = moved.cameras[0].T_world_camera @ [0.0, 0.0, 2.0, 1.0]  # two metres before the camera
     np.testing.assert_allclose(ahead, [2.3, 0.0, 1.2, 1.0], atol=1e-12)
+
+
+def test_the_base_tells_up_where_nothing_else_does():
+    """A base has z up (REP 103); gravity, where it is known, is told as it is."""
+    moved = apply_metric_scale(scene(), asked("base"), Evidence(mounts=mounts()))
+    assert moved.up is not None and moved.up.direction == (0.0, 0.0, 1.0) and "taken to stand level" in moved.up.source
+    report = build_report(moved, seed=0, preset="fast", peak_rss_mb=None)
+    assert json.loads(json.dumps(report))["up"]["direction"] == [0.0, 0.0, 1.0]
+    known = apply_metric_scale(scene(), asked("base"), Evidence(mounts=mounts(), gravities=gravities()))
+    expected = AHEAD[:3, :3] @ TRUE[0][:3, :3].T @ UP
+    assert known.up is not None and "level" not in known.up.source
+    np.testing.assert_allclose(known.up.direction, expected, atol=1e-6)
 
 
 def test_a_mount_in_millimetres_is_told():
@@ -213,10 +226,15 @@ def test_what_is_missing_from_the_beginning_is_told_before_the_work():
     for frame, said in (("base", "T_base_camera"), ("odom", "--poses FILE")):
         with pytest.raises(UnknownFrame, match=said) as refused:
             check_frame(asked(frame), NOTHING)
-        assert refused.value.exit_code == 65
+        assert exit_code(refused.value) == 2, "what was asked for does not go with what was given"
     check_frame(asked("upright"), NOTHING)  # a floor may be found
     check_frame(asked("base"), Evidence(mounts=mounts()))
     check_frame(asked(None), NOTHING)
+    bare = msgspec.structs.replace(asked("base"), baseline=None)
+    with pytest.raises(UnknownFrame, match="nothing that was given tells metres"):
+        check_frame(bare, Evidence(mounts=mounts()))
+    check_frame(bare, Evidence(mounts=mounts()), has_lengths=True)
+    check_frame(msgspec.structs.replace(bare, marker_size_m=0.1), Evidence(mounts=mounts()))
 
 
 def test_a_refused_snapshot_keeps_its_reason():

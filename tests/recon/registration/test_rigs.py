@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Clock as StampClock
 from splatnode.capture.frame import Frame, Stamp
-from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera
+from splatnode.capture.rig import TOLERANCE_S, Rig, RigCamera, form_mounted_rig
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment, rigs
@@ -273,10 +273,31 @@ def test_only_cameras_that_have_images_and_are_given_count_for_the_rig() -> None
     assert find_rig(found, keyframes)[1].num_given == 0
 
 
+def test_cameras_whose_place_on_the_base_is_told_are_a_rig() -> None:
+    """As capture's configuration tells it, with each image; a camera on an arm is none of it."""
+    _, keyframes, _ = make_drive()
+    mounts = {camera: tuple(T.ravel().tolist()) for camera, T in true_mounts().items()}
+    told = [replace(each.frame, T_base_camera=mounts[each.frame.camera_id]) for each in keyframes]
+    rig = form_mounted_rig(told)
+    assert rig is not None and rig.is_base and {each.camera_id for each in rig.cameras} == set(IDS)
+    assert {each.sigma_m for each in rig.cameras} == {0.005}
+    found = make_drive()[0]
+    assert find_rig(found, keyframes, rig)[1].metres_per_unit is not None
+    moves = [replace(each, T_base_camera=mounts[IDS[index % 2]]) if each.camera_id == "right" else each
+             for index, each in enumerate(told)]  # fmt: skip
+    rig = form_mounted_rig(moves)
+    assert rig is not None and "right" not in {each.camera_id for each in rig.cameras}
+    assert form_mounted_rig(each for each in told if each.camera_id == "left") is None
+    assert form_mounted_rig(each.frame for each in keyframes) is None
+
+
 def test_a_camera_that_is_given_wrongly_is_named_and_not_believed() -> None:
     found, keyframes, worlds = make_drive()
     adjusted, rig = find_rig(found, keyframes, make_rig(left=3.0))
     assert rig.refuted == ("left",)
+    (off,) = rig.residuals
+    assert off.camera_id == "left" and off.beside in ("front", "right") and off.degrees == pytest.approx(3.0, abs=0.3)
+    assert off.metres < 0.02 and off.sigma_deg < 0.3 and off.sigma_m < 0.02 and not rig.is_inverse
     assert not any(mount.given for mount in rig.mounts if mount.camera_id == "left")
     assert rig.metres_per_unit == pytest.approx(scale_of(adjusted, worlds), rel=0.03)
 
@@ -286,3 +307,13 @@ def test_nothing_of_a_rig_is_believed_where_it_is_wrong_and_nothing_tells_in_wha
     rig = find_rig(found, keyframes, make_rig(left=3.0, right=-4.0, front=5.0))[1]
     assert set(rig.refuted) == set(IDS)
     assert rig.metres_per_unit is None and not any(mount.given for mount in rig.mounts)
+    assert len(rig.residuals) == 2 and max(each.degrees for each in rig.residuals) > 5.0 and not rig.is_inverse
+
+
+def test_a_rig_whose_poses_are_inverses_is_recognized() -> None:
+    """As when the poses of a file lead from the rig to its cameras."""
+    found, keyframes, _ = make_drive()
+    inverses = [replace(each, T_rig_camera=tuple(np.linalg.inv(each.matrix).ravel().tolist()))
+                for each in make_rig().cameras if each.matrix is not None]  # fmt: skip
+    rig = find_rig(found, keyframes, Rig(tuple(inverses)))[1]
+    assert set(rig.refuted) == set(IDS) and rig.is_inverse

@@ -11,7 +11,7 @@ import pytest
 
 from splatnode.capture.frame import Clock, Stamp
 from splatnode.capture.rig import FrameSet
-from splatnode.recon.registration.rigs import Mount, RigChange, RigEstimate
+from splatnode.recon.registration.rigs import Mount, MountResidual, RigChange, RigEstimate
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, make_ball
 from splatnode.recon.verification.error_model import compute_placed_bounds, describe_rig
 
@@ -87,6 +87,16 @@ def test_a_verdict_names_a_camera_that_moved_and_one_that_was_given_wrongly() ->
     assert "Fasten these cameras" in said.advice and "Calibrate the rig anew" in said.advice
     many = replace(make_rig(), changes=(change,) * 7)
     assert "and 2 more" in describe_rig(SAID, GRAPH, many).message
+
+
+def test_what_is_not_believed_is_told_with_how_far_it_is_off_and_what_to_do() -> None:
+    off = MountResidual("left", "front", degrees=11.6, metres=0.0312, sigma_deg=0.142, sigma_m=0.0021)
+    rig = replace(make_rig(), refuted=("front", "left"), residuals=(off,))
+    said = describe_rig(SAID, GRAPH, rig)
+    assert "left beside front by 12 degrees and 0.031 m, where 0.14 degrees and 0.0021 m are one" in said.message
+    assert said.message.endswith("The rig gives no metres.") and "sigma_m and sigma_deg" in said.advice
+    said = describe_rig(SAID, GRAPH, replace(rig, is_inverse=True, metres_per_unit=1.0))
+    assert "Invert them" in said.advice and "no metres" not in said.message
 
 
 def test_a_refusal_says_nothing_of_a_rig() -> None:
