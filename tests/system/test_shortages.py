@@ -36,12 +36,13 @@ HARMLESS = {
         "viewer/sources.py:_listen",
     },
     "a shortage is told to whoever asked, as what it is": {
+        "capture/daemon.py:_open_link",
         "capture/daemon.py:capture",
         "capture/process/system.py:resident_mb",
         "capture/process/system.py:make_sure_of_room",
         "capture/reader.py:_run",
         "extras/batch/command.py:write_back",
-        "recon/daemon/node.py:_remove_keyframe",
+        "recon/daemon/node.py:_retract",
         "recon/daemon/node.py:run_and_record_error",
         "recon/daemon/output.py:save",
         "recon/daemon/output.py:save_fallbacks",
@@ -53,6 +54,8 @@ HARMLESS = {
     "what is left out is no frame, no keyframe and no result: a name, a reason, a picture, a figure": {
         "capture/daemon.py:last_run",
         "capture/messaging/keyframe_queue.py:_quarantine_frame",
+        "capture/messaging/frame_set_link.py:_send",
+        "capture/messaging/frame_set_link.py:receive",
         "capture/process/library_lines.py:_create_file",
         "capture/process/library_lines.py:_find_memory",
         "capture/process/library_lines.py:tell_last_words",
