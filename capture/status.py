@@ -22,6 +22,7 @@ from splatnode.capture.messaging.network import (
 from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, NoAnswer, Subscriber, ask
 from splatnode.capture.messaging.spool import QuarantinedKeyframe
 from splatnode.capture.messaging.wire import Amount, Count, Header, Name, Text, WireError
+from splatnode.capture.process.terminal import ProgressStep
 
 HEARTBEAT_S = 1.0  # between heartbeats of capture
 WAIT_S = 2.0  # for a heartbeat; a process without one is silent
@@ -128,6 +129,8 @@ def _format_value(value: Any) -> str:
         return f"{value['name']}: {value['reason']}"
     if isinstance(value, dict) and {"scene_id", "keyframes"} <= value.keys():
         return _format_submap(value)
+    if isinstance(value, dict) and value.keys() == {"doing", "done", "of", "what", "left_s"}:
+        return _format_work(value)
     return f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
@@ -142,6 +145,14 @@ def _format_submap(value: Mapping[str, Any]) -> str:
         f"{value.get('rss_mb', 0):.0f} MB",
     ]
     return f"{value['scene_id']}: {', '.join(filter(None, parts))}"
+
+
+def _format_work(value: Mapping[str, Any]) -> str:
+    """`refining the scene: 210 of 500 steps, about 6 s left`."""
+    done, of, left_s = value["done"], value["of"], value["left_s"]
+    if not (isinstance(done, int) and isinstance(of, int) and isinstance(left_s, (int, float, type(None)))):
+        return str(dict(value))
+    return ProgressStep(str(value["doing"]), done, of, str(value["what"]), left_s).sentence
 
 
 # Field of a heartbeat -> what it is called, and how its value is written; other fields go by their names.
@@ -169,6 +180,7 @@ _WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "delay": ("because", _format_value),
     "unfinished": ("places to finish", _format_value),
     "newest_places": ("places", _format_value),
+    "work": ("now", _format_value),
     "refused": ("refused messages", _format_value),
     "duplicates": ("keyframes come again", _format_value),
 }

@@ -23,6 +23,7 @@ from splatnode.recon.daemon.checkpoint import checkpoint, records
 from splatnode.recon.daemon.checkpoint.records import CheckpointError
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.output import Output
+from splatnode.recon.daemon.work_meter import Work, WorkMeter
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
 from splatnode.recon.modelling import SceneWithVerdict
 
@@ -41,13 +42,14 @@ class InactiveSubmaps:
         output: Output,
         atlas: LoopDetector,
         fallback_s: float = math.inf,
+        meter: WorkMeter | None = None,
     ) -> None:
         """`here` is the checkpoint which has left/ in it, `config` how scenes are made.
 
         Fallbacks take at most `fallback_s` seconds of each step with a place.
         """
         self._here, self._config, self._output, self._atlas = here, config, output, atlas
-        self._fallback_s = fallback_s
+        self._fallback_s, self._meter = fallback_s, meter or WorkMeter()
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
         self._retract_after_s = -math.inf  # monotonic: a keyframe could not be taken out before
@@ -71,7 +73,10 @@ class InactiveSubmaps:
         """
         self._remove_keyframes()
         return self._process_first(
-            [each for each in self._pending_folders if not self._atlas.has_scene(each.name)], self._verify, pause
+            [each for each in self._pending_folders if not self._atlas.has_scene(each.name)],
+            self._verify,
+            pause,
+            Work.JUDGE,
         )
 
     def finalize_next(self, pause: Pause) -> bool:
@@ -80,7 +85,10 @@ class InactiveSubmaps:
         False where there is none to be made now; `pause` as for `verify_next`.
         """
         return self._process_first(
-            [each for each in self._pending_folders if self._atlas.has_scene(each.name)], self._finalize, pause
+            [each for each in self._pending_folders if self._atlas.has_scene(each.name)],
+            self._finalize,
+            pause,
+            Work.FINISH,
         )
 
     @property
@@ -91,14 +99,19 @@ class InactiveSubmaps:
             each for each in records.list_left_folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now
         ]
 
-    def _process_first(self, folders: Sequence[Path], step: _Step, pause: Pause) -> bool:
+    @property
+    def num_unjudged(self) -> int:
+        """Places that were left and are not judged."""
+        return sum(not self._atlas.has_scene(each.name) for each in records.list_left_folders(self._here.directory))
+
+    def _process_first(self, folders: Sequence[Path], step: _Step, pause: Pause, work: Work) -> bool:
         """Takes the step with the first of the places; False where there is none, or the disk did not take it."""
         if not folders:
             return False
         folder = folders[0]
         self._not_before_s[folder] = time.monotonic() + AGAIN_S
         try:
-            with contextlib.closing(Store(folder)) as store:
+            with contextlib.closing(Store(folder)) as store, self._meter.measure(work):
                 found = checkpoint.restore(store, self._config)
                 self._work = found.work
                 give_back_memory()

@@ -444,6 +444,7 @@ class Daemon:
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
             tracked=_make_live_camera_record(tracked),
+            work=worker.work,
             problem=self._describe_problem(),
         )
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.messaging.wire import Amount, Count, Header, Name, Text
+from splatnode.capture.messaging.wire import Amount, Count, Header, Name, Sequential, Text
 from splatnode.recon.result.message import CameraRecord
 
 
@@ -34,6 +34,16 @@ class SubmapStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     left_out: Count  # keyframes without one
     seconds: Amount  # that were worked on it
     rss_mb: Amount  # memory of the process then
+
+
+class WorkProgress(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The work under way, how far it is, and how long the rest of it takes."""
+
+    doing: Text  # in words
+    done: Sequential  # things that were counted so far
+    of: Sequential  # 0: there is nothing to count
+    what: Text  # one of the things: "step", "keyframe", "scene"
+    left_s: Amount | None = None  # by what was measured in this process; None: nothing tells it
 
 
 class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -63,4 +73,5 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     camera_moved: bool | None  # None: not watched
     moved: Text  # by how much and with what certainty; empty while it stands still
     tracked: CameraRecord | None  # where the live camera is in the finished scene, if that is known
+    work: WorkProgress | None = None  # None: nothing is being done, or the node is older
     problem: Text  # what keeps the node from working as it should; empty where nothing does

@@ -17,6 +17,7 @@ from functools import partial
 
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.system import is_shortage
+from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
@@ -30,6 +31,7 @@ from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.status import ReconState
 from splatnode.recon.daemon.submap_index import SubmapState
+from splatnode.recon.daemon.work_meter import Work, WorkMeter, weigh_final
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore_cancel
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -222,7 +224,9 @@ def verify_keyframes(work: IncrementalReconstruction, forget: Forget, pause: Pau
         forget(keyframe.name, "it contradicts the scene")
 
 
-def refine(work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause) -> Iterator[SceneWithVerdict]:
+def refine(
+    work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause, tell: Tell = ignore_progress
+) -> Iterator[SceneWithVerdict]:
     """The scene of all keyframes at every checkpoint, and at the end; it is not shown yet.
 
     Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
@@ -233,8 +237,9 @@ def refine(work: IncrementalReconstruction, config: ReconstructionConfig, pause:
         if next(steps) % STEP == 0:
             pause()
 
+    tell(ProgressStep("estimating depth"))
     work.rebuild(pause)
-    yield from work.refine(work.initial_scene, config.optimize, pause_periodically)
+    yield from work.refine(work.initial_scene, config.optimize, pause_periodically, tell)
 
 
 # The result of the present place's finished scene: written when the scene is, or when the disk takes it again.
@@ -275,10 +280,17 @@ class Abandoned(Exception):
 
 class ActiveSubmap:
     def __init__(
-        self, config: DaemonConfig, recipe: Recipe, store: Store, output: Output, pause: Callable[[float], None]
+        self,
+        config: DaemonConfig,
+        recipe: Recipe,
+        store: Store,
+        output: Output,
+        pause: Callable[[float], None],
+        meter: WorkMeter | None = None,
     ) -> None:
         """`pause` raises Abandoned if the daemon stops, and from a time (monotonic) on if something has come."""
         self._config, self._recipe, self._store, self._output = config, recipe, store, output
+        self._meter = meter or WorkMeter()
         self._pause_until = pause
         self._work = IncrementalReconstruction(recipe)
         self._final = FinalResult(store, output)
@@ -528,8 +540,10 @@ class ActiveSubmap:
     def finalize(self) -> None:
         """Makes the scene afresh from all keyframes and refines it. Raises Abandoned when something comes."""
         self.state = ReconState.REFINING
-        self._verify()
-        self._refine_verified()
+        with self._meter.measure(Work.FINAL, weigh_final(len(self._work.names))):
+            self._meter.tell(ProgressStep("finding and checking the cameras"))
+            self._verify()
+            self._refine_verified()
 
     def _verify(self) -> None:
         """Weighs all evidence; what shows other places begins others, or becomes places of its own that wait."""
@@ -557,7 +571,7 @@ class ActiveSubmap:
 
     def _refine_verified(self) -> None:
         refined = SceneWithVerdict()
-        for refined in refine(self._work, self._recipe, self._pause):
+        for refined in refine(self._work, self._recipe, self._pause, self._meter.tell):
             if refined.scene is not None and refined.scene.iterations in self._recipe.optimize.checkpoints:
                 self._work.show(refined)
                 self._show()

@@ -23,8 +23,9 @@ from splatnode.recon.daemon.finalizer import InactiveSubmaps
 from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
 from splatnode.recon.daemon.output import Output, PublishedSnapshot
-from splatnode.recon.daemon.status import PLACES, SubmapStatus
+from splatnode.recon.daemon.status import PLACES, SubmapStatus, WorkProgress
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
+from splatnode.recon.daemon.work_meter import Backlog, Work, WorkMeter
 from splatnode.recon.frames.keyframe import Keyframe
 
 log = logging.getLogger(__name__)
@@ -51,10 +52,13 @@ class Worker:
         )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._report_problem)
-        self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause)
+        self._meter = WorkMeter()
+        self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause, self._meter)
         self._free_space = OccupancyMapper(config.occupancy)
         self._atlas = LoopDetector(store.directory, self._recipe, self._output.places)
-        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_timeout_s)
+        self._left = InactiveSubmaps(
+            store, self._recipe, self._output, self._atlas, config.fallback_timeout_s, self._meter
+        )
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
         self._shortage = ""  # the last one that was told
@@ -90,6 +94,11 @@ class Worker:
         """The map of the present scene as it is now, or why there is none."""
         return self._free_space.find_current_map(self.place.finished, self.place.state)
 
+    @property
+    def work(self) -> WorkProgress | None:
+        """Tells what is being done, and how long the rest of it takes; None while nothing is."""
+        return self._meter.describe(Backlog(self.count_waiting(), self._left.num_unjudged, self.num_unfinished))
+
     def find_inactive_scenes(self, name: str) -> list[str]:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
         return [scene for scene in self._output.places.find_scenes(name) if scene != self._store.scene_id]
@@ -124,6 +133,7 @@ class Worker:
 
     def _process_idle(self) -> None:
         """Does one step of work that is left while the active submap needs nothing."""
+        self._meter.restart_count(Work.KEYFRAMES)
         if self.place.retry_write():
             self.problem = ""
             return
@@ -173,7 +183,8 @@ class Worker:
         self.problem = ""
         stored = [each for each in arrived if self._store.holds(each.keyframe.frame)]
         if stored or not arrived:
-            self.place.add_keyframes(stored)
+            with self._meter.measure(Work.KEYFRAMES, len(stored), len(stored)):
+                self.place.add_keyframes(stored)
 
     def _serve_active_submap(self) -> None:
         """While the scene of a place that was left is finished, the present one goes on.

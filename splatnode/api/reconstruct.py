@@ -35,7 +35,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Stamp
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.notices import notify
-from splatnode.capture.process.terminal import Tell, ignore_progress
+from splatnode.capture.process.terminal import Tell, add_remaining_time, ignore_progress
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
@@ -312,11 +312,11 @@ def reconstruct(
     - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
     - `multi_view_only` (formerly `only_seen`): leaves out what no two images confirm, and the far background.
     - `seed`: of random numbers (None: the configuration's). `threads`: at most (None: as many as processors).
-    - `tell`: gets steps (`doing`, `done`, `of`) and lines of text, in the calling thread; an exception in it cancels.
+    - `tell`: gets steps (`doing`, `done`, `of`, `left_s`) and lines of text, in this thread; an exception in it cancels.
     """
     check_poses, multi_view_only = _merge_former(check_poses, poses_only_check, multi_view_only, only_seen)
     check_counts(views=views, threads=threads)
-    telling = tell or ignore_progress
+    telling = add_remaining_time(tell or ignore_progress)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     loaded = load_frames(images, views, every_frame, telling, several)
     source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)

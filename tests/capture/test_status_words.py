@@ -55,3 +55,14 @@ def test_each_place_is_told_in_a_line_of_its_own():
 def test_every_field_that_has_words_is_one_of_a_heartbeat():
     fields = {field.encode_name for status in (CaptureStatus, ReconStatus) for field in msgspec.structs.fields(status)}
     assert set(_WORDS) <= fields and fields | {"type"} >= _NOT_PRINTED
+
+
+def test_what_the_node_does_is_told_with_the_rest_and_strange_values_as_they_are():
+    work = {"doing": "refining the scene", "done": 210, "of": 500, "what": "step", "left_s": 6.2}
+    assert describe_heartbeat("recon", {"state": "refining", "work": work}) == [
+        "recon: refining",
+        "  now                     refining the scene: 210 of 500 steps, about 6 s left",
+    ]
+    assert describe_heartbeat("recon", {"work": work | {"of": 0, "left_s": None}})[1].endswith("scene: 210 steps")
+    for strange in (work | {"done": "many"}, work | {"left_s": [1]}, {"doing": 1}):
+        assert describe_heartbeat("recon", {"work": strange})[1].endswith(str(strange))
