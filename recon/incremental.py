@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon.budget import find_budget_hits
 from splatnode.recon.clock import Clock, OutOfTime, Timer
 from splatnode.recon.config import ReconstructionConfig
@@ -392,20 +391,11 @@ class IncrementalReconstruction:
         self.clock.lap("points")
 
     def refine(
-        self,
-        scene: Scene | None,
-        steps: training.RefinementConfig,
-        pause: Pause = ignore_cancel,
-        tell: Tell = ignore_progress,
+        self, scene: Scene | None, steps: training.RefinementConfig, pause: Pause = ignore_cancel
     ) -> Iterator[SceneWithVerdict]:
         """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet."""
         self.clock.lap("wait")
-
-        def go_on(done: int) -> None:
-            tell(ProgressStep("refining the scene", done, steps.steps, "step"))
-            pause()
-
-        for show in refine_scene(scene, self.config, steps, gone_on=go_on):
+        for show in refine_scene(scene, self.config, steps, gone_on=lambda done: pause()):
             self.clock.lap("optimise")
             yield show
             self.clock.lap("wait")

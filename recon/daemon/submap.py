@@ -234,12 +234,14 @@ def refine(
     steps = itertools.count(1)
 
     def pause_periodically() -> None:
-        if next(steps) % STEP == 0:
+        done = next(steps)
+        tell(ProgressStep("refining the scene", done, config.optimize.steps, "step"))
+        if done % STEP == 0:
             pause()
 
     tell(ProgressStep("estimating depth"))
     work.rebuild(pause)
-    yield from work.refine(work.initial_scene, config.optimize, pause_periodically, tell)
+    yield from work.refine(work.initial_scene, config.optimize, pause_periodically)
 
 
 # The result of the present place's finished scene: written when the scene is, or when the disk takes it again.
