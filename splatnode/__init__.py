@@ -9,7 +9,7 @@ TYPE_CHECKING = False  # to a type checker it is true; `typing` would take time
 
 if TYPE_CHECKING:
     from splatnode.api.live_map import NodeMap
-    from splatnode.api.node import Node, NodeUpdate, connect
+    from splatnode.api.node import LiveLocation, Node, NodeUpdate, connect
     from splatnode.api.publisher import Published, Publisher, RefusedImage
     from splatnode.api.reconstruct import Marker, Stereo, reconstruct
     from splatnode.api.result import Camera, Result, View, load
@@ -27,6 +27,7 @@ __all__ = [
     "DepthNoise",
     "InputWarning",
     "Intrinsics",
+    "LiveLocation",
     "Located",
     "Marker",
     "Node",
@@ -55,6 +56,7 @@ _MODULES = {
     "DepthNoise": "splatnode.capture.depth_image",
     "InputWarning": "splatnode.capture.process.notices",
     "Intrinsics": "splatnode.capture.frame",
+    "LiveLocation": "splatnode.api.node",
     "Located": "splatnode.recon.locating.outcome",
     "Marker": "splatnode.api.reconstruct",
     "Node": "splatnode.api.node",

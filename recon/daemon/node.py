@@ -3,6 +3,7 @@
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
 watcher   capture.preview -> has the camera moved?
+locator   recon.locate: where clients took their images, in what is shown
 main      recon.scene, recon.depth, recon.map, recon.status, recon.control; the service manager; signals
 
 It says that a disk is nearly full while it can still write: before a keyframe or a result is refused."""
@@ -60,10 +61,12 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
+from splatnode.recon.daemon.locator import LocatableScene, Locator
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
 from splatnode.recon.daemon.relocalization import Watcher
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.daemon.worlds import WorldRevisions
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.staged import finish_interrupted_write
@@ -133,8 +136,8 @@ def remove_keyframe(args: argparse.Namespace) -> int:
 
 
 SERVE_S = 0.05  # between looks at what the threads have produced
-_SOCKETS = 8  # that it binds: of states two
-_FILES, _THREADS = 128, 28  # of which the daemon has need: six endpoints, its own threads, those that compute
+_SOCKETS = 9  # that it binds: of states two
+_FILES, _THREADS = 144, 32  # of which the daemon has need: seven endpoints, its own threads, those that compute
 END_S = 20.0  # for the threads to end; an export takes seconds
 QUIET_S = 2.0  # in which no keyframe comes before a node that finishes ends: capture sends what it still keeps
 RESTS = 2  # looks at which nothing was left to be done, likewise
@@ -210,6 +213,8 @@ class Daemon:
         Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
+        self._problems = Problems()
+        self._worlds = WorldRevisions()
         with self._close_on_error():
             raise_file_limit()
             network = config.network
@@ -219,6 +224,10 @@ class Daemon:
             maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.occupancy.live else None
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
+            self._locator = None
+            if config.localization.live:
+                self._locator = Locator(network, self._problems, stopping)
+                self._resources.callback(self._locator.close)
             self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
             self._resources.enter_context(hold_result_folder(config.out))
@@ -227,12 +236,11 @@ class Daemon:
         self._disk_space = DiskSpace(config, self._store)
         self._inbox = Inbox()
         self._newest = _NewestSnapshot()
-        self._problems = Problems()
         several = config.frame_sets, config.further_captures
         self._intake = Intake(
             network, config.reconstruction, self._store, self._inbox, self._problems, stopping, *several
         )
-        self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping)
+        self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping, self._worlds)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._scene_numbers = Numbering()
         session = self._scene_numbers.session
@@ -263,7 +271,8 @@ class Daemon:
             self._run(manager)
 
     def _run(self, manager: ServiceManager) -> None:
-        threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher)]
+        running = [self._intake, self._worker, self._watcher, *([] if self._locator is None else [self._locator])]
+        threads = [self._start_thread(each.run) for each in running]
         manager.ready()
         event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
         next_status_s = 0.0
@@ -359,6 +368,10 @@ class Daemon:
         self._publish_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
         numbers = self._scene_numbers.next()
         self._sequence = int(numbers["sequence"])
+        world = self._worlds.update(shown.scene_id, shown.snapshot)
+        if self._locator is not None:
+            told = self._scene_numbers.session, self._sequence, world.revision, world.provisional
+            self._locator.show(LocatableScene(shown.snapshot, shown.scene_id, *told, shown.estimate))
         try:
             header, arrays = encode_snapshot(shown.snapshot, shown.scene_id, numbers)
             depth = self._depth_numbers.next()
@@ -444,6 +457,7 @@ class Daemon:
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
             tracked=_make_live_camera_record(tracked),
+            worlds=self._worlds.records,
             work=worker.work,
             problem=self._describe_problem(),
         )

@@ -22,6 +22,8 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
+from splatnode.recon.daemon.worlds import WorldRevisions
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
@@ -82,6 +84,7 @@ class PublishedSnapshot:
 
     snapshot: Snapshot
     scene_id: str
+    estimate: Reconstruction | None = None  # of its keyframes, where images are located in it
 
 
 class Output:
@@ -91,8 +94,10 @@ class Output:
         store: Store,
         publish: Callable[[PublishedSnapshot], None],
         complain: Callable[[str], None],
+        worlds: WorldRevisions | None = None,
     ) -> None:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
+        self._worlds = worlds or WorldRevisions()
         self._config, self._store, self._publish, self.complain = config, store, publish, complain
         self.places = SubmapIndex(config.out, store.identity)
         self._metres = MetricScaler(config.reconstruction.metric)
@@ -100,7 +105,8 @@ class Output:
     def publish(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """Shows what `work` has come to, in metres where these are known; what is shown."""
         measured = self._metres.scale_snapshot(snapshot, work)
-        self._publish(PublishedSnapshot(measured, self._store.scene_id))
+        estimate = work.find_reconstruction() if self._config.localization.live else None
+        self._publish(PublishedSnapshot(measured, self._store.scene_id, estimate))
         return measured
 
     def save(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
@@ -146,6 +152,8 @@ class Output:
         except OSError as error:
             self.complain(SHORT_OF_MEMORY if is_shortage(error) else error.strerror or str(error))
             return False
+        if place.scene_id != self._store.scene_id and judged:
+            self._worlds.rebuild(place.scene_id, measured.cameras)
         known = result_snapshot.format_widest_bounds(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
         return True

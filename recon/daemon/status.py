@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.messaging.wire import Amount, Count, Header, Name, Sequential, Text
+from splatnode.recon.daemon.worlds import Worlds
 from splatnode.recon.result.message import CameraRecord
 
 
@@ -73,5 +74,6 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     camera_moved: bool | None  # None: not watched
     moved: Text  # by how much and with what certainty; empty while it stands still
     tracked: CameraRecord | None  # where the live camera is in the finished scene, if that is known
+    worlds: Worlds = ()  # of the scenes, as poses in them are told: another revision withdraws those before
     work: WorkProgress | None = None  # None: nothing is being done, or the node is older
     problem: Text  # what keeps the node from working as it should; empty where nothing does

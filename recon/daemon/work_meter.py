@@ -135,5 +135,5 @@ class WorkMeter:
 
 
 def _subtract(whole_s: float | None, spent_s: float) -> float | None:
-    """Returns what is left of a prediction; None where there is none, or it was wrong: more than that is spent already."""
+    """Returns what is left of a prediction; None where there is none, or more than that is spent already."""
     return None if whole_s is None or spent_s >= whole_s else whole_s - spent_s

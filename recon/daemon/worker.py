@@ -26,6 +26,7 @@ from splatnode.recon.daemon.output import Output, PublishedSnapshot
 from splatnode.recon.daemon.status import PLACES, SubmapStatus, WorkProgress
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
 from splatnode.recon.daemon.work_meter import Backlog, Work, WorkMeter
+from splatnode.recon.daemon.worlds import WorldRevisions
 from splatnode.recon.frames.keyframe import Keyframe
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,9 @@ class Worker:
         inbox: Inbox,
         publish: Callable[[PublishedSnapshot], None],
         stopping: threading.Event,
+        worlds: WorldRevisions | None = None,
     ) -> None:
+        """`worlds` hears which scenes are made afresh."""
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
         asked = config.reconstruction.fallbacks
         ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
@@ -51,7 +54,7 @@ class Worker:
             config.reconstruction, max_gaussians=limit, budget_s=None, fallbacks=ladder
         )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
-        self._output = Output(config, store, publish, self._report_problem)
+        self._output = Output(config, store, publish, self._report_problem, worlds)
         self._meter = WorkMeter()
         self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause, self._meter)
         self._free_space = OccupancyMapper(config.occupancy)

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from splatnode.api.entrance import enter_api
 from splatnode.api.live_map import LiveMap, NodeMap
 from splatnode.api.result import Camera, Result, camera_of, result_of
-from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.messages import make_jpeg_array
+from splatnode.capture.messaging.network import RECON_LOCATE, Network
+from splatnode.capture.messaging.pubsub import NoAnswer, QueryClient
 from splatnode.capture.process.config import parse_config, read_yaml
+from splatnode.recon.locating.message import LocateAnswer, LocateRequest, parse_outcome
+from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.sources import LiveSource
 from splatnode.viewer.state import Moment
 
+if TYPE_CHECKING:
+    from splatnode.api.photographs import Lens, Picture
+
 FIRST_PORT = Network().first_port
 OUTDATED = "the scene has changed since its map was made"
+_JPEG_QUALITY = 95  # of an image that is sent
 _LOOK_S = 0.05  # between looks at whether a map has come
 
 
@@ -29,6 +39,18 @@ class NodeUpdate:
 
     scene_id: str  # another one is another place, with a world of its own
     result: Result  # `result.final`: verified with all evidence, and refined; `result.scale_interval`: None, or metres
+
+
+@dataclass(frozen=True, eq=False)
+class LiveLocation:
+    """Where an image was taken, in the scene that a node showed then."""
+
+    scene_id: str  # of the place; `none` where the node has no scene
+    found: Located | NotLocated | None  # in the world of that scene; None: nothing was looked for
+    why: str  # nothing was looked for; empty where something was
+    provisional: bool  # the scene grows: bounds are wider, and it will be made afresh, which withdraws this
+    revision: int  # of the scene's world
+    session: str  # of the node
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +71,9 @@ class Node:
     """
 
     def __init__(self, network: Network) -> None:
+        self._network = network
+        self._locating: QueryClient | None = None  # once somebody asks
+        self._asked, self._asking = 0, threading.Lock()
         self._live = LiveSource(network)
         try:
             self._map = LiveMap(network)
@@ -104,6 +129,52 @@ class Node:
                 return self.map
         return found
 
+    @enter_api()
+    def localise(
+        self,
+        image: str | PathLike[str] | Picture,
+        *,
+        intrinsics: Lens | None = None,
+        follows: bool = False,
+        timeout_s: float = 10.0,
+    ) -> LiveLocation:
+        """Asks the node where an image was taken, in the scene that it shows, also while that grows.
+
+        The node's configuration needs `localization.live`. `image` and `intrinsics` are as for `Result.localise`;
+        `follows`: the image was taken near to the last one, which makes the search faster. `find_withdrawal` tells
+        whether the answer still holds. Raises TimeoutError where no answer comes in time, PermissionError, and
+        ValueError for an image that cannot be used.
+        """
+        from splatnode.api.locating import load_query_frame  # brings what matches photographs
+
+        frame = load_query_frame(image, intrinsics)
+        with self._asking:
+            self._locating = self._locating or QueryClient(RECON_LOCATE, self._network, LocateAnswer)
+            self._asked += 1
+            request = LocateRequest(self._asked, frame.intrinsics, follows)
+            try:
+                answer = self._locating.ask(request, [make_jpeg_array(frame.image, _JPEG_QUALITY)], timeout_s)
+            except NoAnswer as error:
+                raise TimeoutError(f"{error}. Set `localization: {{live: true}}` in recon's file") from None
+        world = answer.scene_id, parse_outcome(answer), answer.why, answer.provisional
+        return LiveLocation(*world, answer.revision, answer.session)
+
+    def find_withdrawal(self, location: LiveLocation) -> str:
+        """Says why an answer of `localise` does not hold any more, by the node's last heartbeat; empty where it holds.
+
+        A scene's world changes when it is made afresh, loses a keyframe, or its cameras move beyond their bounds.
+        """
+        session, worlds = self._live.worlds
+        if not session or location.found is None:
+            return "" if location.found is not None else location.why
+        world = worlds.get(location.scene_id)
+        if session != location.session:
+            return "the node was started again"
+        if world is None:
+            newest = max((each.revision for each in worlds.values()), default=0)
+            return "" if newest < location.revision else "the node does not tell of this scene any more"
+        return (world.why or "the scene has changed") if world.revision > location.revision else ""
+
     @property
     def silent_s(self) -> float:
         """Seconds since anything was heard of the node, which speaks each second; infinite before the first time."""
@@ -113,6 +184,9 @@ class Node:
         """Ends the connection, and whoever waits for an update."""
         self._live.close()
         self._map.close()
+        with self._asking:
+            if self._locating is not None:
+                self._locating.close()
 
     def __enter__(self) -> Node:
         return self

@@ -312,7 +312,7 @@ def reconstruct(
     - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
     - `multi_view_only` (formerly `only_seen`): leaves out what no two images confirm, and the far background.
     - `seed`: of random numbers (None: the configuration's). `threads`: at most (None: as many as processors).
-    - `tell`: gets steps (`doing`, `done`, `of`, `left_s`) and lines of text, in this thread; an exception in it cancels.
+    - `tell`: gets steps (`doing`, `done`, `of`, `left_s`) and lines of text, in this thread; raise in it to cancel.
     """
     check_poses, multi_view_only = _merge_former(check_poses, poses_only_check, multi_view_only, only_seen)
     check_counts(views=views, threads=threads)

@@ -41,6 +41,7 @@ _CLASSES = (
     "Node",
     "NodeUpdate",
     "NodeMap",
+    "LiveLocation",
     "Publisher",
     "Published",
     "RefusedImage",

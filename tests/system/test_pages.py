@@ -15,6 +15,7 @@ from splatnode.capture.odometry import GivenPose, Gravity, Motion
 from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
+from splatnode.recon.locating.message import LocateAnswer, LocateRequest, LocationRecord
 from splatnode.recon.occupancy.message import MapHeader, MapRecord
 from splatnode.recon.result.export.format import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
@@ -82,6 +83,9 @@ SECTIONS = {
     "ReferenceFrameRecord": ReferenceFrameRecord,
     "MapHeader": MapHeader,
     "MapRecord": MapRecord,
+    "LocateRequest": LocateRequest,
+    "LocateAnswer": LocateAnswer,
+    "LocationRecord": LocationRecord,
     "CameraRecord": CameraRecord,
     "BoundsRecord": BoundsRecord,
     "Want": pubsub.Want,
