@@ -71,7 +71,7 @@ class RefusalRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LocateAnswer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="location"):
-    """Where the image was taken, in which world, and whether that may still change."""
+    """The place where the image was taken, in which world, and whether that may still change."""
 
     number: Sequential  # of the request
     scene_id: Name  # `none` where there is no scene

@@ -43,7 +43,7 @@ class NodeUpdate:
 
 @dataclass(frozen=True, eq=False)
 class LiveLocation:
-    """Where an image was taken, in the scene that a node showed then."""
+    """The place where an image was taken, in the scene that a node showed then."""
 
     scene_id: str  # of the place; `none` where the node has no scene
     found: Located | NotLocated | None  # in the world of that scene; None: nothing was looked for
