@@ -60,13 +60,14 @@ from splatnode.recon.config import apply_changes
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.growing_map import GrowingMapper, GrowingScene, ProvisionalMap
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
 from splatnode.recon.daemon.locator import LocatableScene, Locator
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
 from splatnode.recon.daemon.relocalization import Watcher
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.daemon.worker import Worker
-from splatnode.recon.daemon.worlds import WorldRevisions
+from splatnode.recon.daemon.worlds import WorldRecord, WorldRevisions
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export.staged import finish_interrupted_write
@@ -247,6 +248,9 @@ class Daemon:
         self._depth_numbers = Numbering(session)
         self._status_numbers = Numbering(session)
         self._maps = None if maps is None else OccupancyPublisher(maps, Numbering(session))
+        mapped = config.occupancy.live and config.occupancy.provisional
+        self._growing = GrowingMapper(config.occupancy.voxel, self._problems, stopping) if mapped else None
+        self._world: WorldRecord | None = None  # of what is shown
         self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()
         self._shown: PublishedSnapshot | None = None
@@ -271,8 +275,8 @@ class Daemon:
             self._run(manager)
 
     def _run(self, manager: ServiceManager) -> None:
-        running = [self._intake, self._worker, self._watcher, *([] if self._locator is None else [self._locator])]
-        threads = [self._start_thread(each.run) for each in running]
+        beside = [each for each in (self._locator, self._growing) if each is not None]
+        threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher, *beside)]
         manager.ready()
         event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
         next_status_s = 0.0
@@ -365,13 +369,11 @@ class Daemon:
         if shown is None:
             return
         self._shown = shown
-        self._publish_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
+        self._world = self._worlds.update(shown.scene_id, shown.snapshot)
+        self._publish_map(NOT_FINAL)  # first: no map of another world is there when this scene comes
         numbers = self._scene_numbers.next()
         self._sequence = int(numbers["sequence"])
-        world = self._worlds.update(shown.scene_id, shown.snapshot)
-        if self._locator is not None:
-            told = self._scene_numbers.session, self._sequence, world.revision, world.provisional
-            self._locator.show(LocatableScene(shown.snapshot, shown.scene_id, *told, shown.estimate))
+        self._show_to_helpers(shown, self._world)
         try:
             header, arrays = encode_snapshot(shown.snapshot, shown.scene_id, numbers)
             depth = self._depth_numbers.next()
@@ -383,7 +385,23 @@ class Daemon:
 
     def _publish_map(self, found: OccupancyResult | str) -> None:
         if self._maps is not None:
-            self._maps.publish(found, self._shown, self._sequence)
+            self._maps.publish(found, self._shown, self._sequence, self._find_growing_map())
+
+    def _find_growing_map(self) -> ProvisionalMap | None:
+        """The provisional map, if it is in the world of what is shown."""
+        made, world = None if self._growing is None else self._growing.made, self._world
+        if made is None or world is None or self._shown is None or self._shown.snapshot.final:
+            return None
+        return made if (made.of.scene_id, made.of.revision) == (world.scene_id, world.revision) else None
+
+    def _show_to_helpers(self, shown: PublishedSnapshot, world: WorldRecord) -> None:
+        """Gives the scene to the threads that locate images in it, and that map it while it grows."""
+        if self._locator is not None:
+            told = self._scene_numbers.session, self._sequence, world.revision, world.provisional
+            self._locator.show(LocatableScene(shown.snapshot, shown.scene_id, *told, shown.estimate))
+        if self._growing is not None and shown.pointmaps is not None and shown.snapshot.verdict.publishable:
+            told = self._sequence, world.revision, shown.pointmaps, shown.shown_s
+            self._growing.show(GrowingScene(shown.snapshot, shown.scene_id, *told))
 
     def _answer(self, command: Command) -> Answer:
         if isinstance(command, MarkProblemsSeen):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import Any
@@ -20,7 +21,8 @@ from splatnode.recon.daemon import submap_index
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.free_space import NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.free_space import LOST, NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.growing_map import GrowingScene, ProvisionalMap
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
 from splatnode.recon.daemon.worlds import WorldRevisions
 from splatnode.recon.estimation import Reconstruction
@@ -30,7 +32,8 @@ from splatnode.recon.metric.evidence import NOTHING, Evidence, gather_evidence
 from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.metres import apply_metric_scale
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.occupancy.message import encode_map, no_map
+from splatnode.recon.occupancy.message import encode_map, make_provisional_record, no_map
+from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.report import write_result_folder
@@ -85,6 +88,8 @@ class PublishedSnapshot:
     snapshot: Snapshot
     scene_id: str
     estimate: Reconstruction | None = None  # of its keyframes, where images are located in it
+    pointmaps: Mapping[str, Pointmap] | None = None  # by keyframe, where it is mapped while it grows
+    shown_s: float = 0.0  # monotonic
 
 
 class Output:
@@ -106,7 +111,9 @@ class Output:
         """Shows what `work` has come to, in metres where these are known; what is shown."""
         measured = self._metres.scale_snapshot(snapshot, work)
         estimate = work.find_reconstruction() if self._config.localization.live else None
-        self._publish(PublishedSnapshot(measured, self._store.scene_id, estimate))
+        mapped = self._config.occupancy.live and self._config.occupancy.provisional and not snapshot.final
+        pointmaps = dict(work.state.pointmaps) if mapped else None
+        self._publish(PublishedSnapshot(measured, self._store.scene_id, estimate, pointmaps, shown_s=time.monotonic()))
         return measured
 
     def save(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
@@ -202,42 +209,59 @@ class OccupancyPublisher:
     def __init__(self, server: StateServer, numbering: Numbering) -> None:
         """`numbering`: of the maps alone, in the session of the scenes."""
         self._server, self._numbering = server, numbering
-        self._told: tuple[str, OccupancyResult | str] | None = None  # scene, and its map or why there is none
+        self._told: tuple[str, OccupancyResult | ProvisionalMap | str] | None = None  # scene, and its map or why not
 
     def serve(self) -> None:
         """Replies to who asks."""
         self._server.serve(0)
 
-    def publish(self, found: OccupancyResult | str, shown: PublishedSnapshot | None, sequence: int) -> None:
-        """`found` is the map of a scene, or why there is none; `shown` what viewers see, by message `sequence`."""
+    def publish(
+        self,
+        found: OccupancyResult | str,
+        shown: PublishedSnapshot | None,
+        sequence: int,
+        growing: ProvisionalMap | None = None,
+    ) -> None:
+        """`found` is the map of a scene, or why there is none; `shown` what viewers see, by message `sequence`.
+
+        `growing` is the map of a scene that grows, in the world of what viewers see.
+        """
         scene_id = NO_SCENE if shown is None else shown.scene_id
-        now = _match_shown_scene(found, shown)
+        now = _match_shown_scene(found, shown, growing)
         if (scene_id, now) == self._told:
             return
         self._told = scene_id, now
         numbers = self._numbering.next()
-        if isinstance(now, OccupancyResult):
+        if not isinstance(now, str):
             now = self._send_map(now, scene_id, sequence, numbers)
         if now:
             self._server.publish(no_map(scene_id, now, numbers))
 
-    def _send_map(self, mapped: OccupancyResult, scene_id: str, sequence: int, numbers: dict[str, Any]) -> str:
+    def _send_map(
+        self, mapped: OccupancyResult | ProvisionalMap, scene_id: str, sequence: int, numbers: dict[str, Any]
+    ) -> str:
         """Sends a map; why not, where there is none to be sent."""
         if mapped.occupancy is None:
             return mapped.why
         try:
-            self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers))
+            of, growing = mapped.of, None
+            if isinstance(of, GrowingScene):
+                sequence = of.sequence
+                growing = make_provisional_record(of.revision, of.snapshot.cameras)
+            self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers, growing))
         except WireError as error:
             log.warning("the map of %s cannot be sent: %s", scene_id, error)
             return f"the map is too large: {error}; choose a larger occupancy.voxel"
         return ""
 
 
-def _match_shown_scene(found: OccupancyResult | str, shown: PublishedSnapshot | None) -> OccupancyResult | str:
-    """The map if it is of what viewers see; else why there is none."""
+def _match_shown_scene(
+    found: OccupancyResult | str, shown: PublishedSnapshot | None, growing: ProvisionalMap | None
+) -> OccupancyResult | ProvisionalMap | str:
+    """The map if it is of what viewers see, or grows with it; else why there is none."""
     if shown is not None and not shown.snapshot.verdict.publishable:
         verdict = shown.snapshot.verdict
         return f"there is no scene: {verdict.code.value}. {verdict.message}"
     if isinstance(found, str):
-        return found
+        return growing if growing is not None and found != LOST else found
     return found if shown is not None and found.of.snapshot is shown.snapshot else NOT_FINAL

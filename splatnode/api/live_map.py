@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import dataclass
+from typing import Any
 
 from splatnode.capture.messaging.network import RECON_MAP, Network
 from splatnode.capture.messaging.pubsub import StateClient
@@ -26,6 +27,13 @@ class NodeMap:
     scene_id: str  # of the place; empty where the node has said nothing
     occupancy: OccupancyMap | None  # in the world of that scene, as it is now
     why: str  # there is no map; empty where there is one
+    provisional: bool = (
+        False  # the scene grows: the map is less certain, and is withdrawn when the scene is made afresh
+    )
+    views: int | None = None  # that a provisional map is made of
+    bounds: tuple[float, float] | None = (
+        None  # of its least certain camera, 95 %: degrees, and of its centre, in the unit
+    )
 
 
 NOTHING_HEARD = NodeMap("", None, SILENT)
@@ -37,6 +45,7 @@ class ReceivedMap:
 
     told: NodeMap
     scene: tuple[str, int] | None = None  # session and sequence
+    world: tuple[str, int] | None = None  # session and revision of a provisional one
 
 
 class LiveMap:
@@ -72,11 +81,23 @@ class LiveMap:
                     continue
                 header: MapHeader = message.header
                 try:
-                    told = NodeMap(header.scene_id, decode_map(message), header.why)
+                    told = NodeMap(header.scene_id, decode_map(message), header.why, **_describe_provisional(header))
                 except WireError as error:
                     if is_logged(self._refusals.add("maps that were refused", error)):
                         log.warning("a map of the node was refused: %s", error)
                     told = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
-                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence))
+                growing = None if header.map is None else header.map.provisional
+                world = None if growing is None else (header.session, growing.revision)
+                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence), world)
         except Exception as error:
             self._error = error
+
+
+def _describe_provisional(header: MapHeader) -> dict[str, Any]:
+    """The fields of a NodeMap that a map of a growing scene has."""
+    growing = None if header.map is None else header.map.provisional
+    if growing is None:
+        return {}
+    known = growing.rotation_deg is not None and growing.centre is not None
+    bounds = (growing.rotation_deg, growing.centre) if known else None
+    return {"provisional": True, "views": growing.views, "bounds": bounds}

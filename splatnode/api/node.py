@@ -112,10 +112,17 @@ class Node:
     def map(self) -> NodeMap:
         """Which space is free, occupied, or not seen, where the node's configuration has `occupancy.live`.
 
-        A map is of a scene that is final, as this program has heard it last; else there is none, and `why` says so.
+        A map is of a scene that is final, as this program has heard it last; with `occupancy.provisional` also of one
+        that grows, which `provisional` says. Else there is none, and `why` says so.
         Raises PermissionError where the node does not let this program in.
         """
         heard = self._map.newest
+        if heard.world is not None:  # it grows with the scene
+            session, worlds = self._live.worlds
+            world = worlds.get(heard.told.scene_id)
+            if world is not None and session == heard.world[0] and world.revision > heard.world[1]:
+                return NodeMap(heard.told.scene_id, None, OUTDATED)
+            return heard.told
         if heard.told.occupancy is not None and heard.scene != self._live.scene:
             return NodeMap(heard.told.scene_id, None, OUTDATED)
         return heard.told

@@ -16,7 +16,7 @@ from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.daemon.status import ReconState, ReconStatus
 from splatnode.recon.locating.message import LocateAnswer, LocateRequest, LocationRecord
-from splatnode.recon.occupancy.message import MapHeader, MapRecord
+from splatnode.recon.occupancy.message import MapHeader, MapRecord, ProvisionalRecord
 from splatnode.recon.result.export.format import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
@@ -83,6 +83,7 @@ SECTIONS = {
     "ReferenceFrameRecord": ReferenceFrameRecord,
     "MapHeader": MapHeader,
     "MapRecord": MapRecord,
+    "ProvisionalRecord": ProvisionalRecord,
     "LocateRequest": LocateRequest,
     "LocateAnswer": LocateAnswer,
     "LocationRecord": LocationRecord,
