@@ -30,6 +30,8 @@ class OccupancyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     live: bool = False  # send the map of each scene that is final, as the service recon.map
     # With `live`: send a map of the scene while it grows, too, marked provisional. It is less certain, and changes
     provisional: bool = False
+    # Keep a file out/free_space/MAP.npz for each map: the free space of all its final scenes, in one frame
+    maps: bool = False
     # Side of a voxel, in the unit of the scene; nothing: as `splatnode occupancy` chooses it
     voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
 

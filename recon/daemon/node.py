@@ -66,6 +66,7 @@ from splatnode.recon.daemon.locator import LocatableScene, Locator
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
 from splatnode.recon.daemon.relocalization import Watcher
 from splatnode.recon.daemon.status import ReconState, ReconStatus
+from splatnode.recon.daemon.whole_map import WholeMapper
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.daemon.worlds import WorldRecord, WorldRevisions
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
@@ -250,6 +251,8 @@ class Daemon:
         self._maps = None if maps is None else OccupancyPublisher(maps, Numbering(session))
         mapped = config.occupancy.live and config.occupancy.provisional
         self._growing = GrowingMapper(config.occupancy.voxel, self._problems, stopping) if mapped else None
+        folder = config.out, config.occupancy.voxel
+        self._whole = WholeMapper(*folder, self._problems, stopping) if config.occupancy.maps else None
         self._world: WorldRecord | None = None  # of what is shown
         self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()
@@ -275,7 +278,7 @@ class Daemon:
             self._run(manager)
 
     def _run(self, manager: ServiceManager) -> None:
-        beside = [each for each in (self._locator, self._growing) if each is not None]
+        beside = [each for each in (self._locator, self._growing, self._whole) if each is not None]
         threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher, *beside)]
         manager.ready()
         event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)

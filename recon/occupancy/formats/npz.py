@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 
 import numpy as np
+import numpy.typing as npt
 
 from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState
 
@@ -12,8 +14,11 @@ AXES = "states[i, j, k] along x, y, z of the map: x forward of the first camera,
 AXES_OF_RESULT = "states[i, j, k] along x, y, z of the map: x and y of the result's frame, z up"
 
 
-def encode_npz(occupancy: OccupancyMap) -> bytes:
-    """`states` (X, Y, Z) uint8, `origin` (3,), `voxel` (), `T_world_map` (4, 4), and texts that say what they mean."""
+def encode_npz(occupancy: OccupancyMap, further: Mapping[str, npt.NDArray] | None = None) -> bytes:
+    """`states` (X, Y, Z) uint8, `origin` (3,), `voxel` (), `T_world_map` (4, 4), and texts that say what they mean.
+
+    `further` are arrays beside these.
+    """
     file = io.BytesIO()
     np.savez_compressed(
         file,
@@ -28,5 +33,6 @@ def encode_npz(occupancy: OccupancyMap) -> bytes:
         world=np.array(occupancy.scale.frame.sentence),
         up=np.array(occupancy.upright.source),
         height=np.array(occupancy.upright.height),
+        **(further or {}),
     )
     return file.getvalue()

@@ -1,0 +1,131 @@
+"""The file of each map's free space: it follows the index of places, and is removed when its map is no more."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from splatnode.capture.process.logs import Problems
+from splatnode.recon.daemon import whole_map
+from splatnode.recon.daemon.free_space import OccupancyConfig
+from splatnode.recon.daemon.whole_map import FOLDER, WholeMapper
+from splatnode.recon.occupancy.grid import OccupancyMap, Upright, VoxelState
+from splatnode.recon.result.export.limits import SceneFileError
+from splatnode.recon.result.submap_index import FILE
+from splatnode.recon.result.verdict import Code
+from tests.recon.daemon.test_daemon import PATIENCE_S, config, finished, peer, running  # noqa: F401
+from tests.support.synthetic import photographs
+from tests.support.walk import write_walk
+
+AHEAD = np.array([[0.6, 0.0, 0.5], [2.4, 0.0, 0.6]])  # between the wall and the cameras: of the first scene, the second
+ON_WALL = AHEAD * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+
+
+def mapper(out, problems: Problems | None = None) -> WholeMapper:
+    return WholeMapper(out, 0.05, problems or Problems(), threading.Event())
+
+
+def read(path) -> tuple[OccupancyMap, list[str]]:
+    with np.load(path, allow_pickle=False) as file:
+        frame = Upright(file["T_world_map"], str(file["up"]), False)
+        return OccupancyMap(file["states"], float(file["voxel"]), file["origin"], frame), file["scenes"].tolist()
+
+
+def change_index(out, change) -> None:
+    index = json.loads((out / FILE).read_text())
+    change(index)
+    (out / FILE).write_text(json.dumps(index, indent=1) + "\n\n")
+
+
+def test_all_final_scenes_of_a_map_come_in_one_frame(tmp_path):
+    out = write_walk(tmp_path / "out")
+    kept = mapper(out)
+    assert kept.update() and not kept.update()  # nothing has changed since
+    (path,) = (out / FOLDER).iterdir()
+    found, scenes = read(path)
+    assert path.name == "scene-0001.npz" and scenes == ["scene-0001", "scene-0002"]
+    assert found.at(AHEAD).tolist() == [VoxelState.FREE] * 2
+    assert found.at(ON_WALL).tolist() == [VoxelState.OCCUPIED] * 2
+    behind = AHEAD * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.3]
+    assert found.at(behind).tolist() == [VoxelState.NOT_SEEN] * 2
+
+
+def test_a_rough_scene_and_one_that_is_not_final_add_nothing(tmp_path):
+    out = write_walk(tmp_path / "out", second=Code.OK_ROUGH)
+    mapper(out).update()
+    found, scenes = read(out / FOLDER / "scene-0001.npz")
+    assert scenes == ["scene-0001"] and found.at(AHEAD).tolist() == [VoxelState.FREE, VoxelState.NOT_SEEN]
+    change_index(out, lambda index: index["places"][0].update(provisional=True))
+    mapper(out).update()  # of a process that was started later
+    assert not list((out / FOLDER).iterdir())
+
+
+def test_a_scene_that_is_taken_back_leaves_the_file_and_the_last_one_takes_it_along(tmp_path):
+    out = write_walk(tmp_path / "out")
+    kept = mapper(out)
+    kept.update()
+    change_index(out, lambda index: index["places"][1].update(provisional=True, publishable=False))
+    assert kept.update()
+    assert read(out / FOLDER / "scene-0001.npz")[1] == ["scene-0001"]
+    change_index(out, lambda index: index["places"][0].update(provisional=True))
+    assert kept.update() and not list((out / FOLDER).iterdir())
+
+
+def test_scenes_are_mapped_once_and_moved_when_a_link_moves_them(tmp_path, monkeypatch):
+    out, mapped = write_walk(tmp_path / "out"), []
+    whole = whole_map.occupancy_map
+    monkeypatch.setattr(whole_map, "occupancy_map", lambda *rest, **more: mapped.append(0) or whole(*rest, **more))
+    kept = mapper(out)
+    kept.update()
+    before = (out / FOLDER / "scene-0001.npz").read_bytes()
+
+    def shift(index) -> None:
+        (pose,) = [each for each in index["poses"] if each["scene"] == "scene-0002"]
+        pose["translation"][0] += 0.5
+
+    change_index(out, shift)
+    kept.update()
+    assert len(mapped) == 2 and (out / FOLDER / "scene-0001.npz").read_bytes() != before
+
+
+def test_a_damaged_index_is_a_problem_and_is_looked_at_again(tmp_path, monkeypatch):
+    out, problems = write_walk(tmp_path / "out"), Problems()
+    index = (out / FILE).read_bytes()
+    (out / FILE).write_bytes(b"{")
+    with pytest.raises(SceneFileError):
+        mapper(out).update()
+    assert not mapper(tmp_path / "nothing").update()
+    monkeypatch.setattr(whole_map, "LOOK_S", 0.01)
+    monkeypatch.setattr(whole_map, "AGAIN_S", 0.01)
+    stopping = threading.Event()
+    thread = threading.Thread(target=WholeMapper(out, 0.05, problems, stopping).run)
+    thread.start()
+    try:
+        deadline = time.monotonic() + 20.0
+        while not str(problems) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        (out / FILE).write_bytes(index)
+        while not (out / FOLDER / "scene-0001.npz").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+    finally:
+        stopping.set()
+        thread.join()
+    assert "could not be written" in str(problems) and (out / FOLDER / "scene-0001.npz").exists()
+
+
+def test_a_node_keeps_the_file_of_its_map(config, peer):  # noqa: F811
+    with running(replace(config, occupancy=OccupancyConfig(maps=True))):
+        for frame in photographs()[:3]:
+            peer.server.offer(frame)
+        peer.wait(finished(3), "a final scene")
+        path, deadline = config.out / FOLDER / "scene-0001.npz", time.monotonic() + PATIENCE_S
+        while not path.exists():
+            assert time.monotonic() < deadline
+            peer.server.serve(0.05)
+    found, scenes = read(path)
+    assert scenes == ["scene-0001"] and found.shares["free"] > 0.01
