@@ -66,3 +66,15 @@ def test_what_the_node_does_is_told_with_the_rest_and_strange_values_as_they_are
     assert describe_heartbeat("recon", {"work": work | {"of": 0, "left_s": None}})[1].endswith("scene: 210 steps")
     for strange in (work | {"done": "many"}, work | {"left_s": [1]}, {"doing": 1}):
         assert describe_heartbeat("recon", {"work": strange})[1].endswith(str(strange))
+
+
+def test_which_poses_hold_is_told_for_each_scene():
+    worlds = [
+        {"scene_id": "scene-0001", "revision": 3, "provisional": False, "why": "it moved"},
+        {"scene_id": "scene-0002", "revision": 2, "provisional": True, "why": ""},
+    ]
+    assert describe_heartbeat("recon", {"state": "growing", "worlds": worlds}) == [
+        "recon: growing",
+        "  poses in                scene-0001: revision 3, final; earlier poses are withdrawn: it moved",
+        "                          scene-0002: revision 2, provisional",
+    ]

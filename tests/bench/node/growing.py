@@ -134,7 +134,7 @@ def _ask(network: Network, queries: list[npt.NDArray[np.uint8]], heard: Heard, e
             number += 1
             began_s, index = time.monotonic(), min(newest, len(queries)) - 1
             try:
-                answer = client.ask(LocateRequest(number), [make_jpeg_array(queries[index], 95)], TIMEOUT_S)
+                answer = client.ask(LocateRequest(number, follows=True), [make_jpeg_array(queries[index], 95)], TIMEOUT_S)
             except NoAnswer:
                 answer = None
             heard.answers.append((index + 0.5, time.monotonic() - began_s, answer))
