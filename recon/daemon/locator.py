@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -31,6 +30,7 @@ from splatnode.recon.locating.message import (
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.result.snapshot import Landmarks, Snapshot
+from splatnode.recon.threads import apply_thread_limit
 
 log = logging.getLogger(__name__)
 
@@ -68,7 +68,6 @@ class Locator:
         self._shown: LocatableScene | None = None
         self._landmarks: tuple[LocatableScene, Landmarks | None] | None = None
         self._last: dict[bytes, tuple[int, Located]] = {}  # by connection: the revision, and where its last image was
-        self.seconds: float | None = None  # that the last answer took
 
     def close(self) -> None:
         self._server.close()
@@ -78,12 +77,11 @@ class Locator:
         self._shown = scene
 
     def run(self) -> None:
-        """Until the daemon stops."""
-        while not self._stopping.is_set():
-            for identity, message in self._server.receive(WAIT_S):
-                began_s = time.monotonic()
-                self._server.reply(identity, self._answer(identity, message))
-                self.seconds = time.monotonic() - began_s
+        """Until the daemon stops; on one processor, which leaves the others to the worker."""
+        with apply_thread_limit(1):
+            while not self._stopping.is_set():
+                for identity, message in self._server.receive(WAIT_S):
+                    self._server.reply(identity, self._answer(identity, message))
 
     def _answer(self, identity: bytes, message: Message[LocateRequest]) -> LocateAnswer:
         scene, request = self._shown, message.header

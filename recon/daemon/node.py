@@ -251,8 +251,9 @@ class Daemon:
         self._maps = None if maps is None else OccupancyPublisher(maps, Numbering(session))
         mapped = config.occupancy.live and config.occupancy.provisional
         self._growing = GrowingMapper(config.occupancy.voxel, self._problems, stopping) if mapped else None
-        folder = config.out, config.occupancy.voxel
-        self._whole = WholeMapper(*folder, self._problems, stopping) if config.occupancy.maps else None
+        helper = config.out, config.occupancy.voxel, self._problems, stopping
+        grows = self._find_growing_map if mapped else None
+        self._whole = WholeMapper(*helper, grows) if config.occupancy.maps else None
         self._world: WorldRecord | None = None  # of what is shown
         self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()

@@ -35,19 +35,23 @@ class PlacedMap:
         """Returns the side of a voxel in the unit of all."""
         return self.placement.scale * self.occupancy.voxel
 
-    def to_all(self, points: Array) -> Array:
+    def transform_to_all(self, points: Array) -> Array:
         """The points (M, 3) of this map's frame in the world of all."""
         T = self.occupancy.T_world_map
         return self.placement.transform_points(points @ T[:3, :3].T + T[:3, 3])
 
-    def to_own(self, points: Array) -> Array:
+    def transform_to_own(self, points: Array) -> Array:
         """The points (M, 3) of the world of all in this map's frame."""
         T = self.occupancy.T_world_map
         return (self.placement.inverse().transform_points(points) - T[:3, 3]) @ T[:3, :3]
 
 
-def combine_maps(parts: Sequence[PlacedMap], pause: Callable[[], None] = ignore_cancel) -> OccupancyMap:
+def combine_maps(
+    parts: Sequence[PlacedMap], pause: Callable[[], None] = ignore_cancel, base: OccupancyMap | None = None
+) -> OccupancyMap:
     """The map of all parts, in the frame of the first and in the unit that the placements lead to.
+
+    With `base`, which this made of other parts, they are added to it, in its frame and with its voxels.
 
     A voxel is occupied where any part has a surface, free where a part knows all of it and MARGIN beside it as free,
     and no other has a surface there. Voxels are as large as the largest of the parts, and larger where there would be
@@ -58,27 +62,47 @@ def combine_maps(parts: Sequence[PlacedMap], pause: Callable[[], None] = ignore_
     first = parts[0]
     T = np.eye(4)
     T[:3, :3] = first.placement.rotation @ first.occupancy.T_world_map[:3, :3]
-    T[:3, 3] = first.to_all(np.zeros((1, 3)))[0]
-    corners = [_find_known_corners(part) for part in parts]
-    known = [(points - T[:3, 3]) @ T[:3, :3] for points in corners]
-    low, high = np.concatenate(known).min(0), np.concatenate(known).max(0)
-    voxel = max(part.voxel for part in parts)
-    while np.prod((high - low) / voxel + 3) > MOST_VOXELS or (high - low).max() / voxel > LONGEST_SIDE:
-        voxel *= 2
-    start = np.floor(low / voxel).astype(np.int64) - 1
-    shape = np.ceil(high / voxel).astype(np.int64) + 1 - start
-    states = np.zeros(tuple(shape.tolist()), np.uint8)
+    T[:3, 3] = first.transform_to_all(np.zeros((1, 3)))[0]
+    T = T if base is None else base.T_world_map
+    known = [(_find_known_corners(part) - T[:3, 3]) @ T[:3, :3] for part in parts]
+    states, start, voxel = _lay_out(known, max(part.voxel for part in parts), base)
     for part, points in zip(parts, known, strict=True):
         pause()
         for index in _list_voxels(points, start, voxel, states.shape):
-            states[tuple(index[_is_free(part, index, start, voxel, T)].T)] = VoxelState.FREE
+            free = tuple(index[_is_free(part, index, start, voxel, T)].T)
+            states[free] = np.where(states[free] == VoxelState.OCCUPIED, VoxelState.OCCUPIED, VoxelState.FREE)
     for part in parts:
         pause()
-        index = np.floor(((_spread_occupied(part) - T[:3, 3]) @ T[:3, :3]) / voxel).astype(np.int64) - start
+        index = np.floor(((_sample_occupied(part) - T[:3, 3]) @ T[:3, :3]) / voxel).astype(np.int64) - start
         inside = ((index >= 0) & (index < states.shape)).all(1)
         states[tuple(index[inside].T)] = VoxelState.OCCUPIED
-    frame = replace(first.occupancy.upright, T_world_map=T)
-    return OccupancyMap(states, voxel, start * voxel, frame, first.occupancy.scale)
+    frame = replace(first.occupancy.upright, T_world_map=T) if base is None else base.upright
+    return OccupancyMap(states, voxel, start * voxel, frame, first.occupancy.scale if base is None else base.scale)
+
+
+def _lay_out(
+    known: Sequence[Array], voxel: float, base: OccupancyMap | None
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int64], float]:
+    """States for boxes (8, 3) and `base`, which they hold; the number of the first voxel along each axis, and its side.
+
+    Raises ValueError where `base` would get too many voxels.
+    """
+    points = np.concatenate(known)
+    low, high = points.min(0), points.max(0)
+    if base is not None:
+        voxel = base.voxel
+        low, high = np.minimum(low, base.origin), np.maximum(high, base.origin + voxel * np.array(base.states.shape))
+    while np.prod((high - low) / voxel + 3) > MOST_VOXELS or (high - low).max() / voxel > LONGEST_SIDE:
+        if base is not None:
+            raise ValueError(f"the map would have more than {MOST_VOXELS} voxels of {voxel:g}; choose a larger voxel")
+        voxel *= 2
+    start = np.floor(low / voxel).astype(np.int64) - 1
+    states = np.zeros(tuple((np.ceil(high / voxel).astype(np.int64) + 1 - start).tolist()), np.uint8)
+    if base is not None:
+        x, y, z = (np.round(base.origin / voxel).astype(np.int64) - start).tolist()
+        a, b, c = base.states.shape
+        states[x : x + a, y : y + b, z : z + c] = base.states
+    return states, start, voxel
 
 
 def _find_known_corners(part: PlacedMap) -> Array:
@@ -86,7 +110,7 @@ def _find_known_corners(part: PlacedMap) -> Array:
     known = np.argwhere(part.occupancy.states != VoxelState.NOT_SEEN)
     low, high = (known.min(0), known.max(0) + 1) if len(known) else (np.zeros(3), np.array(part.occupancy.states.shape))
     box = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(-1, 3)
-    return part.to_all(part.occupancy.origin + box * part.occupancy.voxel)
+    return part.transform_to_all(part.occupancy.origin + box * part.occupancy.voxel)
 
 
 def _list_voxels(
@@ -108,7 +132,7 @@ def _is_free(
     free = np.ones(len(index), bool)
     for step in sorted(_STEPS.tolist(), key=lambda each: float(np.abs(each).sum())):  # the centre first: few are left
         points = (index[free] + start + 0.5 + (0.5 + MARGIN) * np.array(step)) * voxel
-        own = part.to_own(points @ T[:3, :3].T + T[:3, 3])
+        own = part.transform_to_own(points @ T[:3, :3].T + T[:3, 3])
         own_index = np.floor((own - part.occupancy.origin) / part.occupancy.voxel).astype(np.int64)
         inside = ((own_index >= 0) & (own_index < part.occupancy.states.shape)).all(1)
         found = np.zeros(len(points), bool)
@@ -117,8 +141,8 @@ def _is_free(
     return free
 
 
-def _spread_occupied(part: PlacedMap) -> Array:
+def _sample_occupied(part: PlacedMap) -> Array:
     """(M, 3) points in the world of all, 125 of each occupied voxel, evenly spread."""
     index = np.argwhere(part.occupancy.states == VoxelState.OCCUPIED)
     points = (index[:, None] + 0.5 + _DENSE).reshape(-1, 3)
-    return part.to_all(part.occupancy.origin + points * part.occupancy.voxel)
+    return part.transform_to_all(part.occupancy.origin + points * part.occupancy.voxel)

@@ -33,6 +33,6 @@ def encode_npz(occupancy: OccupancyMap, further: Mapping[str, npt.NDArray] | Non
         world=np.array(occupancy.scale.frame.sentence),
         up=np.array(occupancy.upright.source),
         height=np.array(occupancy.upright.height),
-        **(further or {}),
+        **(further or {}),  # pyright: ignore[reportArgumentType]
     )
     return file.getvalue()

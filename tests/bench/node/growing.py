@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,7 @@ from splatnode.recon.occupancy.message import MapHeader, decode_map
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
 from tests.bench.quality.occupancy import room
 from tests.bench.quality.solid import touched
-from tests.support.node import PATIENCE_S, Node, running
+from tests.support.node import PATIENCE_S, Node, processor_s, running
 
 ALONE_S = 5.0  # of recon, before the camera starts: it loads torch
 ASK_EVERY_S = 0.5
@@ -56,6 +57,7 @@ class Heard:
     maps: list[tuple[float, MapHeader, OccupancyMap]] = field(default_factory=list)
     cameras: dict[int, dict[int, npt.NDArray[np.float64]]] = field(default_factory=dict)  # by scene's message, keyframe
     final: bool = False
+    grew_s: float = 0.0  # of recon's processor time, until the last keyframe was shown
     answers: list[tuple[float, float, LocateAnswer | None]] = field(default_factory=list)  # index, seconds, answer
 
 
@@ -74,6 +76,7 @@ def main() -> None:
     result = {
         "command": shlex.join(["python", "-m", "tests.bench", "growing", *told]),
         "keyframes": args.keyframes, "per_second": args.per_second, "load_average": os.getloadavg()[0],
+        "processor_s_a_keyframe": heard.grew_s / args.keyframes or None,
         **_score_maps(heard, config), "located": _score_answers(heard, config),
     }  # fmt: skip
     args.out.write_text(json.dumps(result, indent=1) + "\n")
@@ -86,13 +89,14 @@ def _watch(folder: Path, config: building.Config, queries: list[npt.NDArray[np.u
     recon = {"occupancy": {"live": True, "provisional": True}, "localization": {"live": True}}
     heard, ended = Heard(), threading.Event()
     with running(Node(folder / "node", capture, recon)) as node:
-        node.start("recon")
+        pid = node.start("recon").pid
         time.sleep(ALONE_S)
+        alone_s = processor_s(pid)
         asking = threading.Thread(target=_ask, args=(node.network, queries, heard, ended))
         asking.start()
         node.start("capture")
         try:
-            _listen(node.network, heard, config.keyframes / config.fps + PATIENCE_S)
+            _listen(node.network, heard, config, lambda: processor_s(pid) - alone_s)
         finally:
             ended.set()
             asking.join()
@@ -101,13 +105,13 @@ def _watch(folder: Path, config: building.Config, queries: list[npt.NDArray[np.u
     return heard
 
 
-def _listen(network: Network, heard: Heard, patience_s: float) -> None:
+def _listen(network: Network, heard: Heard, config: building.Config, spent_s: Callable[[], float]) -> None:
     """Until the map of the final scene has come."""
     with contextlib.ExitStack() as stack:
         previews = stack.enter_context(Subscriber(CAPTURE_PREVIEW, network, PreviewHeader))
         maps = stack.enter_context(StateClient(RECON_MAP, network, MapHeader))
         scenes = stack.enter_context(StateClient(RECON_SCENE, network, SceneHeader))
-        deadline = time.monotonic() + patience_s
+        deadline = time.monotonic() + config.keyframes / config.fps + PATIENCE_S
         while time.monotonic() < deadline:
             if (preview := previews.latest(0)) is not None and preview.header.taken:
                 heard.taken_s.setdefault(building.frame_index(preview.header.name), time.monotonic())
@@ -117,6 +121,8 @@ def _listen(network: Network, heard: Heard, patience_s: float) -> None:
                     building.frame_index(each.name): each.T_world_camera for each in shown.cameras
                 }
                 heard.final = shown.final
+                if not heard.grew_s and len(shown.cameras) == config.keyframes:
+                    heard.grew_s = spent_s()
             if (message := maps.poll(0.01)) is not None and (made := decode_map(message)) is not None:
                 heard.maps.append((time.monotonic(), message.header, made))
                 if message.header.map.provisional is None:
@@ -134,7 +140,9 @@ def _ask(network: Network, queries: list[npt.NDArray[np.uint8]], heard: Heard, e
             number += 1
             began_s, index = time.monotonic(), min(newest, len(queries)) - 1
             try:
-                answer = client.ask(LocateRequest(number, follows=True), [make_jpeg_array(queries[index], 95)], TIMEOUT_S)
+                answer = client.ask(
+                    LocateRequest(number, follows=True), [make_jpeg_array(queries[index], 95)], TIMEOUT_S
+                )
             except NoAnswer:
                 answer = None
             heard.answers.append((index + 0.5, time.monotonic() - began_s, answer))

@@ -127,7 +127,7 @@ def test_viewers_get_the_growing_map_unless_the_camera_is_lost_or_the_scene_is_r
     assert _match_shown_scene(NOT_FINAL, shown, made) is made
     assert _match_shown_scene(LOST, shown, made) == LOST and _match_shown_scene(NOT_FINAL, shown, None) == NOT_FINAL
     refused = changed(growing().snapshot, verdict=Verdict(Code.AMBIGUOUS, "Two fit.", "Take more."))
-    assert "AMBIGUOUS" in _match_shown_scene(NOT_FINAL, PublishedSnapshot(refused, "a"), made)
+    assert "AMBIGUOUS" in str(_match_shown_scene(NOT_FINAL, PublishedSnapshot(refused, "a"), made))
 
 
 def test_a_provisional_map_tells_its_bounds_and_a_final_one_is_the_message_that_it_was():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from dataclasses import replace as changed
 
 import numpy as np
 import pytest
@@ -13,14 +14,16 @@ from msgspec.structs import replace
 from splatnode.capture.process.logs import Problems
 from splatnode.recon.daemon import whole_map
 from splatnode.recon.daemon.free_space import OccupancyConfig
-from splatnode.recon.daemon.whole_map import FOLDER, WholeMapper
-from splatnode.recon.occupancy.grid import OccupancyMap, Upright, VoxelState
+from splatnode.recon.daemon.growing_map import GrowingScene, ProvisionalMap
+from splatnode.recon.daemon.whole_map import FOLDER, WholeMapper, find_shared_placement
+from splatnode.recon.occupancy.command import read_to_map
+from splatnode.recon.occupancy.grid import OccupancyMap, Upright, VoxelState, occupancy_map
 from splatnode.recon.result.export.limits import SceneFileError
-from splatnode.recon.result.submap_index import FILE
+from splatnode.recon.result.submap_index import FILE, read_map_set
 from splatnode.recon.result.verdict import Code
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, finished, peer, running  # noqa: F401
 from tests.support.synthetic import photographs
-from tests.support.walk import write_walk
+from tests.support.walk import SECOND, write_walk
 
 AHEAD = np.array([[0.6, 0.0, 0.5], [2.4, 0.0, 0.6]])  # between the wall and the cameras: of the first scene, the second
 ON_WALL = AHEAD * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
@@ -116,6 +119,56 @@ def test_a_damaged_index_is_a_problem_and_is_looked_at_again(tmp_path, monkeypat
         stopping.set()
         thread.join()
     assert "could not be written" in str(problems) and (out / FOLDER / "scene-0001.npz").exists()
+
+
+def test_a_scene_that_grows_is_added_marked_and_taken_out_with_its_world(tmp_path, monkeypatch):
+    """It goes on from the first scene, which is final, and is the second one, which is not yet."""
+    out = write_walk(tmp_path / "out")
+    monkeypatch.setattr(whole_map, "find_shared_placement", lambda *_: SECOND)
+    monkeypatch.setattr(whole_map, "GROWING_EVERY_S", 0.0)
+    snapshot = read_to_map(out / "scene-0002")
+    scene = GrowingScene(snapshot, "scene-0002", 7, 1, {}, 0.0)
+    made = ProvisionalMap(scene, occupancy_map(snapshot, 0.05))
+
+    def leave_second(index) -> None:
+        index["places"][1].update(provisional=True)
+        index["poses"] = [each for each in index["poses"] if each["scene"] == "scene-0001"]
+
+    change_index(out, leave_second)
+    kept = WholeMapper(out, 0.05, Problems(), threading.Event(), lambda: made)
+    assert not kept.update_growing(made)  # there is no final scene yet
+    kept.update()
+    path = out / FOLDER / "scene-0001.npz"
+    assert read(path)[0].at(AHEAD).tolist() == [VoxelState.FREE, VoxelState.NOT_SEEN]
+    assert kept.update_growing(made) and not kept.update_growing(made)
+    found, scenes = read(path)
+    assert found.at(AHEAD).tolist() == [VoxelState.FREE] * 2 and scenes == ["scene-0001"]
+    assert found.at(ON_WALL).tolist() == [VoxelState.OCCUPIED] * 2
+    with np.load(path) as file:
+        assert str(file["growing"]) == "scene-0002"
+        told = replace_states(found, file["provisional"])
+    assert told.at(AHEAD).tolist() == [0, 1]
+    kept.update_growing(None)  # its world is withdrawn
+    with np.load(path) as file:
+        assert str(file["growing"]) == "" and "provisional" not in file
+    assert read(path)[0].at(AHEAD).tolist() == [VoxelState.FREE, VoxelState.NOT_SEEN]
+
+
+def replace_states(made: OccupancyMap, states: np.ndarray) -> OccupancyMap:
+    return OccupancyMap(states.astype(np.uint8), made.voxel, made.origin, made.upright)
+
+
+def test_a_scene_that_shares_too_little_or_lies_otherwise_is_added_to_no_map(tmp_path):
+    out = write_walk(tmp_path / "out")
+    found, cameras = read_map_set(out), read_to_map(out / "scene-0001").cameras
+    (joined,) = found.maps
+    placement = find_shared_placement(cameras, found, joined)
+    assert placement is not None and placement.scale == pytest.approx(1.0)
+    assert find_shared_placement(cameras[:2], found, joined) is None
+    T = cameras[0].T_world_camera.copy()
+    T[:3, 3] += 0.5
+    bent = [changed(cameras[0], T_world_camera=T), *cameras[1:]]
+    assert find_shared_placement(bent, found, joined) is None
 
 
 def test_a_node_keeps_the_file_of_its_map(config, peer):  # noqa: F811

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from splatnode.recon.daemon import worlds
+from splatnode.recon.daemon import output, worlds
+from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.submap_index import SubmapState
 from splatnode.recon.daemon.worlds import MOST_WORLDS, REBUILT, WorldRevisions, explain_moved_cameras
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, make_ball
@@ -82,3 +85,23 @@ def test_scenes_that_the_camera_left_are_withdrawn_when_they_are_made_afresh_and
     for number in range(MOST_WORLDS):
         revisions.update(f"scene-{number}", growing(camera(0)))
     assert len(revisions.records) == worlds.MOST_WORLDS and "left" not in {each.scene_id for each in revisions.records}
+
+
+@pytest.mark.parametrize(("scene_id", "withdrawn"), [("scene-0001", True), ("scene-0002", False)])
+def test_writing_the_result_of_a_scene_that_the_camera_left_withdraws_its_poses(
+    scene_id, withdrawn, tmp_path, monkeypatch
+):
+    """The present scene, scene-0002, is told of when it is shown."""
+    revisions = WorldRevisions()
+    told = {name: revisions.update(name, growing(camera(0), camera(1))) for name in ("scene-0001", "scene-0002")}
+    here = SimpleNamespace(scene_id="scene-0002", identity="0" * 32)
+    written = output.Output(DaemonConfig(out=tmp_path), here, lambda shown: None, lambda problem: None, revisions)
+    monkeypatch.setattr(output, "write_result_folder", lambda *rest, **more: None)
+    monkeypatch.setattr(output, "_make_submap_record", lambda *rest: None)
+    for name in ("update", "link_scene"):
+        monkeypatch.setattr(written.places, name, lambda *rest: None)
+    monkeypatch.setattr(written._metres, "scale_result", lambda snapshot, work: snapshot)
+    final = replace(growing(camera(0), camera(1)), final=True)
+    assert written.export(final, None, SimpleNamespace(scene_id=scene_id), SubmapState.FINISHED, ())
+    now = {record.scene_id: record.revision for record in revisions.records}
+    assert (now[scene_id] > told[scene_id].revision) == withdrawn

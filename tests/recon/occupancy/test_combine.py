@@ -65,7 +65,7 @@ def test_a_surface_stays_a_surface_wherever_the_voxels_of_all_lie():
         placement = Placement(float(rng.uniform(0.5, 2)), q * np.sign(np.linalg.det(q)), rng.normal(size=3))
         part = PlacedMap(small_map(wall, 0.25, (0, 0, 0)), placement)
         made = combine_maps([PlacedMap(small_map(np.full((2, 2, 2), 1), part.voxel, (0, 0, 0)), IDENTITY), part])
-        points = part.to_all(np.stack([*rng.uniform(0.0, 2.0, (2, 500)), rng.uniform(1.0, 1.25, 500)], 1))
+        points = part.transform_to_all(np.stack([*rng.uniform(0.0, 2.0, (2, 500)), rng.uniform(1.0, 1.25, 500)], 1))
         found = made.at(points)
         assert (found == VoxelState.OCCUPIED).mean() > 0.98 and not (found == VoxelState.FREE).any()
 
@@ -78,6 +78,22 @@ def test_far_scenes_get_larger_voxels_rather_than_too_many(monkeypatch):
     assert made.voxel > 0.25 and made.states.size <= 10_000
     with pytest.raises(ValueError, match="at least one, got none"):
         combine_maps([])
+
+
+def test_a_part_is_added_to_what_was_combined_before_and_opens_no_wall():
+    wall = np.full((6, 6, 6), VoxelState.FREE, np.uint8)
+    wall[:, :, 5] = VoxelState.OCCUPIED
+    base = combine_maps([PlacedMap(small_map(wall, 0.25, (0, 0, 0)), IDENTITY)])
+    beside = Placement(1.0, np.eye(3), np.array([0.5, 0.0, 0.75]))  # which calls the wall free
+    part = PlacedMap(small_map(np.full((6, 6, 6), VoxelState.FREE), 0.25, (0, 0, 0)), beside)
+    made = combine_maps([part], base=base)
+    T = base.T_world_map
+    known = (base.origin + (np.argwhere(base.states) + 0.5) * base.voxel) @ T[:3, :3].T + T[:3, 3]
+    assert np.array_equal(made.at(known), base.at(known)) and np.array_equal(made.T_world_map, T)
+    assert made.at([[1.1, 0.6, 1.9]]).tolist() == [VoxelState.FREE] and base.at([[1.1, 0.6, 1.9]]).tolist() == [0]
+    far = PlacedMap(part.occupancy, Placement(1.0, np.eye(3), np.array([1e4, 1e4, 0.0])))
+    with pytest.raises(ValueError, match="choose a larger voxel"):
+        combine_maps([far], base=base)
 
 
 def test_a_part_that_knows_nothing_adds_nothing():
