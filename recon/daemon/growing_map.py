@@ -92,6 +92,12 @@ class _Stopping(Exception):
     """The daemon stops."""
 
 
+def drop_normals(pointmaps: Mapping[str, Pointmap]) -> dict[str, Pointmap]:
+    """The point maps with what a map of free space is made of alone: the rest is most of their memory."""
+    nothing = np.zeros((0, 0, 3), np.float32)
+    return {name: replace(each, normal=nothing, unchecked=None) for name, each in pointmaps.items()}
+
+
 def map_growing_scene(scene: GrowingScene, voxel: float | None, pause: Callable[[], None]) -> ProvisionalMap:
     """Maps what the photographs so far show at depths that two of them confirm. `pause` may raise to abandon it."""
     try:

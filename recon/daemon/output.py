@@ -22,7 +22,7 @@ from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.free_space import LOST, NOT_FINAL, OccupancyResult
-from splatnode.recon.daemon.growing_map import GrowingScene, ProvisionalMap
+from splatnode.recon.daemon.growing_map import GrowingScene, ProvisionalMap, drop_normals
 from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapRecord, SubmapState, make_submap_record
 from splatnode.recon.daemon.worlds import WorldRevisions
 from splatnode.recon.estimation import Reconstruction
@@ -112,7 +112,7 @@ class Output:
         measured = self._metres.scale_snapshot(snapshot, work)
         estimate = work.find_reconstruction() if self._config.localization.live else None
         mapped = self._config.occupancy.live and self._config.occupancy.provisional and not snapshot.final
-        pointmaps = dict(work.state.pointmaps) if mapped else None
+        pointmaps = drop_normals(work.state.pointmaps) if mapped else None
         self._publish(PublishedSnapshot(measured, self._store.scene_id, estimate, pointmaps, shown_s=time.monotonic()))
         return measured
 

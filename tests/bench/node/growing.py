@@ -6,6 +6,8 @@ second where images were taken that are no keyframes, half-way between two of th
 map_after_s   from the moment when capture says that it took a keyframe to the first map that has its view
 free_solid    of the voxels that a map calls free, the share into which something solid reaches (as in `occupancy`);
               of each provisional map, and of the final one
+alone_s       of the same steps one after the other, in one process: the processor seconds of their own thread, from the
+              keyframe to its map; what a machine without other work would show, where a second core is free
 located       of the questions while the scene grew: the share that got a place, the seconds of an answer, and the
               share of places within their bounds: of the distance, after the best similarity of the scene's cameras
 """
@@ -30,11 +32,15 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.config import PreviewHeader
+from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import make_jpeg_array
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_LOCATE, RECON_MAP, RECON_SCENE, Network
 from splatnode.capture.messaging.pubsub import NoAnswer, QueryClient, StateClient, Subscriber
 from splatnode.extras.cameras import building
+from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.daemon.growing_map import GrowingScene, map_growing_scene
 from splatnode.recon.geometry import Similarity, align_cameras
+from splatnode.recon.incremental import IncrementalReconstruction, ignore_cancel
 from splatnode.recon.locating.message import LocateAnswer, LocateRequest, parse_outcome
 from splatnode.recon.locating.outcome import Located
 from splatnode.recon.occupancy.grid import OccupancyMap, VoxelState
@@ -77,10 +83,26 @@ def main() -> None:
         "command": shlex.join(["python", "-m", "tests.bench", "growing", *told]),
         "keyframes": args.keyframes, "per_second": args.per_second, "load_average": os.getloadavg()[0],
         "processor_s_a_keyframe": heard.grew_s / args.keyframes or None,
-        **_score_maps(heard, config), "located": _score_answers(heard, config),
+        "alone_s": _percentiles(_time_steps(config)), **_score_maps(heard, config),
+        "located": _score_answers(heard, config),
     }  # fmt: skip
     args.out.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps({key: value for key, value in result.items() if key != "maps"}))
+
+
+def _time_steps(config: building.Config) -> list[float]:
+    """Seconds of the thread, from each keyframe to its map, once there is one."""
+    work, seconds = IncrementalReconstruction(ReconstructionConfig()), []
+    for index in range(config.keyframes):
+        name, image = building.frame_name(index), building.render_image(config, index)
+        began_s = time.thread_time()
+        work.add_frame(Frame(index, name, index, image, None))
+        work.update()
+        scene = GrowingScene(work.snapshot(), "alone", index, 0, work.state.pointmaps, 0.0)
+        made = map_growing_scene(scene, None, ignore_cancel)
+        if made.occupancy is not None:
+            seconds.append(time.thread_time() - began_s)
+    return seconds
 
 
 def _watch(folder: Path, config: building.Config, queries: list[npt.NDArray[np.uint8]]) -> Heard:

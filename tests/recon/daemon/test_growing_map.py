@@ -22,6 +22,7 @@ from splatnode.recon.daemon.growing_map import (
     GrowingScene,
     ProvisionalMap,
     add_growing_depths,
+    drop_normals,
     map_growing_scene,
 )
 from splatnode.recon.daemon.output import PublishedSnapshot, _match_shown_scene
@@ -80,6 +81,8 @@ def test_a_growing_room_is_mapped_as_a_final_one_and_nothing_solid_is_free():
     made = map_growing_scene(growing(), 0.05, no_pause).occupancy
     final = occupancy_map(room_snapshot(), 0.05)
     assert made is not None and made.voxel == final.voxel
+    less = map_growing_scene(growing(pointmaps=drop_normals(room_pointmaps())), 0.05, no_pause).occupancy
+    assert less is not None and np.array_equal(less.states, made.states)
     assert abs(made.shares["free"] - final.shares["free"]) < 0.05
     index = np.argwhere(made.states == VoxelState.FREE)
     centres = (made.origin + (index + 0.5) * made.voxel) @ made.T_world_map[:3, :3].T + made.T_world_map[:3, 3]
