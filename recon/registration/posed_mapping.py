@@ -43,6 +43,8 @@ _MORE, _MORE_POINTS = 1.5, 15  # factor and number by which more observations mu
 _LEAST_OBSERVATIONS = 15  # of points that two others see, of a camera that images alone place
 # A pair with so many matches tells whether a pose is false: most agree on another one, and few on what is given
 _TELLING_MATCHES, _CONSISTENT, _AGREEING = 40, 0.8, 0.3
+# Far from what is given, repeated structure (the other wing of a castle) is likelier than such an error of a pose
+_FAR_DEG, _TELLING_FAR = 15.0, 150
 _ROUNDS = 3  # of tests after a map was finished
 
 
@@ -406,9 +408,20 @@ def _pairs_say(
         if share > _AGREEING:
             found[i, j] = int(share > _DOUBTED_RATIO)
             continue
-        num_fit = _relative(problem, partial, (i, j), config)[2]
-        found[i, j] = -int(num_fit >= _CONSISTENT * len(pair.matches))
+        rotation, _, num_fit = _relative(problem, partial, (i, j), config)
+        given = partial.estimate.rotations[j] @ partial.estimate.rotations[i].T
+        apart_deg = math.degrees(Rotation.from_matrix(rotation @ given.T).magnitude())
+        found[i, j] = -int(contradicts_poses(len(pair.matches), num_fit, apart_deg))
     return found
+
+
+def contradicts_poses(num_matches: int, num_fit: int, apart_deg: float) -> bool:
+    """Whether a pair whose matches hardly fit given poses tells that one of these is false.
+
+    `num_fit` of its matches fit one other relative pose, whose rotation is `apart_deg` degrees away.
+    """
+    enough = num_fit >= (_TELLING_FAR if apart_deg > _FAR_DEG else 0)
+    return enough and num_fit >= _CONSISTENT * num_matches
 
 
 def _relative(

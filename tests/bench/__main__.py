@@ -61,6 +61,7 @@ BENCHMARKS = {
         "lens_assumptions",
         "registrations",
         "known_poses",
+        "odometry_sets",
         "several_cameras",
         "rigs",
         "rgbd",

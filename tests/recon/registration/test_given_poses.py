@@ -145,3 +145,12 @@ def test_poses_whose_errors_depend_on_each_other_are_weighed_as_their_covariance
     turned = Rotation.from_rotvec(best.x[:24].reshape(4, 6)[:, :3]).as_matrix() @ begun.rotations
     np.testing.assert_allclose(found.rotations, turned, atol=2e-6)
     np.testing.assert_allclose(found.translations, begun.translations + best.x[:24].reshape(4, 6)[:, 3:], atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("num_matches", "num_fit", "apart_deg", "contradicts"),
+    [(62, 54, 3.0, True), (62, 54, 100.0, False), (300, 270, 100.0, True), (62, 30, 3.0, False)],
+    ids=["a false pose", "the other wing of a castle", "poses that changed places", "matches that fit nothing"],
+)
+def test_few_matches_far_from_given_poses_are_repeated_structure(num_matches, num_fit, apart_deg, contradicts) -> None:
+    assert posed_mapping.contradicts_poses(num_matches, num_fit, apart_deg) is contradicts

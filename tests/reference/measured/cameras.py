@@ -173,18 +173,44 @@ def known_poses() -> str:
     found, rows = raw("known_poses")["rows"], []
     for kind, words in (("clean", "none"), ("turn", "turned by 3°"), ("shift", "shifted by 3 % of the distance")):
         group = [row for row in found if row["kind"] == kind]
-        named = sum(row["named_right"] is True for row in group)
+        matched = [row for row in group if row["matches"]]
+        named = f"{sum(row['named_right'] for row in matched)} of {len(matched)}"
         strangers = sum(row["named"] - (row["named_right"] is True) for row in group)
         beyond = sum(max(row["centre_over_bound"], row["rotation_over_bound"]) > 1 for row in group)
         most = max(max(row["centre_over_bound"], row["rotation_over_bound"]) for row in group)
-        rows.append((words, len(group), "–" if kind == "clean" else named, strangers, beyond, f"{most:.1f}"))
+        told = ("–", "–") if kind == "clean" else (named, len(group) - len(matched))
+        rows.append((words, len(group), *told, strangers, beyond, f"{most:.1f}"))
     header = (
         "false pose",
         "runs",
-        "it is named",
+        "it is named, where it has matches",
+        "it has no match",
         "others named",
         "any camera beyond a bound",
         "largest error over bound",
+    )
+    return table(header, rows)
+
+
+def odometry_sets() -> str:
+    """Sets that images alone refuse, with odometry that drifts."""
+    refused, rows = [row for row in raw("odometry_sets")["rows"] if row["verdict"]], []
+    for words, is_apart in (("`NO_OVERLAP`", True), ("another", False)):
+        group = [row for row in refused if (row["alone"] == "NO_OVERLAP") == is_apart]
+        answered = [row for row in group if row["placed"]]
+        within = sum(max(row["rotation_over_bound"], row["centre_over_bound"]) <= 1 for row in answered)
+        most = max(max(row["rotation_over_bound"], row["centre_over_bound"]) for row in answered)
+        metres = sum(row["scale_sigmas"] <= 1.96 for row in answered)
+        counts = len(group), len(answered), sum(row["wrong"] for row in answered), within, f"{most:.1f}", metres
+        rows.append((words, *counts))
+    header = (
+        "verdict without odometry",
+        "sets",
+        "answered with it",
+        "wrong",
+        "all cameras within their bounds",
+        "largest error over bound",
+        "metres within their interval",
     )
     return table(header, rows)
 
@@ -426,6 +452,7 @@ BLOCKS = (
     rigs,
     rgbd,
     known_poses,
+    odometry_sets,
     hard_sets,
     told_lenses,
     unknown_lenses,
