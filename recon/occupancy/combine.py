@@ -77,7 +77,9 @@ def combine_maps(
         inside = ((index >= 0) & (index < states.shape)).all(1)
         states[tuple(index[inside].T)] = VoxelState.OCCUPIED
     frame = replace(first.occupancy.upright, T_world_map=T) if base is None else base.upright
-    return OccupancyMap(states, voxel, start * voxel, frame, first.occupancy.scale if base is None else base.scale)
+    return OccupancyMap(
+        states, voxel, start.astype(np.float64) * voxel, frame, first.occupancy.scale if base is None else base.scale
+    )
 
 
 def _lay_out(

@@ -218,7 +218,8 @@ def _growing() -> Iterable[Row]:
         f"{alone['median']:.1f} s of a thread from a keyframe to its free space, 95th percentile {alone['p95']:.1f} s "
         f"(in this run {after['median']:.0f} s, the load on two cores being {run['load_average']:.0f}); at most "
         f"{percent(solid['provisional'], 2)} of the free space solid while the scene grew, "
-        f"{percent(solid['final'], 2)} at the end (the bar is .1 %); all {located['placed']} images located, within their bounds",
+        f"{percent(solid['final'], 2)} at the end (the bar is .1 %); all {located['placed']} images located, within "
+        "their bounds",
         "`growing.json`",
     )
 
