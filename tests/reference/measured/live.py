@@ -216,10 +216,10 @@ def _growing() -> Iterable[Row]:
     yield (
         f"{run['keyframes']} keyframes of one room, one every {1 / run['per_second']:.0f} s, and two images a second",
         f"{alone['median']:.1f} s of a thread from a keyframe to its free space, 95th percentile {alone['p95']:.1f} s "
-        f"(in this run {after['median']:.0f} s, the load on two cores being {run['load_average']:.0f}); at most "
+        f"(in this run {after['median']:.1f} and {after['p95']:.1f} s, with other work on both cores); at most "
         f"{percent(solid['provisional'], 2)} of the free space solid while the scene grew, "
-        f"{percent(solid['final'], 2)} at the end (the bar is .1 %); all {located['placed']} images located, within "
-        "their bounds",
+        f"{percent(solid['final'], 2)} at the end (the bar is .1 %); all {located['placed']} images located within "
+        f"their bounds, in {located['seconds']['median']:.1f} s, 95th percentile {located['seconds']['p95']:.1f} s",
         "`growing.json`",
     )
 
