@@ -59,7 +59,7 @@ from splatnode.capture.process.system import (
     resident_mb,
     wrap_late_errors,
 )
-from splatnode.capture.process.terminal import Problems, Unfailing, event, is_logged
+from splatnode.capture.process.terminal import Problems, ProgressStep, Unfailing, event, is_logged
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 
@@ -170,6 +170,10 @@ def _format_value(value: Any) -> str:
         return f"{value['name']}: {value['reason']}"
     if isinstance(value, dict) and {"scene_id", "keyframes"} <= value.keys():
         return _format_submap(value)
+    if isinstance(value, dict) and {"scene_id", "revision"} <= value.keys():
+        return _format_world(value)
+    if isinstance(value, dict) and value.keys() == {"doing", "done", "of", "what", "left_s"}:
+        return _format_work(value)
     return f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
@@ -184,6 +188,21 @@ def _format_submap(value: Mapping[str, Any]) -> str:
         f"{value.get('rss_mb', 0):.0f} MB",
     ]
     return f"{value['scene_id']}: {', '.join(filter(None, parts))}"
+
+
+def _format_world(value: Mapping[str, Any]) -> str:
+    """`scene-0001: revision 3, final; earlier poses are withdrawn: the scene was made afresh`."""
+    kind, why = "provisional" if value.get("provisional") else "final", value.get("why")
+    withdrawn = f"; earlier poses are withdrawn: {why}" if why else ""
+    return f"{value['scene_id']}: revision {value['revision']}, {kind}{withdrawn}"
+
+
+def _format_work(value: Mapping[str, Any]) -> str:
+    """`refining the scene: 210 of 500 steps, about 6 s left`."""
+    done, of, left_s = value["done"], value["of"], value["left_s"]
+    if not (isinstance(done, int) and isinstance(of, int) and isinstance(left_s, (int, float, type(None)))):
+        return str(dict(value))
+    return ProgressStep(str(value["doing"]), done, of, str(value["what"]), left_s).sentence
 
 
 # Field of a heartbeat -> what it is called, and how its value is written; other fields go by their names.
@@ -211,6 +230,8 @@ _WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "delay": ("because", _format_value),
     "unfinished": ("places to finish", _format_value),
     "newest_places": ("places", _format_value),
+    "worlds": ("poses in", _format_value),
+    "work": ("now", _format_value),
     "refused": ("refused messages", _format_value),
     "duplicates": ("keyframes come again", _format_value),
 }

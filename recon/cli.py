@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from splatnode.capture.frame import DroppedFrame, Frame
@@ -46,6 +47,7 @@ from splatnode.capture.process.terminal import (
 )
 from splatnode.capture.rig import Rig, read_rig
 from splatnode.recon.config import ReconstructionConfig, apply_changes, preset
+from splatnode.recon.daemon import WorkProgress
 from splatnode.recon.daemon import config as daemon
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import ArrivedKeyframe, Event, Inbox, RemovedFrame
@@ -315,6 +317,7 @@ class MapProgress:
     unfinished: int  # places whose scenes are still to be made
     maps: int
     loops: int
+    work: WorkProgress | None = None  # that is under way
 
     def __str__(self) -> str:
         work = f" ({self.unfinished} still to be made)" if self.unfinished else ""
@@ -354,7 +357,7 @@ def make_scenes(
         worker = Worker(node, store, inbox, lambda _: None, stopping)
 
         def tell(taken: int) -> None:
-            show(MapProgress(taken, worker.map_counts[0], worker.num_unfinished, *worker.map_counts[1:]))
+            show(MapProgress(taken, worker.map_counts[0], worker.num_unfinished, *worker.map_counts[1:], worker.work))
 
         with _run_worker(worker, stopping) as check:
             for together in _receive_sets(frames, identity, node.frame_set_tolerance_s):
@@ -501,10 +504,12 @@ class _ProgressPrinter:
             return
         step = ProgressStep("making scenes", now.taken, self._keyframes, "keyframe")
         line = f"{step}; {now}"
-        progress(f"{line} ({format_times(step, time.monotonic() - self._began_s)})")
+        work = now.work if now.taken == self._keyframes else None  # before, more places may come
+        rest = "" if work is None else f"; {ProgressStep(*msgspec.structs.astuple(work)).sentence}"
+        progress(f"{line}{rest} ({format_times(step, time.monotonic() - self._began_s)})")
         if not is_interactive() and (now.judged, now.unfinished, now.maps) != self._last:
             self._last = now.judged, now.unfinished, now.maps
-            say(line)
+            say(f"{line}{rest}")
 
 
 def _write_frames(source: ReplayRecording, out: Path) -> Iterator[Frame | DroppedFrame]:

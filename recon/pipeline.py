@@ -18,7 +18,14 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import is_resampled
-from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress, notify, report_items
+from splatnode.capture.process.terminal import (
+    ProgressStep,
+    Tell,
+    add_remaining_time,
+    ignore_progress,
+    notify,
+    report_items,
+)
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.rig import form_mounted_rig
 from splatnode.recon import threads
@@ -190,6 +197,7 @@ def reconstruct_stream(frames: Iterable[Frame | DroppedFrame], config: Reconstru
 
 def rebuild_from_scratch(work: IncrementalReconstruction, tell: Tell = ignore_progress) -> Iterator[Snapshot]:
     """The snapshots of `reconstruct`, from its refinement on, for all frames that `work` has taken."""
+    tell = add_remaining_time(tell)
     estimate = work.estimate_with_depth(_make_progress_pause("finding and checking the cameras", tell))
     begun = create_initial_scene(estimate, work.config)
     yield from model_scene(
@@ -264,6 +272,7 @@ def reconstruct_source(
     Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used, and UnknownFrame
     where nothing can tell the frame of reference that is asked for.
     """
+    tell = add_remaining_time(tell)
     if doubt := describe_doubtful_units(source.frames):
         notify(log, doubt)
     with threads.apply_thread_limit(most_threads):

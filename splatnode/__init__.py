@@ -8,7 +8,7 @@ from importlib import import_module
 TYPE_CHECKING = False  # to a type checker it is true; `typing` would take time
 
 if TYPE_CHECKING:
-    from splatnode.api.node import Node, NodeMap, NodeUpdate, connect
+    from splatnode.api.node import LiveLocation, Node, NodeMap, NodeUpdate, connect
     from splatnode.api.publisher import Published, Publisher, RefusedImage
     from splatnode.api.reconstruct import Marker, Session, Stereo, Update, reconstruct
     from splatnode.api.result import Camera, Result, View, load
@@ -25,6 +25,7 @@ __all__ = [
     "DepthNoise",
     "InputWarning",
     "Intrinsics",
+    "LiveLocation",
     "Located",
     "Marker",
     "Node",
@@ -53,6 +54,7 @@ _MODULES = {
     "DepthNoise": "splatnode.capture.depth_image",
     "InputWarning": "splatnode.capture.process.terminal",
     "Intrinsics": "splatnode.capture.frame",
+    "LiveLocation": "splatnode.api.node",
     "Located": "splatnode.recon.locating",
     "Marker": "splatnode.api.reconstruct",
     "Node": "splatnode.api.node",

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from splatnode.capture.messaging.network import RECON_DEPTH, RECON_SCENE, RECON_STATUS, Network
 from splatnode.capture.messaging.pubsub import StateClient, Subscriber
 from splatnode.capture.process.terminal import Problems, is_logged
-from splatnode.recon.daemon import ReconStatus
+from splatnode.recon.daemon import ReconStatus, WorldRecord
 from splatnode.recon.result.export import SceneFileError, sanitize_gaussians
 from splatnode.recon.result.export.limits import select_gaussians
 from splatnode.recon.result.levels_of_detail import concatenate_gaussians, find_far_shell, make_detail_levels
@@ -100,6 +100,7 @@ class LiveSource:
         self._refusals = Problems()
         self._newest: Moment | None = None
         self._tracked: CameraEstimate | None = None
+        self.worlds: tuple[str, dict[str, WorldRecord]] = "", {}  # session, and the newest by scene
         self.scene: tuple[str, int] | None = None  # session and sequence of the newest message with a scene
         self._lock = threading.Condition()
         self._error: BaseException | None = None
@@ -145,6 +146,9 @@ class LiveSource:
             while not self.closed.is_set():
                 message = self._client.poll(_POLL_S)
                 heartbeat = self._heartbeats.latest(0)
+                if heartbeat is not None:
+                    told = {world.scene_id: world for world in heartbeat.header.worlds}
+                    self.worlds = heartbeat.header.session, told
                 if heartbeat is not None and heartbeat.header.tracked != last:
                     last = heartbeat.header.tracked
                     self._tracked = last and parse_camera(last)

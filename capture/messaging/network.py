@@ -339,6 +339,7 @@ RECON_CONTROL = Service("recon.control", Pattern.COMMANDS, 6)
 CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
 RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured
 RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests
+RECON_LOCATE = Service("recon.locate", Pattern.COMMANDS, 12)  # requests have an image; where it is configured
 
 
 # Of a capture beside others: a part of the names of its sockets, its spool and its frames.
@@ -444,6 +445,13 @@ class Endpoint:
 
         At most `most` are read; a malformed one counts as refused, `what` is its name in the log.
         """
+        for identity, message in self._receive_messages(router, schema, what, most, timeout_s, REQUEST_LIMITS):
+            yield identity, message.header
+
+    def _receive_messages(
+        self, router: zmq.Socket, schema: Any, what: str, most: int, timeout_s: float, limits: messages.Limits
+    ) -> Iterator[tuple[bytes, messages.Message[Any]]]:
+        """As `_receive_requests`, with the arrays of the requests."""
         if not router.poll(max(0, math.ceil(timeout_s * 1000))):
             return
         for _ in range(most):
@@ -452,11 +460,11 @@ class Endpoint:
             except zmq.Again:
                 return
             try:
-                header = messages.decode(parts, schema, REQUEST_LIMITS).header
+                message = messages.decode(parts, schema, limits)
             except messages.WireError as error:
                 self._refuse(what, error)
                 continue
-            yield identity, header
+            yield identity, message
 
     def _lock(self, service: Service) -> None:
         try:
@@ -464,10 +472,10 @@ class Endpoint:
         except LockHeld as error:
             raise AlreadyRunning(service, error.pid) from error
 
-    def _bind(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
-        """Raises AlreadyRunning, NetworkError, OSError."""
+    def _bind(self, service: Service, kind: int, *, queue: int, largest: int = REQUEST_BYTES) -> zmq.Socket:
+        """Raises AlreadyRunning, NetworkError, OSError. `largest`: bytes of a part of a request."""
         with self._close_on_error():
-            socket = self._socket(kind, queue, largest=REQUEST_BYTES)
+            socket = self._socket(kind, queue, largest)
             if self._keys is not None:
                 socket.curve_server, socket.curve_secretkey = True, self._keys.secret
                 socket.zap_domain = _ZAP_DOMAIN.encode()

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import zmq
 
 from splatnode.capture.messaging.messages import (
+    Limits,
     Message,
     Part,
     Sequential,
@@ -147,6 +148,54 @@ def ask(service: Service, network: Network, request: msgspec.Struct, schema: Any
         if not asker.dealer.poll(max(0, math.ceil(1000 * (deadline - time.monotonic())))):
             raise silence
         return decode(asker.dealer.recv_multipart(copy=False), schema, REQUEST_LIMITS).header
+
+
+# Requests that bring arrays, such as an image, and take a while: a client has one under way, the newest.
+
+ASKED_AT_ONCE = 2  # requests of a client that wait
+
+
+class QueryServer(Endpoint):
+    """Offers `service`, whose requests are a `schema` with arrays. Raises AlreadyRunning where another process does."""
+
+    def __init__(self, service: Service, network: Network, schema: Any, limits: Limits) -> None:
+        super().__init__(network, offers=service)
+        self.schema, self._limits = schema, limits
+        self._router = self._bind(service, zmq.ROUTER, queue=ASKED_AT_ONCE, largest=limits.total_bytes)
+
+    def receive(self, timeout_s: float) -> list[tuple[bytes, Message[Any]]]:
+        """Who asks, and the newest request of each, waiting at most `timeout_s` for the first."""
+        found = self._receive_messages(self._router, self.schema, "a query", QUEUE, timeout_s, self._limits)
+        return list(dict(found).items())
+
+    def reply(self, identity: bytes, answer: msgspec.Struct) -> None:
+        """Never waits: who has gone gets no answer."""
+        with contextlib.suppress(zmq.ZMQError):
+            self._router.send_multipart([identity, *encode(answer)], zmq.NOBLOCK)
+
+
+class QueryClient(Endpoint):
+    """Asks a QueryServer, whether it is there already or comes later. Requests and answers have a `number`."""
+
+    def __init__(self, service: Service, network: Network, schema: Any) -> None:
+        super().__init__(network)
+        self._name, self.schema = service.name, schema
+        self._dealer = self._connect(service, zmq.DEALER, queue=ASKED_AT_ONCE)
+
+    def ask(self, request: Any, arrays: Sequence[npt.NDArray], timeout_s: float) -> Any:
+        """The answer, a `schema`, with the request's number. Raises NoAnswer; NotAllowed; WireError."""
+        until_s = time.monotonic() + timeout_s
+        sent = False
+        while (left_s := until_s - time.monotonic()) > 0:
+            self._check_links()
+            if not sent and self._dealer.poll(min(CONNECT_POLL_MS, math.ceil(1000 * left_s)), zmq.POLLOUT):
+                self._dealer.send_multipart(encode(request, arrays), zmq.NOBLOCK)
+                sent = True
+            elif sent and self._dealer.poll(min(250, math.ceil(1000 * left_s))):
+                answer = decode(self._dealer.recv_multipart(copy=False), self.schema, REQUEST_LIMITS).header
+                if answer.number == request.number:  # else of one that nobody waits for any more
+                    return answer
+        raise NoAnswer(f"{self._name} did not answer within {timeout_s:g} s; is it on? See: splatnode status")
 
 
 # A state of which the newest counts, such as the scene for viewers: published, and sent to whoever asks.

@@ -13,9 +13,10 @@ import sys
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from splatnode.capture.process.text import LONGEST_TEXT, escape_text, sanitize_lines, sanitize_text
@@ -178,6 +179,7 @@ class _SanitizedStream:
 _SHOW_EVERY_S = 0.1  # at most so often in place
 _TICK_S = 1.0  # between looks at the seconds of a step that is not heard of
 _TELLS_S = 1.0  # from so many seconds on a step tells how long the rest will take
+_LINE_EVERY_S = 10.0  # where lines cannot be replaced, a step that goes on says so this often
 _MINUTES_FROM_S = 100.0  # longer times are told in minutes
 
 Item = TypeVar("Item")
@@ -191,12 +193,18 @@ class ProgressStep:
     done: int = 0  # things that were counted so far
     of: int = 0  # 0: nobody knows, or there is nothing to count
     what: str = ""  # one of the things that are counted: "photograph pair"
+    left_s: float | None = None  # until all of it is done, by the rate that was measured; None: nothing tells it
 
     def __str__(self) -> str:
         """`matching: 3 of 10 photograph pairs`."""
         if self.of:
             return f"{self.doing}: {self.done} of {_format_count(self.of, self.what)}"
         return f"{self.doing}: {_format_count(self.done, self.what)}" if self.done else self.doing
+
+    @property
+    def sentence(self) -> str:
+        """`matching: 3 of 10 photograph pairs, about 6 s left`."""
+        return str(self) if self.left_s is None else f"{self}, about {format_duration(self.left_s)} left"
 
     @property
     def is_under_way(self) -> bool:
@@ -216,8 +224,52 @@ def ignore_progress(_: ProgressStep | str) -> None:
     """Ignores progress, where nobody waits."""
 
 
+class RemainingTime:
+    """Estimates how long the rest of a step takes, by the rate of the newer half of what is done.
+
+    The first things of a step say little of the last ones: images are loaded, and scenes grow.
+    """
+
+    def __init__(self) -> None:
+        self._doing, self._of, self._first = "", 0, 0
+        self._heard: deque[tuple[float, int]] = deque()  # when so many were done: of the newer half, and one before
+
+    def estimate(self, step: ProgressStep, now_s: float) -> float | None:
+        """Seconds until all of the step is done; None as long as nothing was measured of it for a second."""
+        heard = self._heard
+        if (step.doing, step.of) != (self._doing, self._of) or (heard and step.done < heard[-1][1]):
+            self._doing, self._of, self._first = step.doing, step.of, step.done
+            heard.clear()
+        if not heard or step.done > heard[-1][1]:
+            heard.append((now_s, step.done))
+        last_s, last = heard[-1]
+        while len(heard) > 2 and 2 * heard[1][1] <= self._first + last and last_s - heard[1][0] >= _TELLS_S:
+            heard.popleft()
+        since_s, since = heard[0]
+        if not 0 < step.done < step.of or last == since or last_s - since_s < _TELLS_S:
+            return None
+        return max(0.0, (last_s - since_s) / (last - since) * (step.of - last) - (now_s - last_s))
+
+
+def add_remaining_time(tell: Tell) -> Tell:
+    """Returns what hears steps as `tell` does, each with the seconds that remain of it once they can be told."""
+    if tell is ignore_progress:
+        return tell
+    remaining = RemainingTime()
+
+    def tell_with_rest(told: ProgressStep | str) -> None:
+        if isinstance(told, ProgressStep) and told.left_s is None:
+            told = replace(told, left_s=remaining.estimate(told, time.monotonic()))
+        tell(told)
+
+    return tell_with_rest
+
+
 class ProgressPrinter:
-    """Shows steps on a terminal in place, with how long they took and will take; elsewhere each once, as it begins."""
+    """Shows steps on a terminal in place, with how long they took and will take.
+
+    Elsewhere each is a line as it begins, and one each ten seconds for as long as it is heard of.
+    """
 
     def __init__(self) -> None:
         self._step, self._began_s, self._shown_s = ProgressStep(""), 0.0, 0.0
@@ -233,8 +285,9 @@ class ProgressPrinter:
             self._began_s = now_s
         self._step = told
         if not is_interactive():
-            if begins:
-                say(told.announcement, error=True)
+            if begins or (told.is_under_way and now_s >= self._shown_s + _LINE_EVERY_S):
+                self._shown_s = now_s
+                say(told.announcement if begins else told.sentence, error=True)
             return
         if begins:
             progress("")
@@ -304,13 +357,17 @@ def report_items(items: Iterable[Item], tell: Tell, doing: str, of: int, what: s
 
 
 def format_times(step: ProgressStep, taken_s: float) -> str:
-    """`4 s, about 32 s left`: what is left takes as long for each as what is done took."""
+    """`4 s, about 32 s left`: by the step's own measurement, else as long for each as what is done took."""
     taken = f"{taken_s:.0f} s"
     if taken_s < _TELLS_S or not 0 < step.done < step.of:
         return taken
-    left_s = taken_s / step.done * (step.of - step.done)
-    left = f"{left_s:.0f} s" if left_s < _MINUTES_FROM_S else f"{left_s / 60:.0f} min"
-    return f"{taken}, about {left} left"
+    left_s = taken_s / step.done * (step.of - step.done) if step.left_s is None else step.left_s
+    return f"{taken}, about {format_duration(left_s)} left"
+
+
+def format_duration(seconds: float) -> str:
+    """`32 s`, and from a hundred seconds on `5 min`."""
+    return f"{seconds:.0f} s" if seconds < _MINUTES_FROM_S else f"{seconds / 60:.0f} min"
 
 
 def _format_count(number: int, what: str) -> str:

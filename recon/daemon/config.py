@@ -11,6 +11,7 @@ from splatnode.capture.messaging.network import Network
 from splatnode.recon import former_names
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.ingest import FrameSetConfig
+from splatnode.recon.daemon.relocalization import LocatorConfig
 from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.result.message import MAX_CAMERAS
@@ -25,6 +26,7 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # localization of the live camera in a final submap
     occupancy: FreeSpace = FreeSpace()  # the occupancy map: which space is free, occupied, or not seen
+    localization: LocatorConfig = LocatorConfig()  # of images that clients send
     frame_sets: FrameSetConfig = FrameSetConfig()  # keyframes that several cameras took together
     # Over tcp, network.first_port of each capture beside the first. On one machine recon finds all captures by itself
     further_captures: tuple[Annotated[int, msgspec.Meta(ge=1, le=65500)], ...] = ()

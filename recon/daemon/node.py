@@ -3,6 +3,7 @@
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
 watcher   capture.preview -> has the camera moved?
+locator   recon.locate: where clients took their images, in what is shown
 main      recon.scene, recon.depth, recon.map, recon.status, recon.control; the service manager; signals
 
 It says that a disk is nearly full while it can still write: before a keyframe or a result is refused."""
@@ -62,12 +63,13 @@ from splatnode.capture.process.terminal import (
 )
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.config import apply_changes
-from splatnode.recon.daemon import ReconState, ReconStatus
+from splatnode.recon.daemon import ReconState, ReconStatus, WorldRecord, WorldRevisions
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.free_space import GrowingMapper, GrowingScene, ProvisionalMap, WholeMapper
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
-from splatnode.recon.daemon.relocalization import NOT_FINAL, OccupancyResult, Watcher
+from splatnode.recon.daemon.relocalization import NOT_FINAL, LocatableScene, Locator, OccupancyResult, Watcher
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
@@ -137,8 +139,8 @@ def remove_keyframe(args: argparse.Namespace) -> int:
 
 
 SERVE_S = 0.05  # between looks at what the threads have produced
-_SOCKETS = 8  # that it binds: of states two
-_FILES, _THREADS = 128, 28  # of which the daemon has need: six endpoints, its own threads, those that compute
+_SOCKETS = 9  # that it binds: of states two
+_FILES, _THREADS = 144, 32  # of which the daemon has need: seven endpoints, its own threads, those that compute
 END_S = 20.0  # for the threads to end; an export takes seconds
 QUIET_S = 2.0  # in which no keyframe comes before a node that finishes ends: capture sends what it still keeps
 RESTS = 2  # looks at which nothing was left to be done, likewise
@@ -214,6 +216,8 @@ class Daemon:
         Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
+        self._problems = Problems()
+        self._worlds = WorldRevisions()
         with self._close_on_error():
             raise_file_limit()
             network = config.network
@@ -223,6 +227,10 @@ class Daemon:
             maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.occupancy.live else None
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
+            self._locator = None
+            if config.localization.live:
+                self._locator = Locator(network, self._problems, stopping)
+                self._resources.callback(self._locator.close)
             self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
             self._resources.enter_context(hold_result_folder(config.out))
@@ -231,19 +239,24 @@ class Daemon:
         self._disk_space = DiskSpace(config, self._store)
         self._inbox = Inbox()
         self._newest = _NewestSnapshot()
-        self._problems = Problems()
         together = msgspec.structs.replace(config.frame_sets, tolerance_s=config.frame_set_tolerance_s)
         several = together, config.further_captures
         self._intake = Intake(
             network, config.reconstruction, self._store, self._inbox, self._problems, stopping, *several
         )
-        self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping)
+        self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping, self._worlds)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._scene_numbers = Numbering()
         session = self._scene_numbers.session
         self._depth_numbers = Numbering(session)
         self._status_numbers = Numbering(session)
         self._maps = None if maps is None else OccupancyPublisher(maps, Numbering(session))
+        mapped = config.occupancy.live and config.occupancy.provisional
+        self._growing = GrowingMapper(config.occupancy.voxel, self._problems, stopping) if mapped else None
+        helper = config.out, config.occupancy.voxel, self._problems, stopping
+        grows = self._find_growing_map if mapped else None
+        self._whole = WholeMapper(*helper, grows) if config.occupancy.maps else None
+        self._world: WorldRecord | None = None  # of what is shown
         self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()
         self._shown: PublishedSnapshot | None = None
@@ -268,7 +281,8 @@ class Daemon:
             self._run(manager)
 
     def _run(self, manager: ServiceManager) -> None:
-        threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher)]
+        beside = [each for each in (self._locator, self._growing, self._whole) if each is not None]
+        threads = [self._start_thread(each.run) for each in (self._intake, self._worker, self._watcher, *beside)]
         manager.ready()
         event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
         next_status_s = 0.0
@@ -361,9 +375,11 @@ class Daemon:
         if shown is None:
             return
         self._shown = shown
-        self._publish_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
+        self._world = self._worlds.update(shown.scene_id, shown.snapshot)
+        self._publish_map(NOT_FINAL)  # first: no map of another world is there when this scene comes
         numbers = self._scene_numbers.next()
         self._sequence = int(numbers["sequence"])
+        self._show_to_helpers(shown, self._world)
         try:
             header, arrays = encode_snapshot(shown.snapshot, shown.scene_id, numbers)
             depth = self._depth_numbers.next()
@@ -375,7 +391,23 @@ class Daemon:
 
     def _publish_map(self, found: OccupancyResult | str) -> None:
         if self._maps is not None:
-            self._maps.publish(found, self._shown, self._sequence)
+            self._maps.publish(found, self._shown, self._sequence, self._find_growing_map())
+
+    def _find_growing_map(self) -> ProvisionalMap | None:
+        """The provisional map, if it is in the world of what is shown."""
+        made, world = None if self._growing is None else self._growing.made, self._world
+        if made is None or world is None or self._shown is None or self._shown.snapshot.final:
+            return None
+        return made if (made.of.scene_id, made.of.revision) == (world.scene_id, world.revision) else None
+
+    def _show_to_helpers(self, shown: PublishedSnapshot, world: WorldRecord) -> None:
+        """Gives the scene to the threads that locate images in it, and that map it while it grows."""
+        if self._locator is not None:
+            told = self._scene_numbers.session, self._sequence, world.revision, world.provisional
+            self._locator.show(LocatableScene(shown.snapshot, shown.scene_id, *told, shown.estimate))
+        if self._growing is not None and shown.pointmaps is not None and shown.snapshot.verdict.publishable:
+            told = self._sequence, world.revision, shown.pointmaps, shown.shown_s
+            self._growing.show(GrowingScene(shown.snapshot, shown.scene_id, *told))
 
     def _answer(self, command: Command) -> Answer:
         if isinstance(command, MarkProblemsSeen):
@@ -444,6 +476,8 @@ class Daemon:
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
             tracked=_make_live_camera_record(tracked),
+            worlds=self._worlds.records,
+            work=worker.work,
             problem=self._describe_problem(),
         )
 

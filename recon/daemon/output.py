@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import enum
 import logging
-from collections.abc import Callable, Collection, Sequence
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
@@ -23,9 +24,10 @@ from splatnode.capture.process.system import SHORT_OF_MEMORY, is_shortage, raise
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import guard_untrusted
 from splatnode.capture.rig import form_frame_sets
-from splatnode.recon.daemon import SubmapStatus, checkpoint
+from splatnode.recon.daemon import SubmapStatus, WorldRevisions, checkpoint
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.free_space import GrowingScene, ProvisionalMap, drop_normals
 from splatnode.recon.daemon.pose_graph import (
     Cameras,
     EdgeKind,
@@ -35,13 +37,15 @@ from splatnode.recon.daemon.pose_graph import (
     optimize_pose_graph,
     transfer_edge,
 )
-from splatnode.recon.daemon.relocalization import NOT_FINAL, OccupancyResult
+from splatnode.recon.daemon.relocalization import LOST, NOT_FINAL, OccupancyResult
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.metric.measurement import MetricConfig
 from splatnode.recon.metric.metres import NOTHING, Evidence, apply_metric_scale, gather_evidence
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.occupancy import encode_map, no_map
+from splatnode.recon.occupancy import encode_map, make_provisional_record, no_map
+from splatnode.recon.priors import Pointmap
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.export import SceneFileError, read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file
@@ -322,6 +326,9 @@ class PublishedSnapshot:
 
     snapshot: Snapshot
     scene_id: str
+    estimate: Reconstruction | None = None  # of its keyframes, where images are located in it
+    pointmaps: Mapping[str, Pointmap] | None = None  # by keyframe, where it is mapped while it grows
+    shown_s: float = 0.0  # monotonic
 
 
 class Output:
@@ -331,8 +338,10 @@ class Output:
         store: Store,
         publish: Callable[[PublishedSnapshot], None],
         complain: Callable[[str], None],
+        worlds: WorldRevisions | None = None,
     ) -> None:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
+        self._worlds = worlds or WorldRevisions()
         self._config, self._store, self._publish, self.complain = config, store, publish, complain
         self.places = SubmapIndex(config.out, store.identity)
         self._metres = MetricScaler(config.reconstruction.metric)
@@ -340,7 +349,10 @@ class Output:
     def publish(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """Shows what `work` has come to, in metres where these are known; what is shown."""
         measured = self._metres.scale_snapshot(snapshot, work)
-        self._publish(PublishedSnapshot(measured, self._store.scene_id))
+        estimate = work.find_reconstruction() if self._config.localization.live else None
+        mapped = self._config.occupancy.live and self._config.occupancy.provisional and not snapshot.final
+        pointmaps = drop_normals(work.state.pointmaps) if mapped else None
+        self._publish(PublishedSnapshot(measured, self._store.scene_id, estimate, pointmaps, shown_s=time.monotonic()))
         return measured
 
     def save(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
@@ -386,6 +398,8 @@ class Output:
         except OSError as error:
             self.complain(SHORT_OF_MEMORY if is_shortage(error) else error.strerror or str(error))
             return False
+        if place.scene_id != self._store.scene_id and judged:
+            self._worlds.rebuild(place.scene_id, measured.cameras)
         known = result_snapshot.format_widest_bounds(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
         return True
@@ -434,42 +448,59 @@ class OccupancyPublisher:
     def __init__(self, server: StateServer, numbering: Numbering) -> None:
         """`numbering`: of the maps alone, in the session of the scenes."""
         self._server, self._numbering = server, numbering
-        self._told: tuple[str, OccupancyResult | str] | None = None  # scene, and its map or why there is none
+        self._told: tuple[str, OccupancyResult | ProvisionalMap | str] | None = None  # scene, and its map or why not
 
     def serve(self) -> None:
         """Replies to who asks."""
         self._server.serve(0)
 
-    def publish(self, found: OccupancyResult | str, shown: PublishedSnapshot | None, sequence: int) -> None:
-        """`found` is the map of a scene, or why there is none; `shown` what viewers see, by message `sequence`."""
+    def publish(
+        self,
+        found: OccupancyResult | str,
+        shown: PublishedSnapshot | None,
+        sequence: int,
+        growing: ProvisionalMap | None = None,
+    ) -> None:
+        """`found` is the map of a scene, or why there is none; `shown` what viewers see, by message `sequence`.
+
+        `growing` is the map of a scene that grows, in the world of what viewers see.
+        """
         scene_id = NO_SCENE if shown is None else shown.scene_id
-        now = _match_shown_scene(found, shown)
+        now = _match_shown_scene(found, shown, growing)
         if (scene_id, now) == self._told:
             return
         self._told = scene_id, now
         numbers = self._numbering.next()
-        if isinstance(now, OccupancyResult):
+        if not isinstance(now, str):
             now = self._send_map(now, scene_id, sequence, numbers)
         if now:
             self._server.publish(no_map(scene_id, now, numbers))
 
-    def _send_map(self, mapped: OccupancyResult, scene_id: str, sequence: int, numbers: dict[str, Any]) -> str:
+    def _send_map(
+        self, mapped: OccupancyResult | ProvisionalMap, scene_id: str, sequence: int, numbers: dict[str, Any]
+    ) -> str:
         """Sends a map; why not, where there is none to be sent."""
         if mapped.occupancy is None:
             return mapped.why
         try:
-            self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers))
+            of, growing = mapped.of, None
+            if isinstance(of, GrowingScene):
+                sequence = of.sequence
+                growing = make_provisional_record(of.revision, of.snapshot.cameras)
+            self._server.publish(*encode_map(mapped.occupancy, scene_id, sequence, numbers, growing))
         except WireError as error:
             log.warning("the map of %s cannot be sent: %s", scene_id, error)
             return f"the map is too large: {error}; choose a larger occupancy.voxel"
         return ""
 
 
-def _match_shown_scene(found: OccupancyResult | str, shown: PublishedSnapshot | None) -> OccupancyResult | str:
-    """The map if it is of what viewers see; else why there is none."""
+def _match_shown_scene(
+    found: OccupancyResult | str, shown: PublishedSnapshot | None, growing: ProvisionalMap | None
+) -> OccupancyResult | ProvisionalMap | str:
+    """The map if it is of what viewers see, or grows with it; else why there is none."""
     if shown is not None and not shown.snapshot.verdict.publishable:
         verdict = shown.snapshot.verdict
         return f"there is no scene: {verdict.code.value}. {verdict.message}"
     if isinstance(found, str):
-        return found
+        return growing if growing is not None and found != LOST else found
     return found if shown is not None and found.of.snapshot is shown.snapshot else NOT_FINAL

@@ -24,23 +24,37 @@ from scipy.special import chdtr
 from splatnode.capture.config import PreviewHeader, decode_preview
 from splatnode.capture.frame import Intrinsics, Stamp
 from splatnode.capture.lenses import undistort_image
-from splatnode.capture.messaging.messages import Message
-from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network, NotAllowed, find_captures
-from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.messaging.messages import Message, WireError
+from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_LOCATE, Network, NotAllowed, find_captures
+from splatnode.capture.messaging.pubsub import QueryServer, Subscriber
 from splatnode.capture.process.config import Internal
-from splatnode.capture.process.system import raise_shortage
+from splatnode.capture.process.system import is_shortage, raise_shortage
 from splatnode.capture.process.terminal import Problems, event, is_logged
+from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import poselib
 from splatnode.recon.daemon import ReconState
+from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera
 from splatnode.recon.keyframes import PLAIN, Keyframe
+from splatnode.recon.locating import (
+    QUERY_LIMITS,
+    LocateAnswer,
+    Located,
+    LocateRequest,
+    NotLocated,
+    decode_query_image,
+    make_outcome_records,
+)
+from splatnode.recon.locating.localize import follow, localize_image
 from splatnode.recon.matching import features
+from splatnode.recon.modelling import add_landmarks
 from splatnode.recon.occupancy import OccupancyMap, occupancy_map
 from splatnode.recon.registration.registration import undistort_pixels
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.rendering import render_arrays
-from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, Landmarks, Snapshot
 from splatnode.recon.result.stored_snapshot import read_depths
+from splatnode.recon.threads import apply_thread_limit
 
 Array = npt.NDArray[np.float64]
 
@@ -407,6 +421,10 @@ LOST = "the last keyframes do not belong to the scene: where the robot is now is
 
 class OccupancyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     live: bool = False  # send the map of each scene that is final, as the service recon.map
+    # With `live`: send a map of the scene while it grows, too, marked provisional. It is less certain, and changes
+    provisional: bool = False
+    # Keep a file out/free_space/MAP.npz for each map: the free space of all its final scenes, in one frame
+    maps: bool = False
     # Side of a voxel, in the unit of the scene; nothing: as `splatnode occupancy` chooses it
     voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
 
@@ -471,3 +489,106 @@ def _add_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
     ours = [(camera.T_world_camera, poses.get(camera.name)) for camera in snapshot.cameras]
     same = all(pose is not None and np.allclose(shown, pose, rtol=0, atol=1e-6) for shown, pose in ours)
     return replace(snapshot, depths=depths) if same else snapshot
+
+
+# The thread that tells clients where their images were taken, in the scene that is shown: also while it grows.
+#
+# It works beside the worker, and makes no keyframe wait: the landmarks of a scene are gathered when the first image of
+# it comes, from the estimate that the scene was made with.
+
+WAIT_S = 0.1  # for an image
+NO_SCENE = "none"  # in place of a scene's id
+NOTHING_YET = "there is no scene yet: it begins with the second or third keyframe"
+UNKNOWN = "the cameras of the scene that is shown are being estimated anew; ask again in a moment"
+MOST_FOLLOWED = 64  # connections whose last image is known
+
+
+class LocatorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    live: bool = False  # answer clients that ask where their images were taken, as the service recon.locate
+
+
+@dataclass(frozen=True, eq=False)
+class LocatableScene:
+    """The scene that viewers see, with what its landmarks are gathered from."""
+
+    snapshot: Snapshot
+    scene_id: str
+    session: str  # of the message that shows it
+    sequence: int
+    revision: int  # of its world
+    provisional: bool
+    estimate: Reconstruction | None  # None: it is not known any more
+
+
+class Locator:
+    """Answers requests of `recon.locate`. `show` is for the thread that shows scenes, `run` for one of its own."""
+
+    def __init__(self, network: Network, problems: Problems, stopping: threading.Event) -> None:
+        """Raises what binding the service raises."""
+        self._server = QueryServer(RECON_LOCATE, network, LocateRequest, QUERY_LIMITS)
+        self._problems, self._stopping = problems, stopping
+        self._shown: LocatableScene | None = None
+        self._landmarks: tuple[LocatableScene, Landmarks | None] | None = None
+        self._last: dict[bytes, tuple[int, Located]] = {}  # by connection: the revision, and where its last image was
+
+    def close(self) -> None:
+        self._server.close()
+
+    def show(self, scene: LocatableScene) -> None:
+        """From now on images are looked for in this scene."""
+        self._shown = scene
+
+    def run(self) -> None:
+        """Until the daemon stops; on one processor, which leaves the others to the worker."""
+        with apply_thread_limit(1):
+            while not self._stopping.is_set():
+                for identity, message in self._server.receive(WAIT_S):
+                    self._server.reply(identity, self._answer(identity, message))
+
+    def _answer(self, identity: bytes, message: Message[LocateRequest]) -> LocateAnswer:
+        scene, request = self._shown, message.header
+        if scene is None:
+            return LocateAnswer(request.number, NO_SCENE, "0" * 32, 0, 0, True, why=NOTHING_YET)
+        world = request.number, scene.scene_id, scene.session, scene.sequence, scene.revision, scene.provisional
+        try:
+            found = self._locate(identity, message, scene)
+        except (WireError, ValueError) as error:  # of this image
+            return LocateAnswer(*world, why=sanitize_text(str(error)))
+        except Exception as error:
+            if is_logged(self._problems.add("images that could not be located", f"{type(error).__name__}: {error}")):
+                log.exception("an image could not be located")
+            why = "memory or disk did not suffice" if is_shortage(error) else "the node failed; see its log"
+            return LocateAnswer(*world, why=why)
+        if isinstance(found, str):
+            return LocateAnswer(*world, why=sanitize_text(found))
+        return LocateAnswer(*world, **make_outcome_records(found))  # pyright: ignore[reportArgumentType]
+
+    def _locate(
+        self, identity: bytes, message: Message[LocateRequest], scene: LocatableScene
+    ) -> Located | NotLocated | str:
+        """The outcome, or why no place was looked for. Raises WireError, ValueError where the image cannot be used."""
+        verdict = scene.snapshot.verdict
+        if not verdict.publishable:
+            return f"there is no scene: {verdict.code.value}. {verdict.message}"
+        landmarks = self._gather_landmarks(scene)
+        if landmarks is None:
+            return UNKNOWN
+        image, request = decode_query_image(message), message.header
+        revision, near = self._last.pop(identity, (-1, None))
+        if request.follows and near is not None and revision == scene.revision:
+            found = follow(landmarks, image, near, request.intrinsics)
+        else:
+            found = localize_image(landmarks, image, request.intrinsics)
+        if isinstance(found, Located):
+            self._last[identity] = scene.revision, found
+            while len(self._last) > MOST_FOLLOWED:
+                del self._last[next(iter(self._last))]
+        return found
+
+    def _gather_landmarks(self, scene: LocatableScene) -> Landmarks | None:
+        """The landmarks of a scene in its world and unit, gathered once."""
+        if self._landmarks is None or self._landmarks[0] is not scene:
+            known = scene.snapshot.landmarks or add_landmarks(scene.snapshot, scene.estimate).landmarks
+            metric = scene.snapshot.scale.metric
+            self._landmarks = scene, known and replace(known, metric=metric)
+        return self._landmarks[1]

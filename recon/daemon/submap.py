@@ -16,11 +16,11 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import partial
 
 from splatnode.capture.process.system import is_shortage
-from splatnode.capture.process.terminal import event
+from splatnode.capture.process.terminal import ProgressStep, Tell, event, ignore_progress
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import ReconState, checkpoint
+from splatnode.recon.daemon import ReconState, Work, WorkMeter, checkpoint, weigh_final
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
@@ -229,7 +229,9 @@ def verify_keyframes(work: IncrementalReconstruction, forget: Forget, pause: Pau
         forget(keyframe.name, "it contradicts the scene")
 
 
-def refine(work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause) -> Iterator[SceneWithVerdict]:
+def refine(
+    work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause, tell: Tell = ignore_progress
+) -> Iterator[SceneWithVerdict]:
     """The scene of all keyframes at every checkpoint, and at the end; it is not shown yet.
 
     Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
@@ -237,9 +239,12 @@ def refine(work: IncrementalReconstruction, config: ReconstructionConfig, pause:
     steps = itertools.count(1)
 
     def pause_periodically() -> None:
-        if next(steps) % STEP == 0:
+        done = next(steps)
+        tell(ProgressStep("refining the scene", done, config.optimize.steps, "step"))
+        if done % STEP == 0:
             pause()
 
+    tell(ProgressStep("estimating depth"))
     work.rebuild(pause)
     yield from work.refine(work.initial_scene, config.optimize, pause_periodically)
 
@@ -282,10 +287,17 @@ class Abandoned(Exception):
 
 class ActiveSubmap:
     def __init__(
-        self, config: DaemonConfig, recipe: Recipe, store: Store, output: Output, pause: Callable[[float], None]
+        self,
+        config: DaemonConfig,
+        recipe: Recipe,
+        store: Store,
+        output: Output,
+        pause: Callable[[float], None],
+        meter: WorkMeter | None = None,
     ) -> None:
         """`pause` raises Abandoned if the daemon stops, and from a time (monotonic) on if something has come."""
         self._config, self._recipe, self._store, self._output = config, recipe, store, output
+        self._meter = meter or WorkMeter()
         self._pause_until = pause
         self._work = IncrementalReconstruction(recipe)
         self._final = FinalResult(store, output)
@@ -536,8 +548,10 @@ class ActiveSubmap:
     def finalize(self) -> None:
         """Makes the scene afresh from all keyframes and refines it. Raises Abandoned when something comes."""
         self.state = ReconState.REFINING
-        self._verify()
-        self._refine_verified()
+        with self._meter.measure(Work.FINAL, weigh_final(len(self._work.names))):
+            self._meter.tell(ProgressStep("finding and checking the cameras"))
+            self._verify()
+            self._refine_verified()
 
     def _verify(self) -> None:
         """Weighs all evidence; what shows other places begins others, or becomes places of its own that wait."""
@@ -565,7 +579,7 @@ class ActiveSubmap:
 
     def _refine_verified(self) -> None:
         refined = SceneWithVerdict()
-        for refined in refine(self._work, self._recipe, self._pause):
+        for refined in refine(self._work, self._recipe, self._pause, self._meter.tell):
             if refined.scene is not None and refined.scene.iterations in self._recipe.optimize.checkpoints:
                 self._work.show(refined)
                 self._show()

@@ -22,7 +22,18 @@ from splatnode.capture.process.terminal import event
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import PLACES, SubmapStatus, checkpoint, ledger, submap
+from splatnode.recon.daemon import (
+    PLACES,
+    Backlog,
+    SubmapStatus,
+    Work,
+    WorkMeter,
+    WorkProgress,
+    WorldRevisions,
+    checkpoint,
+    ledger,
+    submap,
+)
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
@@ -53,7 +64,9 @@ class Worker:
         inbox: Inbox,
         publish: Callable[[PublishedSnapshot], None],
         stopping: threading.Event,
+        worlds: WorldRevisions | None = None,
     ) -> None:
+        """`worlds` hears which scenes are made afresh."""
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
         asked = config.reconstruction.fallbacks
         ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
@@ -65,11 +78,14 @@ class Worker:
             frame_set_tolerance_s=config.frame_set_tolerance_s,
         )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
-        self._output = Output(config, store, publish, self._report_problem)
-        self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause)
+        self._output = Output(config, store, publish, self._report_problem, worlds)
+        self._meter = WorkMeter()
+        self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause, self._meter)
         self._free_space = OccupancyMapper(config.occupancy)
         self._atlas = LoopDetector(store.directory, self._recipe, self._output.places)
-        self._left = InactiveSubmaps(store, self._recipe, self._output, self._atlas, config.fallback_timeout_s)
+        self._left = InactiveSubmaps(
+            store, self._recipe, self._output, self._atlas, config.fallback_timeout_s, self._meter
+        )
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
         self._shortage = ""  # the last one that was told
@@ -104,6 +120,11 @@ class Worker:
     def current_map(self) -> OccupancyResult | str:
         """The map of the present scene as it is now, or why there is none."""
         return self._free_space.find_current_map(self.place.finished, self.place.state)
+
+    @property
+    def work(self) -> WorkProgress | None:
+        """Tells what is being done, and how long the rest of it takes; None while nothing is."""
+        return self._meter.describe(Backlog(self.count_waiting(), self._left.num_unjudged, self.num_unfinished))
 
     def find_inactive_scenes(self, name: str) -> list[str]:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
@@ -146,6 +167,7 @@ class Worker:
 
     def _process_idle(self) -> None:
         """Does one step of work that is left while the active submap needs nothing."""
+        self._meter.restart_count(Work.KEYFRAMES)
         if self.place.retry_write():
             self.problem = ""
             return
@@ -195,7 +217,8 @@ class Worker:
         self.problem = ""
         stored = [each for each in arrived if self._store.holds(each.keyframe.frame)]
         if stored or not arrived:
-            self.place.add_keyframes(stored)
+            with self._meter.measure(Work.KEYFRAMES, len(stored), len(stored)):
+                self.place.add_keyframes(stored)
 
     def _serve_active_submap(self) -> None:
         """While the scene of a place that was left is finished, the present one goes on.
@@ -294,13 +317,14 @@ class InactiveSubmaps:
         output: Output,
         atlas: LoopDetector,
         fallback_s: float = math.inf,
+        meter: WorkMeter | None = None,
     ) -> None:
         """`here` is the checkpoint which has left/ in it, `config` how scenes are made.
 
         Fallbacks take at most `fallback_s` seconds of each step with a place.
         """
         self._here, self._config, self._output, self._atlas = here, config, output, atlas
-        self._fallback_s = fallback_s
+        self._fallback_s, self._meter = fallback_s, meter or WorkMeter()
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
         self._retract_after_s = -math.inf  # monotonic: a keyframe could not be taken out before
@@ -324,7 +348,10 @@ class InactiveSubmaps:
         """
         self._remove_keyframes()
         return self._process_first(
-            [each for each in self._pending_folders if not self._atlas.has_scene(each.name)], self._verify, pause
+            [each for each in self._pending_folders if not self._atlas.has_scene(each.name)],
+            self._verify,
+            pause,
+            Work.JUDGE,
         )
 
     def finalize_next(self, pause: Pause) -> bool:
@@ -333,7 +360,10 @@ class InactiveSubmaps:
         False where there is none to be made now; `pause` as for `verify_next`.
         """
         return self._process_first(
-            [each for each in self._pending_folders if self._atlas.has_scene(each.name)], self._finalize, pause
+            [each for each in self._pending_folders if self._atlas.has_scene(each.name)],
+            self._finalize,
+            pause,
+            Work.FINISH,
         )
 
     @property
@@ -344,14 +374,19 @@ class InactiveSubmaps:
             each for each in ledger.list_left_folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now
         ]
 
-    def _process_first(self, folders: Sequence[Path], step: _Step, pause: Pause) -> bool:
+    @property
+    def num_unjudged(self) -> int:
+        """Places that were left and are not judged."""
+        return sum(not self._atlas.has_scene(each.name) for each in ledger.list_left_folders(self._here.directory))
+
+    def _process_first(self, folders: Sequence[Path], step: _Step, pause: Pause, work: Work) -> bool:
         """Takes the step with the first of the places; False where there is none, or the disk did not take it."""
         if not folders:
             return False
         folder = folders[0]
         self._not_before_s[folder] = time.monotonic() + AGAIN_S
         try:
-            with contextlib.closing(Store(folder)) as store:
+            with contextlib.closing(Store(folder)) as store, self._meter.measure(work):
                 found = checkpoint.restore(store, self._config)
                 self._work = found.work
                 give_back_memory()

@@ -18,11 +18,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.messaging.messages import Header, Message, Name, Sequential, Text, WireError
+from splatnode.capture.messaging.messages import Amount, Header, Message, Name, Sequential, Text, WireError
 from splatnode.capture.process.text import guard_untrusted, sanitize_text
 from splatnode.recon.result.message import Matrix4, ScaleRecord, Vector3, make_scale_record, parse_scale
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot, find_camera_problem
-from splatnode.recon.result.verdict import RELATIVE, SURE, FrameName, ReferenceFrame, Scale
+from splatnode.recon.result.verdict import RELATIVE, SURE, FrameName, ReferenceFrame, Scale, find_widest
 
 # Layout: where the voxels of a map lie.
 
@@ -579,7 +579,17 @@ def _load_depth_observations(snapshot: Snapshot) -> list[DepthObservation]:
 Side = Annotated[float, msgspec.Meta(ge=1e-9, le=1e9)]
 
 
-class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class ProvisionalRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A map of a scene that grows: how sure its cameras are, and in which world it is."""
+
+    revision: Sequential  # of the scene's world: withdrawn once the heartbeat tells a later one
+    views: Sequential  # that it is made of
+    rotation_deg: Amount | None  # 95 % bound of its least certain camera; None: nobody tells it
+    centre: Amount | None  # likewise, in the unit of the map
+    centre_percent: Amount | None  # likewise, of the distance to the scene
+
+
+class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """An OccupancyMap without its states."""
 
     scene_sequence: Sequential  # of the message of recon.scene, of this session, that shows the scene of the map
@@ -589,6 +599,7 @@ class MapRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     up: Text  # how the direction of up is known
     on_floor: bool  # z = 0 is the floor; else it is the height of the first camera
     scale: ScaleRecord
+    provisional: ProvisionalRecord | None = None  # left out where the scene is final
 
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where the map lies nowhere."""
@@ -606,7 +617,11 @@ class MapHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 def encode_map(
-    occupancy: OccupancyMap, scene_id: str, scene_sequence: int, numbering: Mapping[str, object]
+    occupancy: OccupancyMap,
+    scene_id: str,
+    scene_sequence: int,
+    numbering: Mapping[str, object],
+    provisional: ProvisionalRecord | None = None,
 ) -> tuple[MapHeader, list[npt.NDArray]]:
     """The header and the array of a map; `numbering` is session, sequence and mono_ns."""
     record = MapRecord(
@@ -617,9 +632,18 @@ def encode_map(
         up=sanitize_text(occupancy.upright.source),
         on_floor=occupancy.upright.on_floor,
         scale=make_scale_record(occupancy.scale),
+        provisional=provisional,
     )
     header = MapHeader(**numbering, scene_id=scene_id, why="", map=record)  # pyright: ignore[reportArgumentType]
     return header, [occupancy.states]
+
+
+def make_provisional_record(revision: int, cameras: Sequence[CameraEstimate]) -> ProvisionalRecord:
+    """The record of a map that was made of these cameras while their scene grew."""
+    widest = find_widest(camera.bounds for camera in cameras if camera.bounds is not None)
+    if widest is None:
+        return ProvisionalRecord(revision, len(cameras), None, None, None)
+    return ProvisionalRecord(revision, len(cameras), widest.rotation_deg, widest.centre, widest.centre_percent)
 
 
 def no_map(scene_id: str, why: str, numbering: Mapping[str, object]) -> MapHeader:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -211,8 +211,11 @@ AXES = "states[i, j, k] along x, y, z of the map: x forward of the first camera,
 AXES_OF_RESULT = "states[i, j, k] along x, y, z of the map: x and y of the result's frame, z up"
 
 
-def encode_npz(occupancy: OccupancyMap) -> bytes:
-    """`states` (X, Y, Z) uint8, `origin` (3,), `voxel` (), `T_world_map` (4, 4), and texts that say what they mean."""
+def encode_npz(occupancy: OccupancyMap, further: Mapping[str, npt.NDArray] | None = None) -> bytes:
+    """`states` (X, Y, Z) uint8, `origin` (3,), `voxel` (), `T_world_map` (4, 4), and texts that say what they mean.
+
+    `further` are arrays beside these.
+    """
     file = io.BytesIO()
     np.savez_compressed(
         file,
@@ -227,6 +230,7 @@ def encode_npz(occupancy: OccupancyMap) -> bytes:
         world=np.array(occupancy.scale.frame.sentence),
         up=np.array(occupancy.upright.source),
         height=np.array(occupancy.upright.height),
+        **(further or {}),  # pyright: ignore[reportArgumentType]
     )
     return file.getvalue()
 

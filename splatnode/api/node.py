@@ -9,19 +9,24 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from splatnode.api.arguments import enter_api
 from splatnode.api.result import Camera, Result, camera_of, result_of
-from splatnode.capture.messaging.messages import WireError
-from splatnode.capture.messaging.network import RECON_MAP, Network
-from splatnode.capture.messaging.pubsub import StateClient
+from splatnode.capture.messaging.messages import WireError, make_jpeg_array
+from splatnode.capture.messaging.network import RECON_LOCATE, RECON_MAP, Network
+from splatnode.capture.messaging.pubsub import NoAnswer, QueryClient, StateClient
 from splatnode.capture.process.config import parse_config, read_yaml
 from splatnode.capture.process.terminal import Problems, is_logged
+from splatnode.recon.locating import LocateAnswer, Located, LocateRequest, NotLocated, parse_outcome
 from splatnode.recon.occupancy import MapHeader, OccupancyMap, decode_map
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.sources import LiveSource
 from splatnode.viewer.state import Moment
+
+if TYPE_CHECKING:
+    from splatnode.api.photographs import Lens, Picture
 
 # What a node says of free space, as a thread hears it.
 
@@ -38,6 +43,10 @@ class NodeMap:
     scene_id: str  # of the place; empty where the node has said nothing
     occupancy: OccupancyMap | None  # in the world of that scene, as it is now
     why: str  # there is no map; empty where there is one
+    provisional: bool = False  # the scene grows: less certain, and withdrawn when the scene is made afresh
+    views: int | None = None  # that a provisional map is made of
+    # Of its least certain camera, 95 %: degrees, and of its centre, in the unit
+    bounds: tuple[float, float] | None = None
 
 
 NOTHING_HEARD = NodeMap("", None, SILENT)
@@ -49,6 +58,7 @@ class ReceivedMap:
 
     told: NodeMap
     scene: tuple[str, int] | None = None  # session and sequence
+    world: tuple[str, int] | None = None  # session and revision of a provisional one
 
 
 class LiveMap:
@@ -84,20 +94,33 @@ class LiveMap:
                     continue
                 header: MapHeader = message.header
                 try:
-                    told = NodeMap(header.scene_id, decode_map(message), header.why)
+                    told = NodeMap(header.scene_id, decode_map(message), header.why, **_describe_provisional(header))
                 except WireError as error:
                     if is_logged(self._refusals.add("maps that were refused", error)):
                         log.warning("a map of the node was refused: %s", error)
                     told = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
-                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence))
+                growing = None if header.map is None else header.map.provisional
+                world = None if growing is None else (header.session, growing.revision)
+                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence), world)
         except Exception as error:
             self._error = error
+
+
+def _describe_provisional(header: MapHeader) -> dict[str, Any]:
+    """The fields of a NodeMap that a map of a growing scene has."""
+    growing = None if header.map is None else header.map.provisional
+    if growing is None:
+        return {}
+    known = growing.rotation_deg is not None and growing.centre is not None
+    bounds = (growing.rotation_deg, growing.centre) if known else None
+    return {"provisional": True, "views": growing.views, "bounds": bounds}
 
 
 # A running node, as a program that listens to it.
 
 FIRST_PORT = Network().first_port
 OUTDATED = "the scene has changed since its map was made"
+_JPEG_QUALITY = 95  # of an image that is sent
 _LOOK_S = 0.05  # between looks at whether a map has come
 
 
@@ -107,6 +130,18 @@ class NodeUpdate:
 
     scene_id: str  # another one is another place, with a world of its own
     result: Result  # `result.final`: verified with all evidence, and refined; `result.scale_interval`: None, or metres
+
+
+@dataclass(frozen=True, eq=False)
+class LiveLocation:
+    """The place where an image was taken, in the scene that a node showed then."""
+
+    scene_id: str  # of the place; `none` where the node has no scene
+    found: Located | NotLocated | None  # in the world of that scene; None: nothing was looked for
+    why: str  # nothing was looked for; empty where something was
+    provisional: bool  # the scene grows: bounds are wider, and it will be made afresh, which withdraws this
+    revision: int  # of the scene's world
+    session: str  # of the node
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +162,9 @@ class Node:
     """
 
     def __init__(self, network: Network) -> None:
+        self._network = network
+        self._locating: QueryClient | None = None  # once somebody asks
+        self._asked, self._asking = 0, threading.Lock()
         self._live = LiveSource(network)
         try:
             self._map = LiveMap(network)
@@ -165,10 +203,17 @@ class Node:
     def map(self) -> NodeMap:
         """Which space is free, occupied, or not seen, where the node's configuration has `occupancy.live`.
 
-        A map is of a scene that is final, as this program has heard it last; else there is none, and `why` says so.
+        A map is of a scene that is final, as this program has heard it last; with `occupancy.provisional` also of one
+        that grows, which `provisional` says. Else there is none, and `why` says so.
         Raises PermissionError where the node does not let this program in.
         """
         heard = self._map.newest
+        if heard.world is not None:  # it grows with the scene
+            session, worlds = self._live.worlds
+            world = worlds.get(heard.told.scene_id)
+            if world is not None and session == heard.world[0] and world.revision > heard.world[1]:
+                return NodeMap(heard.told.scene_id, None, OUTDATED)
+            return heard.told
         if heard.told.occupancy is not None and heard.scene != self._live.scene:
             return NodeMap(heard.told.scene_id, None, OUTDATED)
         return heard.told
@@ -182,6 +227,52 @@ class Node:
                 return self.map
         return found
 
+    @enter_api()
+    def localise(
+        self,
+        image: str | PathLike[str] | Picture,
+        *,
+        intrinsics: Lens | None = None,
+        follows: bool = False,
+        timeout_s: float = 10.0,
+    ) -> LiveLocation:
+        """Asks the node where an image was taken, in the scene that it shows, also while that grows.
+
+        The node's configuration needs `localization.live`. `image` and `intrinsics` are as for `Result.localise`;
+        `follows`: the image was taken near to the last one, which makes the search faster. `find_withdrawal` tells
+        whether the answer still holds. Raises TimeoutError where no answer comes in time, PermissionError, and
+        ValueError for an image that cannot be used.
+        """
+        from splatnode.api.photographs import load_query_frame  # brings what matches photographs
+
+        frame = load_query_frame(image, intrinsics)
+        with self._asking:
+            self._locating = self._locating or QueryClient(RECON_LOCATE, self._network, LocateAnswer)
+            self._asked += 1
+            request = LocateRequest(self._asked, frame.intrinsics, follows)
+            try:
+                answer = self._locating.ask(request, [make_jpeg_array(frame.image, _JPEG_QUALITY)], timeout_s)
+            except NoAnswer as error:
+                raise TimeoutError(f"{error}. Set `localization: {{live: true}}` in recon's file") from None
+        world = answer.scene_id, parse_outcome(answer), answer.why, answer.provisional
+        return LiveLocation(*world, answer.revision, answer.session)
+
+    def find_withdrawal(self, location: LiveLocation) -> str:
+        """Says why an answer of `localise` does not hold any more, by the node's last heartbeat; empty where it holds.
+
+        A scene's world changes when it is made afresh, loses a keyframe, or its cameras move beyond their bounds.
+        """
+        session, worlds = self._live.worlds
+        if not session or location.found is None:
+            return "" if location.found is not None else location.why
+        world = worlds.get(location.scene_id)
+        if session != location.session:
+            return "the node was started again"
+        if world is None:
+            newest = max((each.revision for each in worlds.values()), default=0)
+            return "" if newest < location.revision else "the node does not tell of this scene any more"
+        return (world.why or "the scene has changed") if world.revision > location.revision else ""
+
     @property
     def silent_s(self) -> float:
         """Seconds since anything was heard of the node, which speaks each second; infinite before the first time."""
@@ -191,6 +282,9 @@ class Node:
         """Ends the connection, and whoever waits for an update."""
         self._live.close()
         self._map.close()
+        with self._asking:
+            if self._locating is not None:
+                self._locating.close()
 
     def __enter__(self) -> Node:
         return self

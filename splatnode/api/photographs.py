@@ -349,16 +349,21 @@ def localize_query(
     landmarks: Landmarks, image: str | PathLike[str] | Picture, lens: Lens | None, near: Near
 ) -> Located | NotLocated:
     """The camera of one photograph, a file or a picture. Raises TypeError, ValueError, FileNotFoundError."""
-    if isinstance(image, (str, PathLike)) and not Path(image).is_file():
-        raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
     expected = _parse_near(near)
-    given = apply_lens(load_frames([image], None, False, ignore_progress), lens, [image]).frames
-    (frame, *_) = given
-    if not isinstance(frame, Frame):
-        raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
+    frame = load_query_frame(image, lens)
     if expected is None:
         return localize_image(landmarks, frame.image, frame.intrinsics)
     return follow(landmarks, frame.image, expected, frame.intrinsics)
+
+
+def load_query_frame(image: str | PathLike[str] | Picture, lens: Lens | None) -> Frame:
+    """The photograph with its lens, if that is known. Raises TypeError, ValueError, FileNotFoundError."""
+    if isinstance(image, (str, PathLike)) and not Path(image).is_file():
+        raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
+    (frame, *_) = apply_lens(load_frames([image], None, False, ignore_progress), lens, [image]).frames
+    if not isinstance(frame, Frame):
+        raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
+    return frame
 
 
 def _parse_near(near: Near) -> Located | npt.NDArray[np.float64] | None:

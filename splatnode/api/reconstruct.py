@@ -55,7 +55,7 @@ from splatnode.capture.keyframe_selection import Limits, Selector
 from splatnode.capture.lenses import assign_lens, check_fits
 from splatnode.capture.pose_files import Trajectory, create_trajectory, poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.terminal import Tell, ignore_progress, notify
+from splatnode.capture.process.terminal import Tell, add_remaining_time, ignore_progress, notify
 from splatnode.recon import threads as limits
 from splatnode.recon.config import ReconstructionConfig, apply_changes
 from splatnode.recon.config import preset as named
@@ -337,11 +337,11 @@ def reconstruct(
     - `views`: so many images or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
     - `multi_view_only` (formerly `only_seen`): leaves out what no two images confirm, and the far background.
     - `seed`: of random numbers (None: the configuration's). `threads`: at most (None: as many as processors).
-    - `tell`: gets steps (`doing`, `done`, `of`) and lines of text, in the calling thread; an exception in it cancels.
+    - `tell`: gets steps (`doing`, `done`, `of`, `left_s`) and lines of text, in this thread; raise in it to cancel.
     """
     check_poses, multi_view_only = _merge_former(check_poses, poses_only_check, multi_view_only, only_seen)
     check_counts(views=views, threads=threads)
-    telling = tell or ignore_progress
+    telling = add_remaining_time(tell or ignore_progress)
     several = SeveralCameras(cameras, camera_ids, captured_at, tolerance_of(preset, config))
     loaded = load_frames(images, views, every_frame, telling, several)
     source = add_depths(_apply_given(loaded, masks, intrinsics, images, telling), depths, images)

@@ -16,6 +16,7 @@ import torch
 import splatnode
 from splatnode import command_line
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.process import terminal
 from splatnode.recon import core
 from splatnode.recon.geometry import umeyama
 from tests.api.conftest import QUICK, SMALL
@@ -89,6 +90,19 @@ def test_a_refusal_is_a_value(arrays, tmp_path):
     again = splatnode.load(made.save(tmp_path / "refused"))
     assert again.verdict == made.verdict and again.cameras == ()
     assert "STATIC_CAMERA: 0 cameras" in repr(made)
+
+
+def test_who_waits_hears_how_long_the_rest_of_a_step_takes(arrays, monkeypatch):
+    monkeypatch.setattr(terminal, "_TELLS_S", 0.0)
+    heard = []
+    splatnode.reconstruct(arrays[:3], config=QUICK, tell=heard.append)
+    steps = [step for step in heard if not isinstance(step, str)]
+    left = {name: [step.left_s for step in steps if step.doing == name] for name in ("matching", "refining the scene")}
+    assert (
+        left["refining the scene"][0] is None and left["refining the scene"][-1] is None
+    )  # nothing known, nothing left
+    assert all(any(each is not None and each >= 0 for each in told) for told in left.values())
+    assert all(step.left_s is None for step in steps if not step.of)
 
 
 def test_who_waits_hears_what_is_done_and_can_end_it(arrays):

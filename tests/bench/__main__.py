@@ -18,6 +18,7 @@ BENCHMARKS = {
         "batch_ray",
         "queue",
         "live",
+        "growing",
         "stream",
         "building",
         "film",

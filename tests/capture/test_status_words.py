@@ -55,3 +55,26 @@ def test_each_place_is_told_in_a_line_of_its_own():
 def test_every_field_that_has_words_is_one_of_a_heartbeat():
     fields = {field.encode_name for status in (CaptureStatus, ReconStatus) for field in msgspec.structs.fields(status)}
     assert set(_WORDS) <= fields and fields | {"type"} >= _NOT_PRINTED
+
+
+def test_what_the_node_does_is_told_with_the_rest_and_strange_values_as_they_are():
+    work = {"doing": "refining the scene", "done": 210, "of": 500, "what": "step", "left_s": 6.2}
+    assert describe_heartbeat("recon", {"state": "refining", "work": work}) == [
+        "recon: refining",
+        "  now                     refining the scene: 210 of 500 steps, about 6 s left",
+    ]
+    assert describe_heartbeat("recon", {"work": work | {"of": 0, "left_s": None}})[1].endswith("scene: 210 steps")
+    for strange in (work | {"done": "many"}, work | {"left_s": [1]}, {"doing": 1}):
+        assert describe_heartbeat("recon", {"work": strange})[1].endswith(str(strange))
+
+
+def test_which_poses_hold_is_told_for_each_scene():
+    worlds = [
+        {"scene_id": "scene-0001", "revision": 3, "provisional": False, "why": "it moved"},
+        {"scene_id": "scene-0002", "revision": 2, "provisional": True, "why": ""},
+    ]
+    assert describe_heartbeat("recon", {"state": "growing", "worlds": worlds}) == [
+        "recon: growing",
+        "  poses in                scene-0001: revision 3, final; earlier poses are withdrawn: it moved",
+        "                          scene-0002: revision 2, provisional",
+    ]

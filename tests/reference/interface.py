@@ -40,6 +40,7 @@ _CLASSES = (
     "Node",
     "NodeUpdate",
     "NodeMap",
+    "LiveLocation",
     "Publisher",
     "Published",
     "RefusedImage",

@@ -14,7 +14,8 @@ from splatnode.capture.frame import ExposureSettings, GivenPose, Gravity, Intrin
 from splatnode.capture.messaging import messages, network, pubsub
 from splatnode.recon.daemon import ReconState, ReconStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
-from splatnode.recon.occupancy import MapHeader, MapRecord
+from splatnode.recon.locating import LocateAnswer, LocateRequest, LocationRecord
+from splatnode.recon.occupancy import MapHeader, MapRecord, ProvisionalRecord
 from splatnode.recon.result.export import list_format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ReferenceFrameRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
@@ -81,6 +82,10 @@ SECTIONS = {
     "ReferenceFrameRecord": ReferenceFrameRecord,
     "MapHeader": MapHeader,
     "MapRecord": MapRecord,
+    "ProvisionalRecord": ProvisionalRecord,
+    "LocateRequest": LocateRequest,
+    "LocateAnswer": LocateAnswer,
+    "LocationRecord": LocationRecord,
     "CameraRecord": CameraRecord,
     "BoundsRecord": BoundsRecord,
     "Want": pubsub.Want,

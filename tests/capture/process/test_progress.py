@@ -13,6 +13,9 @@ from splatnode.capture.process import terminal
 from splatnode.capture.process.terminal import (
     ProgressPrinter,
     ProgressStep,
+    RemainingTime,
+    add_remaining_time,
+    ignore_progress,
     report_items,
     sanitize_output,
     show_progress,
@@ -158,3 +161,48 @@ def test_what_is_soon_there_is_not_waited_for(monkeypatch):
 )
 def test_a_step_in_words(step, said, announced):
     assert (str(step), step.announcement) == (said, announced)
+
+
+def test_the_rest_is_told_by_the_newer_half_and_not_before_a_second_was_measured():
+    remaining = RemainingTime()
+
+    def left(done: int, now_s: float, doing: str = "refining") -> float | None:
+        return remaining.estimate(ProgressStep(doing, done, 100, "step"), now_s)
+
+    assert left(0, 0.0) is None and left(1, 0.9) is None  # nothing is known yet
+    assert left(10, 10.0) == pytest.approx(91.0)  # nine in 9.1 s
+    assert left(20, 11.0) == pytest.approx(8.0)  # faster than it began: ten in the last second
+    assert left(20, 13.0) == pytest.approx(6.0)  # it goes on while nothing is heard
+    assert left(20, 99.0) == 0.0
+    assert left(100, 100.0) is None  # nothing is left
+    assert left(5, 101.0) is None and left(6, 101.5, "another") is None  # each step is measured by itself
+
+
+def test_whoever_listens_hears_the_rest_of_a_step_and_lines_as_they_are(monkeypatch):
+    heard: list[ProgressStep | str] = []
+    now = iter([0.0, 2.0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
+    tell = add_remaining_time(heard.append)
+    tell(ProgressStep("refining", 100, 500, "step"))
+    tell("a line")
+    tell(ProgressStep("refining", 200, 500, "step"))
+    first, line, second = heard
+    assert isinstance(first, ProgressStep) and first.left_s is None and line == "a line"
+    assert isinstance(second, ProgressStep) and second.left_s == pytest.approx(6.0)
+    assert second.sentence == "refining: 200 of 500 steps, about 6 s left"
+    assert add_remaining_time(ignore_progress) is ignore_progress
+
+
+def test_where_there_is_no_terminal_a_long_step_says_every_ten_seconds_how_far_it_is(monkeypatch):
+    stream, now = io.StringIO(), iter([0.0, 0.0, 9.0, 9.0, 12.0, 12.0, 20.0, 20.0, 24.0, 24.0])
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(now))
+    with sanitize_output():
+        tell = add_remaining_time(ProgressPrinter())
+        for done in (0, 90, 120, 200, 240):
+            tell(ProgressStep("refining", done, 500, "step"))
+    told = [
+        "refining: 500 steps",
+        *(f"refining: {done} of 500 steps, about {left} s left" for done, left in ((120, 38), (240, 26))),
+    ]
+    assert stream.getvalue().splitlines() == told

@@ -36,6 +36,13 @@ from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig as ReconConfig
 from splatnode.recon.daemon.ledger import CheckpointError, Ledger
 from splatnode.recon.daemon.node import Command
+from splatnode.recon.locating import (
+    QUERY_LIMITS,
+    LocateAnswer,
+    LocateRequest,
+    decode_query_image,
+    parse_outcome,
+)
 from splatnode.recon.occupancy import MapHeader
 from splatnode.recon.occupancy import decode_map as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
@@ -78,6 +85,14 @@ def _read_scene(parts: Any, folder: Path) -> object:
 
 def _read_map(parts: Any, folder: Path) -> object:
     return map_from(decode(parts, MapHeader, _LIMITS))
+
+
+def _read_query(parts: Any, folder: Path) -> object:
+    return decode_query_image(decode(parts, LocateRequest, QUERY_LIMITS))
+
+
+def _read_location(parts: Any, folder: Path) -> object:
+    return parse_outcome(decode(parts, LocateAnswer, REQUEST_LIMITS).header)
 
 
 def _decoding(schema: Any, limits: Limits = _LIMITS) -> Callable[[Any, Path], object]:
@@ -277,6 +292,8 @@ _MESSAGES = (
         mutants=4,
         tidy=False,
     ),
+    Boundary("queries of places", _of(LocateRequest, _preview), _read_query, _PREVIEWS, 200, 1, mutants=4, tidy=False),
+    Boundary("answers on places", _of(LocateAnswer), _read_location, _WIRE, 10, 2, mutants=4, tidy=False),
     Boundary("states", _of(Want), _decoding(Want, REQUEST_LIMITS), _WIRE, 10, 2, mutants=4, tidy=False),
 )
 _FILES = (
