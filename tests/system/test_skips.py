@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from fnmatch import fnmatch
 
 import pytest
 
@@ -55,3 +56,9 @@ def test_what_a_machine_may_lack_is_on_the_list(tmp_path):
 def test_every_allowed_skip_has_a_reason_of_its_own_words():
     assert all(row.why and row.test for row in ALLOWED)
     assert all(row.said != "*" or row.lacking for row in ALLOWED)
+
+
+def test_every_row_is_of_a_test_file_that_there_is():
+    files = [path.relative_to(ROOT / "tests").as_posix() for path in (ROOT / "tests").rglob("test_*.py")]
+    gone = [row.test for row in ALLOWED if "/" in row.test and not any(fnmatch(file, row.test) for file in files)]
+    assert not gone, f"no test file is there for {gone}: did it move?"
