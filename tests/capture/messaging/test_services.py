@@ -18,5 +18,6 @@ def test_names_and_ports_stay():
         "capture.control": 7,
         "recon.map": 8,
         "recon.depth": 10,
+        "recon.locate": 12,
     }
     assert network.RECON_SCENE.requests == Service("recon.scene.requests", network.Pattern.STATE, 4)
