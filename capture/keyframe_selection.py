@@ -481,6 +481,9 @@ def group_frame_sets(
             yield tuple(together)
             together = []
         together.append(each)
+        if not each.camera_id or each.captured_at is None:  # nothing can be together with it
+            yield (each,)
+            together = []
     if together:
         yield tuple(together)
 

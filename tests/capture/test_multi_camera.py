@@ -50,6 +50,18 @@ def write_film(file: Path, count: int = 3, rate: int = 10) -> Path:
     return file
 
 
+def test_a_frame_without_a_camera_waits_for_no_other():
+    """A recording that is interrupted after it keeps it."""
+
+    def interrupted():
+        yield Frame(0, "one.png", 0, picture(0), None)
+        raise KeyboardInterrupt
+
+    together = next(group_frame_sets(interrupted()))
+    assert isinstance(together, tuple)
+    assert [each.name for each in together] == ["one.png"]
+
+
 def test_a_folder_per_camera_is_one_stream_of_frame_sets(tmp_path):
     for camera in ("right", "left"):
         write_photographs(tmp_path / camera, ["img2.png", "img10.png"])

@@ -24,7 +24,7 @@ ALLOWED = (
     AllowedSkip("recon/priors/test_priors.py*", "*splatnode weights*", "weights of gigabytes, which no registry has"),
     AllowedSkip("*lpips*", "needs*LPIPS*weights*", "the shared test data has one network's weights at most"),
     AllowedSkip("*/formats/test_tum_with_evo.py*", "needs evo*", "half a gigabyte; test_tum.py has the format's rules"),
-    AllowedSkip("extras/viewers/test_rrd.py*", "needs rerun", "half a gigabyte; ./run test has it where it is installed"),
+    AllowedSkip("extras/viewers/test_rrd.py*", "needs rerun", "half a gigabyte; ./run test runs it where it is"),
     AllowedSkip("extras/viewers/test_rerun_stream.py*", "needs rerun", "likewise"),
     AllowedSkip("api/test_window.py*", "needs rerun", "likewise"),
     AllowedSkip("api/test_window.py*", "needs viser", "its wheels could not be installed", "viser"),
