@@ -490,8 +490,7 @@ def group_frame_sets(
 
 def _is_together(frames: Sequence[Frame], frame: Frame, tolerance_s: float) -> bool:
     first, second = frames[0].captured_at, frame.captured_at
-    ids = [each.camera_id for each in frames]
-    if first is None or second is None or not frame.camera_id or frame.camera_id in ids or not all(ids):
+    if first is None or second is None or not frame.camera_id or frame.camera_id in {each.camera_id for each in frames}:
         return False
     return are_taken_together(first, second, tolerance_s)
 

@@ -128,10 +128,15 @@ def _lay_out(
     start = np.floor(low / voxel).astype(np.int64) - 1
     states = np.zeros(tuple((np.ceil(high / voxel).astype(np.int64) + 1 - start).tolist()), np.uint8)
     if base is not None:
-        x, y, z = (np.round(base.origin / voxel).astype(np.int64) - start).tolist()
-        a, b, c = base.states.shape
-        states[x : x + a, y : y + b, z : z + c] = base.states
+        _copy_states(base, np.round(base.origin / voxel).astype(np.int64) - start, states)
     return states, start, voxel
+
+
+def _copy_states(base: OccupancyMap, at: npt.NDArray[np.int64], states: npt.NDArray[np.uint8]) -> None:
+    """Copies the states of `base` into larger ones, its first voxel to the number `at` (3,)."""
+    x, y, z = at.tolist()
+    a, b, c = base.states.shape
+    states[x : x + a, y : y + b, z : z + c] = base.states
 
 
 def _find_known_corners(part: PlacedMap) -> Array:
@@ -479,9 +484,7 @@ class WholeMapper:
 def _mark_new(whole: OccupancyMap, base: OccupancyMap) -> npt.NDArray[np.bool_]:
     """(X, Y, Z) the voxels of `whole` that are another than in `base`, which it was made of."""
     before = np.zeros_like(whole.states)
-    x, y, z = np.round((base.origin - whole.origin) / whole.voxel).astype(int).tolist()
-    a, b, c = base.states.shape
-    before[x : x + a, y : y + b, z : z + c] = base.states
+    _copy_states(base, np.round((base.origin - whole.origin) / whole.voxel).astype(np.int64), before)
     return before != whole.states
 
 

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from splatnode.recon.geometry import align_cameras, compute_rms_radius, cross_matrix
+from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, cross_matrix
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import (
@@ -488,7 +488,7 @@ def _pairs_say(
             continue
         rotation, _, num_fit = _relative(problem, partial, (i, j), config)
         given = partial.estimate.rotations[j] @ partial.estimate.rotations[i].T
-        apart_deg = math.degrees(Rotation.from_matrix(rotation @ given.T).magnitude())
+        apart_deg = float(angles_deg(rotation, given))
         found[i, j] = -int(contradicts_poses(len(pair.matches), num_fit, apart_deg))
     return found
 

@@ -15,6 +15,7 @@ import itertools
 import json
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -22,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from splatnode.capture.frame import make_given_pose
+from splatnode.capture.frame import Frame, make_given_pose
 from splatnode.capture.process.terminal import say
 from splatnode.extras.evaluate.dataset import EvaluationScene, load_scene, load_split
 from splatnode.recon.config import apply_changes, preset
@@ -112,14 +113,19 @@ def _write(out: Path, found: list[Row]) -> None:
 
 def _match(folder: Path, views: int) -> _Set:
     scene = load_scene(folder)
-    names = load_split(folder, list(scene.cameras), views).train
+    frames = load_frames_with_lens(scene, load_split(folder, list(scene.cameras), views).train)
+    alone = apply_changes(CONFIG, {"registration": {"trust_poses": False}})
+    graph = estimate_frame_cameras(frames, load_prior(alone), alone, Clock())[0].graph
+    return _Set(scene, graph, find_distance(scene))
+
+
+def load_frames_with_lens(scene: EvaluationScene, names: Sequence[str]) -> list[Frame]:
+    """The photographs, whose lens is told."""
     frames = []
     for frame in scene.frames(names):
         lens = scene.cameras[frame.name].intrinsics_for(frame.width, frame.height)
         frames.append(replace(frame, intrinsics=replace(lens, source="given")))
-    alone = apply_changes(CONFIG, {"registration": {"trust_poses": False}})
-    graph = estimate_frame_cameras(frames, load_prior(alone), alone, Clock())[0].graph
-    return _Set(scene, graph, _distance(scene))
+    return frames
 
 
 def _row(matched: _Set, kind: str, seed: int) -> Row:
@@ -170,7 +176,7 @@ def _disturbed(T: Array, generator: np.random.Generator, kind: str) -> Array:
     return told
 
 
-def _distance(scene: EvaluationScene) -> float:
+def find_distance(scene: EvaluationScene) -> float:
     """The median depth at which the true cameras' axes meet, in the unit of the scene."""
     Ts = np.stack([camera.T_world_camera for camera in scene.cameras.values()])
     return float(np.median(axis_depths(np.swapaxes(Ts[:, :3, :3], 1, 2), Ts[:, :3, 3])))

@@ -29,8 +29,8 @@ from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.estimation import Reconstruction, estimate_cameras, load_prior
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.pipeline import estimate_frame_cameras
-from splatnode.recon.registration.known_poses import axis_depths
 from splatnode.recon.threads import Clock
+from tests.bench.quality.known_poses import find_distance, load_frames_with_lens
 
 Array = npt.NDArray[np.float64]
 
@@ -103,17 +103,7 @@ def drift(Ts: Sequence[Array], generator: np.random.Generator) -> list[Array]:
 
 def match(scene: EvaluationScene, names: Sequence[str]) -> Reconstruction:
     """The set without odometry; the lens is told."""
-    frames = []
-    for frame in scene.frames(names):
-        lens = scene.cameras[frame.name].intrinsics_for(frame.width, frame.height)
-        frames.append(replace(frame, intrinsics=replace(lens, source="given")))
-    return estimate_frame_cameras(frames, load_prior(ALONE), ALONE, Clock())[0]
-
-
-def find_distance(scene: EvaluationScene) -> float:
-    """The median depth at which the true cameras' axes meet, in the unit of the scene."""
-    Ts = np.stack([camera.T_world_camera for camera in scene.cameras.values()])
-    return float(np.median(axis_depths(np.swapaxes(Ts[:, :3, :3], 1, 2), Ts[:, :3, 3])))
+    return estimate_frame_cameras(load_frames_with_lens(scene, names), load_prior(ALONE), ALONE, Clock())[0]
 
 
 def judge(scene: EvaluationScene, names: Sequence[str], generator: np.random.Generator) -> Row:
