@@ -13,7 +13,7 @@ pytest.importorskip("pycolmap", reason="rivals need pycolmap (pip install 'splat
 
 from splatnode.extras.evaluate.methods import Start
 from splatnode.extras.evaluate.protocol import create_empty_networks
-from splatnode.extras.evaluate.rivals import colmap_3dgs
+from splatnode.extras.evaluate.rivals import colmap_3dgs, colmap_fsgs
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.threads import Clock
@@ -53,6 +53,13 @@ def test_recipes_get_the_cameras_and_points_of_the_given_poses():
         assert np.allclose(view.T_world_camera, camera.T_world_camera)
         scale = max(view.image.shape) / 32
         assert view.K[0, 0] == pytest.approx(scale * camera.focal) and view.lens is None
+
+
+def test_fsgs_knows_the_range_of_a_view_that_observes_no_point():
+    model = given_scenes.make_sparse_model(estimate_of([[0.1 * x, 0.0, 1.0] for x in range(4)]))
+    assert model is not None and max(map(len, model.observed)) < 3
+    scene = colmap_fsgs.initialize_scene_with_depth(model, 0)
+    assert all(view.pointmap is not None for view in scene.views)
 
 
 def test_a_recipe_without_points_is_a_row_that_says_why():
