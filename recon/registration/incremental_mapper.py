@@ -357,6 +357,8 @@ _MAX_SPLITS = 4  # rounds in which views get lenses of their own
 _MAX_DOUBTED = 8  # views for which other focal lengths are tried at once
 _DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
 _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
+# Of two maps, the median error of the matches of the better one over that of the other, from which on they explain them
+_AS_WELL, _NEARLY = 0.97, 0.9  # as well as each other, and nearly so
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
 
@@ -451,6 +453,57 @@ def give_own_lenses(
     images: Sequence[PatchImage],
     config: MapperConfig,
     pause: Callable[[], None] = lambda: None,
+) -> tuple[MapperInput, FinalMap]:
+    """Both, with lenses of their own for the views that refute the common one, or with pixels that are not square.
+
+    Each can pass for the other in part. Where another aspect alone explains much, the map is continued from it, too,
+    and the one that explains the matches better is kept; as well with fewer lenses is better, too. Where it explains
+    them nearly as well with fewer lenses, the aspect counts as unknown.
+    """
+    own = _separate_lenses(problem, finished, images, config, pause)
+    stretched = self_calibration.free_aspects(finished.map, finished.loss, config.own_lenses)
+    if stretched is None:
+        problem, stretched = own[0], self_calibration.free_aspects(own[1].map, own[1].loss, config.own_lenses)
+    if stretched is None:
+        return own
+    stretched = extend(problem, stretched, config.incremental)
+    again = run_final_adjustment(problem, stretched, images, config.finishing)
+    if again is None:
+        return own
+    other = _separate_lenses(problem, again, images, config, pause)
+    return _choose_aspect(own, other, config)
+
+
+def _choose_aspect(
+    own: tuple[MapperInput, FinalMap], other: tuple[MapperInput, FinalMap], config: MapperConfig
+) -> tuple[MapperInput, FinalMap]:
+    """The one of two maps that explains the matches better; `other` was continued from pixels that are not square."""
+    if not self_calibration.is_stretched(other[1].map, config.own_lenses):
+        return own
+    before, after = (_median_error(problem, found.map) for problem, found in (own, other))
+    simpler = len(other[0].lenses) < len(own[0].lenses)  # an aspect that does what several lenses do is no chance
+    if after < before / _AS_WELL if simpler else after < before * _AS_WELL:
+        return other
+    if simpler and after < before / _NEARLY:
+        prior = self_calibration.free_aspect_prior(own[1].map, config.own_lenses)
+        return own[0], replace(own[1], map=replace(own[1].map, prior=prior))
+    return own
+
+
+def _median_error(problem: MapperInput, partial: PartialMap) -> float:
+    """The median Sampson error of all matches, pixels at REFERENCE_SIDE; infinite are those of missing views."""
+    errors = mapping_problem.pair_errors(problem, partial)
+    return float(
+        np.median(np.concatenate([errors.get(k, np.full(len(p.matches), np.inf)) for k, p in problem.pairs.items()]))
+    )
+
+
+def _separate_lenses(
+    problem: MapperInput,
+    finished: FinalMap,
+    images: Sequence[PatchImage],
+    config: MapperConfig,
+    pause: Callable[[], None],
 ) -> tuple[MapperInput, FinalMap]:
     """Both, with lenses of their own for the views that refute the common one.
 

@@ -229,6 +229,10 @@ class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of what all images have in common where it is given: calibrations differ by as much
     calibrated_focal: float = 0.002  # of log focal
     calibrated_shift: float = 0.001  # of the principal point, as a share of the longer side
+    # Pixels far from square, which the search for deviations does not find, are tried where a free aspect differs at
+    # least so much (of the log aspect) and leaves at most such a share of the cost
+    least_aspect: float = 0.05
+    aspect_gain: float = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -363,6 +367,34 @@ def split_lenses(
     numbered = [replace(view, lens=int(lens)) for view, lens in zip(problem.views, lens_of, strict=True)]
     problem = replace(problem, views=tuple(numbered), lenses=tuple(lenses))
     return problem, replace(partial, estimate=estimate, prior=prior)
+
+
+def free_aspects(
+    partial: PartialMap, loss: bundle_adjustment.BundleAdjustmentConfig, config: OwnLensesConfig
+) -> PartialMap | None:
+    """The map adjusted with pixels of any aspect; None where these explain little more or are nearly what they were."""
+    before, prior = partial.estimate, free_aspect_prior(partial, config)
+    after = bundle_adjustment.adjust(before, prior, loss, partial.registered[0])
+    moved = np.abs(np.log(after.aspects / before.aspects)).max()
+    costs = [bundle_adjustment.robust_cost(each, loss) for each in (before, after)]
+    if moved < config.least_aspect or not costs[1] <= config.aspect_gain * costs[0]:
+        return None
+    return replace(partial, estimate=after, prior=prior)
+
+
+def free_aspect_prior(partial: PartialMap, config: OwnLensesConfig) -> bundle_adjustment.LensPrior:
+    """The prior of the map with pixels of any aspect, one for lenses that are tied; given lenses keep theirs."""
+    prior = partial.prior
+    lenses = partial.estimate.lens_of_camera[list(partial.registered)]
+    free = np.isin(np.arange(len(prior.sigmas)), lenses) & (prior.sigmas > 0)
+    sigmas = prior.own_sigmas[:, _ASPECT]
+    return replace(prior, aspect_sigmas=np.where(free, np.maximum(sigmas, config.widest_aspect), sigmas))
+
+
+def is_stretched(partial: PartialMap, config: OwnLensesConfig) -> bool:
+    """Whether a view of the map has pixels that are far from square."""
+    aspects = partial.estimate.aspects[partial.estimate.lens_of_camera[list(partial.registered)]]
+    return bool(np.abs(np.log(aspects)).max() > config.least_aspect)
 
 
 def find_common_lens(prior: bundle_adjustment.LensPrior, lens: int, config: OwnLensesConfig) -> int:

@@ -7,6 +7,7 @@ The table of refusals: a code, one sentence that says what was found, and what t
 
 from __future__ import annotations
 
+import string
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -83,16 +84,31 @@ class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Refusal:
-    """One entry: `message` and `advice` are templates of `str.format`, whose fields the caller of `refuse` names."""
+    """One entry: `message` and `advice` are templates of `str.format`, whose fields the caller of `refuse` names.
+
+    `{count:shows|show}` is the first word where `count` is 1, else the second.
+    """
 
     code: Code
     message: str
     advice: str
 
 
+class _Grammar(string.Formatter):
+    """The templates of refusals are filled in by it."""
+
+    def format_field(self, value: object, format_spec: str) -> str:
+        singular, either, plural = format_spec.partition("|")
+        return (singular if value == 1 else plural) if either else super().format_field(value, format_spec)
+
+
+_GRAMMAR = _Grammar()
+
+
 def refuse(refusal: Refusal, frames: Sequence[str], **values: object) -> Verdict:
     """The verdict that there is no scene, about the frames of these names. Raises KeyError for a field left open."""
-    return Verdict(refusal.code, refusal.message.format(**values), refusal.advice.format(**values), tuple(frames))
+    message, advice = (_GRAMMAR.format(text, **values) for text in (refusal.message, refusal.advice))
+    return Verdict(refusal.code, message, advice, tuple(frames))
 
 
 _STEADIER = "Hold the camera still for each photograph, or give it more light."
@@ -110,7 +126,7 @@ ONLY_COPIES = Refusal(
 )
 ALL_BLURRED = Refusal(
     Code.BLUR,
-    "{count} photographs are too blurred to work with ({first}: {reason}).",
+    "{count} {count:photograph is|photographs are} too blurred to work with ({first}: {reason}).",
     _STEADIER,
 )
 BLURRED = Refusal(
@@ -120,7 +136,7 @@ BLURRED = Refusal(
 )
 WITHOUT_TEXTURE = Refusal(
     Code.LOW_TEXTURE,
-    "{plain} of {count} photographs show too little texture to be matched.",
+    "{plain} of {count} photographs {plain:shows|show} too little texture to be matched.",
     "Let more structured things into the picture, or step back.",
 )
 NO_OVERLAP = Refusal(
@@ -153,8 +169,8 @@ WRONG_EXIF = Refusal(
 )
 WRONG_LENS = Refusal(
     Code.FOCAL_SUSPECT,
-    "{refuted} of {count} photographs contradict the lens that was given for them: they ask for other focal lengths, "
-    "in the median {change:+.0f} %.",
+    "{refuted} of {count} photographs {refuted:contradicts|contradict} the lens that was given for them: they ask for "
+    "other focal lengths, in the median {change:+.0f} %.",
     _CALIBRATION,
 )
 WRONG_FOCAL_BY_VOTE = Refusal(
@@ -176,12 +192,14 @@ UNCERTAIN_FOCAL = Refusal(
 )
 MIXED_CAMERAS = Refusal(
     Code.MIXED_CAMERAS,
-    "{others} of {count} photographs have another size than most, and their lens cannot be told.",
+    "{others} of {count} photographs {others:has|have} another size than most, and {others:its|their} lens cannot be "
+    "told.",
     "Leave them out, give their calibration, or take all photographs with one camera, uncropped.",
 )
 APART = Refusal(
     Code.SPLIT,
-    "{count} photographs may show another place: almost nothing that can be confirmed joins them to the others.",
+    "{count} {count:photograph|photographs} may show another place: almost nothing that can be confirmed joins "
+    "{count:it|them} to the others.",
     "Add photographs that connect the places, or take them one after the other.",
 )
 CONTRADICTING = Refusal(
@@ -202,8 +220,8 @@ DISAGREEING = Refusal(
 )
 NO_COMMON_LENS = Refusal(
     Code.AMBIGUOUS,
-    "{own} of {count} photographs do not have the lens of the others, as after a zoom, a crop or a change of focus, "
-    "and with a lens for each the poses stay in doubt.",
+    "{own} of {count} photographs {own:does|do} not have the lens of the others, as after a zoom, a crop or a change "
+    "of focus, and with a lens for each the poses stay in doubt.",
     "Keep zoom and focus as they are and do not crop, or give the lens of each photograph by --intrinsics.",
 )
 WEAKLY_JOINED = Refusal(
@@ -235,7 +253,8 @@ MIRRORED_IN_DEPTH = Refusal(
 )
 MIRRORED_PHOTOGRAPHS = Refusal(
     Code.AMBIGUOUS,
-    "{count} photographs show the place the wrong way round: turned left to right, they match the others better.",
+    "{count} {count:photograph shows|photographs show} the place the wrong way round: turned left to right, "
+    "{count:it matches|they match} the others better.",
     "Leave out photographs that were mirrored, or turn them back.",
 )
 TOO_CLOSE = Refusal(

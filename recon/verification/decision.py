@@ -285,8 +285,9 @@ def check_given_focal(case: EvidenceCase) -> Verdict | None:
         return None
     worst = max(doubted, key=lambda lens: abs(lens.found / lens.given - 1.0))
     change = 100 * (worst.found / worst.given - 1.0)
-    refusal = verification.WRONG_FOCAL if worst.trusted else verification.WRONG_EXIF
-    return refuse(refusal, case.names, given=worst.given, found=worst.found, change=change)
+    if worst.trusted:
+        return refuse(verification.WRONG_FOCAL, case.names, given=worst.given, found=worst.found, change=change)
+    return refuse(verification.WRONG_EXIF, case.names, given=worst.given, found=worst.found, change=change)
 
 
 def _is_contradicted(freed: FreedLens, config: DecisionConfig) -> bool:

@@ -99,7 +99,8 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
         sigmas[lens] = 0.0 if calibrated else FREE_SIGMA
         nominal[lens] = np.inf if given is None or calibrated else NOMINAL_SIGMA
         shift_sigmas[lens] = FREE_SHIFT * largest if camera.displaced else 0.0
-        aspect_sigmas[lens] = FREE_ASPECT if abs(camera.aspect - 1.0) > SQUARE else 0.0
+        stretched = abs(camera.aspect - 1.0) > SQUARE
+        aspect_sigmas[lens] = max(FREE_ASPECT, abs(np.log(camera.aspect))) if stretched else 0.0
         own[lens], near[lens] = camera.own_lens, camera.near_lens
     principal = np.stack([camera.principal for camera in cameras])
     Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)

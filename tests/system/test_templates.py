@@ -17,7 +17,6 @@ _OWN = {  # templates, and widths, of the program's own that are no constants wh
     "capture/cli.py": {"longest"},
     "extras/evaluate/report.py": {"digits", "measure.digits"},
     "recon/result/snapshot.py": {"max(decimals, 0)"},
-    "recon/verification/__init__.py": {"refusal.message.format", "refusal.advice.format"},
 }
 _LEVELS = {"debug", "info", "warning", "error", "exception", "critical"}
 

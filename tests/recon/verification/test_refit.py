@@ -10,6 +10,7 @@ import pytest
 
 from splatnode.recon.registration import bundle_adjustment
 from splatnode.recon.verification import refit
+from tests.support.verdicts import graph, registration
 
 FOCAL = 900.0
 
@@ -178,3 +179,19 @@ def test_a_lens_that_no_other_camera_shares_keeps_its_prior():
     )  # fmt: skip
     assert refit.doubt_common_lenses(alone).focals_rel.max() < 1e-6
     assert refit.doubt_common_lenses(alone).centre.max() < 0.2 * refit.doubt_common_lenses(given(fit)).centre.max()
+
+
+def test_the_prior_of_an_aspect_is_as_wide_as_the_aspect_is_far_from_square():
+    placed = replace(
+        registration((0, 1)),
+        points=np.array([[0.1, 0.0, 1.0]]),
+        observed_by=np.array([0, 1]),
+        observed_point=np.zeros(2, np.int64),
+        observed_pixels=np.array([[38.0, 24.0], [26.0, 24.0]]),
+    )
+    widths = {}
+    for aspect in (1.0, 1.05, 1.5):
+        cameras = tuple(replace(camera, aspect=aspect) for camera in placed.cameras)
+        fit = refit.build_fit(graph(2, {}).keyframes, replace(placed, cameras=cameras), 10)
+        widths[aspect] = fit.prior.own_sigmas[0, 5]
+    assert widths == pytest.approx({1.0: 0.0, 1.05: refit.FREE_ASPECT, 1.5: np.log(1.5)})
