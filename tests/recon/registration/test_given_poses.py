@@ -119,7 +119,18 @@ def test_a_false_pose_is_the_most_contradicted(turn: float, shift: float) -> Non
     worst = min(residuals, key=lambda camera: residuals[camera].probability)
     assert worst == 2
     assert residuals[worst].probability < posed_mapping.LEAST_PROBABILITY
-    assert residuals[worst].sigmas > 4.4
+    assert residuals[worst].sigmas > 3.9
+
+
+@pytest.mark.parametrize("camera", [1, 2])
+def test_a_residual_tells_where_images_have_the_camera_without_its_pose(camera: int) -> None:
+    _, found = adjusted(1, (camera, np.radians(0.4), 0.01))
+    given = found.given
+    assert given is not None
+    residual = posed_mapping.residuals(found, given, bundle_adjustment.covariance(found, TOLD, LOSS))[camera]
+    freed = bundle_adjustment.adjust(replace(found, given=given.release([camera])), TOLD, LOSS)
+    before, after = (np.concatenate(posed_mapping.deviation(each, given, camera)[:2]) for each in (found, freed))
+    np.testing.assert_allclose(residual.without, after - before, atol=0.1 * np.abs(after - before).max())
 
 
 def test_poses_whose_errors_depend_on_each_other_are_weighed_as_their_covariance_says() -> None:
