@@ -316,7 +316,7 @@ def hard_sets() -> str:
         f"Of {total['sets']} hard sets from {scenes} real scenes {total['published']} were published, "
         f"{total['right']} of them within 2° and 5 %, {beyond} beyond its claim.",
         f"Cameras with their verification take {seconds[0]:.1f}, {seconds[1]:.1f} and {seconds[2]:.1f} s in the median "
-        f"at 3, 6 and 12 views on a machine with three other jobs; depth {span(depth, 1)} s a view (`replay.json`).",
+        f"at 3, 6 and 12 views beside other work; depth {span(depth, 1)} s a view (`replay.json`).",
     )
 
 
