@@ -503,6 +503,8 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
         told, checks = estimate_scale_from_depth(
             make_metric_views(snapshot), snapshot.landmarks, evidence.depths, others
         )
+        if snapshot.given is not None and snapshot.given.from_depth:
+            told = []  # the same depth images give the unit already
         said, snapshot = said + told, replace(snapshot, depth_checks=checks)
     if not said:
         return snapshot
@@ -542,7 +544,10 @@ def _collect_measurements(
             make_metric_views(snapshot), evidence.sightings, config.marker_size_m, config.marker_size_sigma_m
         )
     aligned = None
-    if snapshot.given is not None:
+    if snapshot.given is not None and snapshot.given.from_depth:
+        known = f"depth images of {snapshot.given.num_poses} photographs, which place the cameras"
+        said.append(Measurement(snapshot.given.scale, snapshot.given.scale_sigma, known))
+    elif snapshot.given is not None:
         found = _align_to_given_world(snapshot, snapshot.given)
         aligned = None if isinstance(found, str) else found
         said.append(found if isinstance(found, str) else found.unit)

@@ -62,6 +62,7 @@ BENCHMARKS = {
         "registrations",
         "known_poses",
         "odometry_sets",
+        "plain_rooms",
         "several_cameras",
         "rigs",
         "rgbd",
