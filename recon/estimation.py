@@ -19,7 +19,7 @@ from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_by_depth
-from splatnode.recon.metric.depth_fit import fill_measured_depth
+from splatnode.recon.metric.depth_fit import fill_measured_depth, fit_depth_images, make_depth_view
 from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
 from splatnode.recon.rasterize import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
@@ -28,7 +28,7 @@ from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
 from splatnode.recon.registration.posed_mapping import offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
-from splatnode.recon.result.snapshot import Landmarks
+from splatnode.recon.result.snapshot import DepthCode, Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Verdict
 from splatnode.recon.threads import make_deadline_pause
 from splatnode.recon.verification.decision import decide, refuse_before_registration
@@ -292,7 +292,7 @@ def estimate_cameras_by_depth(
 ) -> Reconstruction | None:
     """The estimate whose cameras depth images place, in metres, however little the images share.
 
-    None where depth images place fewer than two cameras, or the matches of the images contradict them. `pause` is
+    None where depth images place fewer than two cameras, or what the images match contradicts them. `pause` is
     called about once a second and may raise.
     """
     placed = {each.name: each for each in place_by_depth([each.frame for each in graph.keyframes], pause)}
@@ -313,7 +313,21 @@ def estimate_cameras_by_depth(
     registration = replace(found, given=given)
     verdict = decide_posed(graph, registration, given, config.decision)
     posed = Reconstruction(graph, registration, None, verdict)
-    return None if _is_contradicted(posed, find_telling_pairs(graph)) else posed
+    is_refuted = _is_contradicted(posed, find_telling_pairs(graph)) or _points_contradict_depth(posed)
+    return None if is_refuted else posed
+
+
+def _points_contradict_depth(posed: Reconstruction) -> bool:
+    """Whether points that the images see from the cameras lie elsewhere than depth images have them."""
+    if posed.registration is None:
+        return False
+    keyframes = posed.graph.keyframes
+    views = [
+        make_depth_view(keyframes[camera.index], posed.registration, camera)
+        for camera in posed.registration.cameras
+        if keyframes[camera.index].frame.depth is not None
+    ]
+    return any(fit.check.code is DepthCode.CONTRADICTS for fit in fit_depth_images(views))
 
 
 def find_telling_pairs(graph: ViewGraph) -> set[Pair]:
