@@ -171,7 +171,7 @@ def find_exchanged_depth(clouds: Sequence[DepthCloud]) -> dict[int, int]:
 
 
 def _explain_light(cloud: DepthCloud, lights: Sequence[Array]) -> tuple[Array, Array]:
-    """What planes of the cloud leave unexplained of each brightness: standard deviation, and share of the variance."""
+    """Returns what planes of the cloud leave unexplained of each brightness: standard deviation, share of variance."""
     near, own = cloud.points.astype(np.float32), cloud.normals[cloud.chosen].astype(np.float32)
     noise = cloud.sigma[cloud.chosen].astype(np.float32)
     off = np.abs(own @ near.T - (own * near).sum(1)[:, None]) < _PLANE_SIGMAS * (noise + noise[:, None])
@@ -208,7 +208,7 @@ def _look_up(target: DepthCloud, points: Array) -> tuple[Index, Mask]:
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:
-    """Of points (..., N) from the planes that they fall on."""
+    """The residuals of points (..., N) from the planes that they fall on."""
 
     off: Array  # signed distance, metres
     normals: Array  # (..., N, 3) of the planes
@@ -305,7 +305,7 @@ _DISTRUSTED = 0.03  # share of the points that count in a direction, those that 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where one cloud's camera is in another one's frame, by their surfaces."""
+    """The place of one cloud's camera in another one's frame, by their surfaces."""
 
     T_target_cloud: Array  # (4, 4)
     forward: Agreement
@@ -313,7 +313,7 @@ class Alignment:
 
     @property
     def score(self) -> float:
-        """That of the worse direction."""
+        """The score of the worse direction."""
         return min(self.forward.score, self.backward.score)
 
     @property
@@ -436,7 +436,7 @@ def _invert(T: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Information:
-    """What surfaces tell of the turn and the shift (6) that move a cloud in the target's frame."""
+    """The information of surfaces on the turn and the shift (6) that move a cloud in the target's frame."""
 
     matrix: Array  # (6, 6)
     gradient: Array  # (6,)
@@ -479,7 +479,7 @@ _MOST_SIGMA, _MOST_SIGMA_DEG = 0.03, 1.0  # of a camera that is placed: share of
 
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
-    """Where depth images place a camera, in the frame of the first one that they place."""
+    """The place that depth images give a camera, in the frame of the first one that they place."""
 
     name: str
     T_world_camera: Array  # (4, 4) metres
@@ -541,7 +541,7 @@ def _place(
     clouds: Sequence[DepthCloud], poses: Mapping[int, Array], pause: Callable[[], None]
 ) -> tuple[dict[int, Array], list[tuple[float, float]]] | None:
     """Poses of the cameras of which little is open, with sigmas, metres and degrees; None where clouds contradict."""
-    views = _put_surest_first(clouds, poses)
+    views = _list_surest_first(clouds, poses)
     for _ in range(_ROUNDS):
         pause()
         poses, _ = _adjust(clouds, poses, views)
@@ -561,8 +561,8 @@ def _place(
     return {i: poses[i] for i in views}, sigmas
 
 
-def _put_surest_first(clouds: Sequence[DepthCloud], poses: Mapping[int, Array]) -> list[int]:
-    """The numbers of the poses: first the one of which the others together tell most where they leave most open."""
+def _list_surest_first(clouds: Sequence[DepthCloud], poses: Mapping[int, Array]) -> list[int]:
+    """Lists the numbers of the poses: first the one of whose least known direction the others tell most."""
     least = []
     for i in sorted(poses):
         found = [
