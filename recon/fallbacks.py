@@ -37,6 +37,7 @@ from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_
 from splatnode.recon.networks import Weights, depth_anything, find_mismatch, locate_weights
 from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
+from splatnode.recon.registration.known_poses import TOLD
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import is_over
 
@@ -275,6 +276,7 @@ WANTING_SIGHT = (
     *(Code.NO_OVERLAP, Code.SPLIT, Code.AMBIGUOUS, Code.LOW_TEXTURE, Code.NO_PARALLAX, Code.PLANAR_ONLY),
     *(Code.BASELINE_TOO_SMALL, Code.UNDETERMINED),
 )
+LENS_FOR_DEPTH = "Give the lens (--intrinsics FILE; Python: intrinsics=): with it depth images can place the cameras."
 # Of the others, what more cameras may mend, where some keyframes have none: few leave much open.
 UNCERTAIN = (Code.OK_ROUGH, Code.TOO_ROUGH, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY, Code.BASELINE_TOO_SMALL)
 
@@ -304,7 +306,7 @@ def run_fallbacks(
         return estimate
     by_depth = estimate_cameras_by_depth(estimate.graph, config, pause)
     if by_depth is None or not by_depth.publishable:
-        return estimate
+        return _advise_lens(estimate)
     log.info("depth images place %d cameras", len(by_depth.camera_names))
     return by_depth
 
@@ -363,6 +365,15 @@ def _wants_depth(estimate: Reconstruction) -> bool:
     """Whether photographs show too little, where few matches at most speak against a lens."""
     code = estimate.verdict.code
     return code in WANTING_SIGHT or (code is Code.FOCAL_SUSPECT and not find_telling_pairs(estimate.graph))
+
+
+def _advise_lens(estimate: Reconstruction) -> Reconstruction:
+    """Appends to the advice that depth images could place the cameras, where they came without a lens that was told."""
+    frames = [keyframe.frame for keyframe in estimate.graph.keyframes if keyframe.frame.depth is not None]
+    if len(frames) < 2 or any(frame.intrinsics is not None and frame.intrinsics.source in TOLD for frame in frames):
+        return estimate
+    advice = f"{estimate.verdict.advice} {LENS_FOR_DEPTH}".strip()
+    return replace(estimate, verdict=replace(estimate.verdict, advice=advice))
 
 
 def _lacks_matches(estimate: Reconstruction) -> bool:

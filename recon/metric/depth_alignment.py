@@ -10,6 +10,7 @@ covariance, and a camera of which too much is open is not placed.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.geometry import cross_matrix
 from splatnode.recon.metric.depth_fit import DepthView, fit_planes, warp_depth
 from splatnode.recon.registration.known_poses import TOLD
@@ -26,6 +28,8 @@ from splatnode.recon.registration.known_poses import TOLD
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+
+log = logging.getLogger(__name__)
 
 # The surface that a depth image shows: points with normals.
 
@@ -142,6 +146,43 @@ def _share_normals(
     return np.where(alike, theirs, normals), np.where(alike, broad[place].astype(np.float64), 0.0)
 
 
+# Whether a depth image goes with its photograph: surfaces are of one brightness each, which ends where they end.
+
+_LATEST = 4  # in the order of the frames: by so many a depth image may be late
+_FITS_BETTER, _FITS = 2.0, 0.5  # unexplained share of its own photograph over that of another one, which is at most
+_LEAST_LIGHT = 0.01  # standard deviation of the logarithm of brightness that surfaces leave unexplained
+
+
+def find_exchanged_depth(clouds: Sequence[DepthCloud]) -> dict[int, int]:
+    """The clouds, in the order of their frames, whose depth fits another one's photograph much better; and which one.
+
+    A depth camera that hangs or is late gives such, and they agree with each other wherever the camera was.
+    """
+    found = {}
+    for k, cloud in enumerate(clouds):
+        first = max(0, k - _LATEST)
+        around = [each for each in clouds[first : k + _LATEST + 1] if each.shape == cloud.shape]
+        own = next(place for place, each in enumerate(around) if each is cloud)
+        noise, share = _explain_light(cloud, [each.log_light for each in around])
+        best = int(np.argmin(share))
+        if noise[own] > _LEAST_LIGHT and share[best] < _FITS and share[own] > _FITS_BETTER * share[best]:
+            found[k] = next(place for place, each in enumerate(clouds) if each is around[best])
+    return found
+
+
+def _explain_light(cloud: DepthCloud, lights: Sequence[Array]) -> tuple[Array, Array]:
+    """Returns what planes of the cloud leave unexplained of each brightness: standard deviation, share of variance."""
+    near, own = cloud.points.astype(np.float32), cloud.normals[cloud.chosen].astype(np.float32)
+    noise = cloud.sigma[cloud.chosen].astype(np.float32)
+    off = np.abs(own @ near.T - (own * near).sum(1)[:, None]) < _PLANE_SIGMAS * (noise + noise[:, None])
+    mates = (off & off.T & (own @ own.T > np.cos(np.radians(_MATES_DEG[-1])))).astype(np.float32)
+    light = np.stack([each[cloud.chosen] for each in lights], 1)
+    light -= light.mean(0)
+    left = light - (mates @ light.astype(np.float32)) / np.maximum(mates.sum(1), 1.0)[:, None]
+    unexplained = (left**2).mean(0)
+    return np.sqrt(unexplained), unexplained / np.maximum((light**2).mean(0), 1e-12)
+
+
 # How one cloud lies beside another one.
 
 _FLOOR_M = 0.004  # of the distance between surfaces, beside what the noise makes
@@ -167,7 +208,7 @@ def _look_up(target: DepthCloud, points: Array) -> tuple[Index, Mask]:
 
 @dataclass(frozen=True, eq=False)
 class _Residuals:
-    """Of points (..., N) from the planes that they fall on."""
+    """The residuals of points (..., N) from the planes that they fall on."""
 
     off: Array  # signed distance, metres
     normals: Array  # (..., N, 3) of the planes
@@ -250,10 +291,13 @@ _COARSE_POINTS = 250
 _COARSE_GATES_M = (0.6, 0.45, 0.35, 0.25, 0.2, 0.15, 0.12, 0.1)  # of residuals, step by step
 _FINE_GATES_M = (0.1,) * 3 + (0.0,) * 10
 _KEPT = 12  # alignments that are refined
+_SHIFTS_M = np.delete(np.arange(-2.4, 2.5, 0.15), 16)  # of further starts from the best, for a surface 2 m away
+_SHIFTED_GATES_M = (0.15, 0.15, 0.12, 0.12, 0.1, 0.1)
 _DAMPING = 1e2  # 1 / radians^2, 1 / metres^2
 _LONGEST_TURN, _LONGEST_SHIFT_M = 0.3, 0.5  # of a step, radians and metres
 _SAME_DEG, _SAME_M = 4.0, 0.1  # between alignments that are one
 _LEAST_AHEAD = 0.04  # of the best alignment's score over that of another one
+_RIVAL_OVERLAP, _RIVAL_BEFORE = 0.4, 0.01  # of an alignment that nothing contradicts, in the mean and at most
 _SAME_SIGMAS = 4.0  # between alignments that differ in what surfaces leave open only
 _POINTS_AS_ONE = 10.0  # neighbours are wrong alike, and each pair is seen from both sides
 _DISTRUSTED = 0.03  # share of the points that count in a direction, those that tell most
@@ -261,7 +305,7 @@ _DISTRUSTED = 0.03  # share of the points that count in a direction, those that 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where one cloud's camera is in another one's frame, by their surfaces."""
+    """The place of one cloud's camera in another one's frame, by their surfaces."""
 
     T_target_cloud: Array  # (4, 4)
     forward: Agreement
@@ -269,23 +313,55 @@ class Alignment:
 
     @property
     def score(self) -> float:
-        """That of the worse direction."""
+        """The score of the worse direction."""
         return min(self.forward.score, self.backward.score)
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether nothing contradicts it, however much better another one overlaps, as where surfaces repeat."""
+        both = self.forward, self.backward
+        return sum(each.overlap for each in both) >= 2 * _RIVAL_OVERLAP and all(
+            each.on_surface >= _LEAST_ON and each.before <= _RIVAL_BEFORE and each.darker <= _MOST_DARKER
+            for each in both
+        )
 
 
 def align_clouds(cloud: DepthCloud, target: DepthCloud) -> list[Alignment]:
-    """The distinct alignments of two clouds, the best first."""
+    """The distinct alignments of two clouds, the best first.
+
+    Of surfaces that repeat themselves, as doors along a corridor, those are among them that a start beside the best
+    one leads to.
+    """
     generator = np.random.default_rng(0)
     few = np.sort(generator.choice(len(cloud.chosen), min(_COARSE_POINTS, len(cloud.chosen)), replace=False))
     Ts = _descend(cloud, target, _make_starts(cloud), cloud.chosen[few], _COARSE_GATES_M)
+    found = _refine(cloud, target, Ts)
+    beside = _shift_starts(cloud, target, found[0].T_target_cloud)
+    found += _refine(cloud, target, _descend(cloud, target, beside, cloud.chosen[few], _SHIFTED_GATES_M))
+    found.sort(key=lambda each: -each.score)
+    return [found[k] for k in _find_distinct(np.stack([each.T_target_cloud for each in found]))]
+
+
+def _refine(cloud: DepthCloud, target: DepthCloud, Ts: Array) -> list[Alignment]:
+    """The best few of the poses (S, 4, 4), refined, the best first."""
     scores = [compute_agreement(cloud, target, T).score for T in Ts]
     Ts = Ts[np.argsort(np.negative(scores), kind="stable")]
     Ts = _descend(cloud, target, Ts[_find_distinct(Ts)[:_KEPT]], cloud.chosen, _FINE_GATES_M)
     found = [
         Alignment(T, compute_agreement(cloud, target, T), compute_agreement(target, cloud, _invert(T))) for T in Ts
     ]
-    found.sort(key=lambda each: -each.score)
-    return [found[k] for k in _find_distinct(np.stack([each.T_target_cloud for each in found]))]
+    return sorted(found, key=lambda each: -each.score)
+
+
+def _shift_starts(cloud: DepthCloud, target: DepthCloud, T: Array) -> Array:
+    """(S, 4, 4) poses beside `T`, shifted the two ways of which surfaces tell least."""
+    sure = _compute_information(cloud, target, T).sure
+    turns = sure[:3, :3] + _DAMPING * np.eye(3)
+    _, ways = np.linalg.eigh(sure[3:, 3:] - sure[3:, :3] @ np.linalg.solve(turns, sure[:3, 3:]))
+    far = float(np.median(cloud.points[:, 2])) / 2.0
+    Ts = np.tile(T, (2 * len(_SHIFTS_M), 1, 1))
+    Ts[:, :3, 3] += (far * _SHIFTS_M[:, None] * ways.T[:2, None]).reshape(-1, 3)
+    return Ts
 
 
 def choose_alignment(alignments: Sequence[Alignment], cloud: DepthCloud, target: DepthCloud) -> Array | None:
@@ -295,9 +371,8 @@ def choose_alignment(alignments: Sequence[Alignment], cloud: DepthCloud, target:
         return None
     known = _compute_information(cloud, target, best.T_target_cloud).sure
     for other in alignments[1:]:
-        if other.score < best.score - _LEAST_AHEAD:
-            break
-        if _count_sigmas(best.T_target_cloud, other.T_target_cloud, known) > _SAME_SIGMAS:
+        is_rival = other.is_possible or other.score >= best.score - _LEAST_AHEAD
+        if is_rival and _count_sigmas(best.T_target_cloud, other.T_target_cloud, known) > _SAME_SIGMAS:
             return None
     return best.T_target_cloud
 
@@ -361,7 +436,7 @@ def _invert(T: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Information:
-    """What surfaces tell of the turn and the shift (6) that move a cloud in the target's frame."""
+    """The information of surfaces on the turn and the shift (6) that move a cloud in the target's frame."""
 
     matrix: Array  # (6, 6)
     gradient: Array  # (6,)
@@ -404,7 +479,7 @@ _MOST_SIGMA, _MOST_SIGMA_DEG = 0.03, 1.0  # of a camera that is placed: share of
 
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
-    """Where depth images place a camera, in the frame of the first one that they place."""
+    """The place that depth images give a camera, in the frame of the first one that they place."""
 
     name: str
     T_world_camera: Array  # (4, 4) metres
@@ -422,6 +497,11 @@ def place_by_depth(frames: Sequence[Frame], pause: Callable[[], None] = lambda: 
     """
     ordered = sorted(frames, key=lambda frame: (frame.stamp_ns, frame.frame_id, frame.name))
     clouds = [cloud for frame in ordered if (cloud := make_depth_cloud(frame)) is not None]
+    exchanged = find_exchanged_depth(clouds)
+    for k, other in exchanged.items():
+        names = sanitize_text(clouds[k].name), sanitize_text(clouds[other].name)
+        log.warning("the depth image of %s fits the photograph %s much better, and is not used", *names)
+    clouds = [cloud for k, cloud in enumerate(clouds) if k not in exchanged]
     aligned: dict[tuple[int, int], Array] = {}
     for i in range(len(clouds)):
         for j in range(i + 1, min(i + 1 + _NEIGHBOURS, len(clouds))):
@@ -461,21 +541,17 @@ def _place(
     clouds: Sequence[DepthCloud], poses: Mapping[int, Array], pause: Callable[[], None]
 ) -> tuple[dict[int, Array], list[tuple[float, float]]] | None:
     """Poses of the cameras of which little is open, with sigmas, metres and degrees; None where clouds contradict."""
-    views = sorted(poses)
-    covariance = np.zeros((0, 0))
+    views = _list_surest_first(clouds, poses)
     for _ in range(_ROUNDS):
         pause()
-        poses, covariance = _adjust(clouds, poses, views)
-    while True:
-        sigmas = _compute_sigmas(covariance)
-        shares = [sigma / float(np.median(clouds[i].points[:, 2])) for i, (sigma, _) in zip(views, sigmas, strict=True)]
-        worst = max(range(len(views)), key=lambda k: max(shares[k] / _MOST_SIGMA, sigmas[k][1] / _MOST_SIGMA_DEG))
-        if shares[worst] <= _MOST_SIGMA and sigmas[worst][1] <= _MOST_SIGMA_DEG:
-            break
-        views = [i for k, i in enumerate(views) if k != worst]
+        poses, _ = _adjust(clouds, poses, views)
+    # First beside the surest one, for all others are open beside one that is, then beside the first, as they are told
+    for order in (list, sorted):
+        pause()
+        views = order(views)
+        poses, sigmas, views = _leave_out_open(clouds, poses, views, pause)
         if len(views) < 2:
             return None
-        poses, covariance = _adjust(clouds, poses, views)
     for i in views:
         for j in views:
             if i != j:
@@ -483,6 +559,35 @@ def _place(
                 if agreement.overlap >= _LEAST_OVERLAP and agreement.is_contradicted:
                     return None
     return {i: poses[i] for i in views}, sigmas
+
+
+def _list_surest_first(clouds: Sequence[DepthCloud], poses: Mapping[int, Array]) -> list[int]:
+    """Lists the numbers of the poses: first the one of whose least known direction the others tell most."""
+    least = []
+    for i in sorted(poses):
+        found = [
+            _compute_information(clouds[i], clouds[j], _invert(poses[j]) @ poses[i]).sure
+            for j in sorted(poses)
+            if abs(i - j) in range(1, _NEIGHBOURS + 1)
+        ]
+        least.append(float(np.linalg.eigvalsh(np.sum(found, axis=0))[0]) if found else 0.0)
+    first = sorted(poses)[int(np.argmax(least))]
+    return [first, *(i for i in sorted(poses) if i != first)]
+
+
+def _leave_out_open(
+    clouds: Sequence[DepthCloud], poses: Mapping[int, Array], views: list[int], pause: Callable[[], None]
+) -> tuple[dict[int, Array], list[tuple[float, float]], list[int]]:
+    """Poses, sigmas and numbers of the cameras of which little is open beside the first one, which stays."""
+    while True:
+        pause()
+        moved, covariance = _adjust(clouds, poses, views)
+        sigmas = _compute_sigmas(covariance)
+        shares = [sigma / float(np.median(clouds[i].points[:, 2])) for i, (sigma, _) in zip(views, sigmas, strict=True)]
+        worst = max(range(len(views)), key=lambda k: max(shares[k] / _MOST_SIGMA, sigmas[k][1] / _MOST_SIGMA_DEG))
+        if len(views) < 2 or (shares[worst] <= _MOST_SIGMA and sigmas[worst][1] <= _MOST_SIGMA_DEG):
+            return moved, sigmas, views
+        views = [i for k, i in enumerate(views) if k != worst]
 
 
 def _make_cameras(
