@@ -29,9 +29,16 @@ from splatnode.recon.registration.posed_mapping import offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.result.snapshot import DepthCode, Landmarks
-from splatnode.recon.result.verdict import SURE, Bounds, Verdict
+from splatnode.recon.result.verdict import SURE, Bounds, Code, Verdict
 from splatnode.recon.threads import make_deadline_pause
-from splatnode.recon.verification.decision import decide, refuse_before_registration
+from splatnode.recon.verification.decision import (
+    EXIF_LEFT_OUT,
+    contradicts_exif,
+    decide,
+    excludes_exif,
+    forget_exif,
+    refuse_before_registration,
+)
 from splatnode.recon.verification.error_model import (
     compute_log_odds,
     compute_placed_bounds,
@@ -258,6 +265,12 @@ def _estimate_from_images(
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
         return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
+    found = _register_and_verify(graph, config, pause)
+    doubted = contradicts_exif(graph, found.registration, found.evidence, found.verdict, config.decision)
+    return _estimate_without_exif(found, config, pause) if doubted else found
+
+
+def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, pause: Callable[[], None]) -> Reconstruction:
     registration = register(graph.keyframes, graph.pairs, config.registration, pause, config.frame_set_tolerance_s)
     pause()
     seen = None if registration is None else registration.image_part
@@ -267,6 +280,23 @@ def _estimate_from_images(
     if registration is not None and registration.rig is not None:
         verdict = describe_rig(verdict, graph, registration.rig)
     return Reconstruction(graph, registration if verdict.publishable else seen, evidence, verdict)
+
+
+def _estimate_without_exif(
+    found: Reconstruction, config: ReconstructionConfig, pause: Callable[[], None]
+) -> Reconstruction:
+    """The estimate as if EXIF told no focal length, where its bounds exclude what EXIF tells; else `found`."""
+    graph = found.graph
+    other = _register_and_verify(forget_exif(graph), config, pause)
+    if other.registration is None or not other.verdict.publishable:
+        return found
+    rougher = found.verdict.publishable and found.verdict.code is not Code.OK_ROUGH is other.verdict.code
+    if rougher or len(other.camera_names) < len(found.publishable_camera_names):
+        return found
+    if not excludes_exif(graph, other.registration, other.bounds):
+        return found
+    message = f"{other.verdict.message} {EXIF_LEFT_OUT}"
+    return replace(other, graph=graph, verdict=replace(other.verdict, message=message))
 
 
 def _estimate_from_poses(

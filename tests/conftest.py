@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
 from hypothesis import settings
 
 from tests.support.long_tests import LIST, is_long, parse_long_tests
@@ -32,9 +31,12 @@ NUMERICAL = (
 )
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Tests are small: threads would wait for each other longer than they work, above all on a busy machine."""
-    torch.set_num_threads(1)
+    if config.getoption("dist", "no") == "no":  # the process that hands tests to others runs none
+        import torch  # here: children of tests import ROOT, and few of them need torch
+
+        torch.set_num_threads(1)
     # The same examples every time, however slow the machine: a test that fails by chance is no test.
     settings.register_profile("splatnode", deadline=None, derandomize=True, database=None)
     settings.load_profile("splatnode")

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import msgspec
@@ -193,9 +193,16 @@ INTERNAL = _InternalMark()
 Internal = Annotated[T, INTERNAL]
 
 
-def list_field_types(schema: Any) -> dict[str, Any]:
+@functools.cache  # Python evaluates the annotations each time that it is asked
+def list_field_types(schema: Any) -> Mapping[str, Any]:
     """Returns the annotations of the fields of a Struct or dataclass by name, marks and limits included."""
-    return typing.get_type_hints(schema, include_extras=True)
+    return MappingProxyType(typing.get_type_hints(schema, include_extras=True))
+
+
+@functools.cache
+def _list_plain_types(schema: Any) -> Mapping[str, Any]:
+    """As `list_field_types`, without marks and limits."""
+    return MappingProxyType(typing.get_type_hints(schema))
 
 
 def is_internal(annotation: Any) -> bool:
@@ -495,7 +502,7 @@ def _check_keys(raw: Any, schema: Any, where: str) -> Any:
         return _plugin(raw, schema, where)
     if not has_fields(schema):
         return raw
-    types = typing.get_type_hints(schema)
+    types = _list_plain_types(schema)
     unknown = sorted((str(key) for key in raw if key not in types), key=lambda key: key not in OF_VERBS)
     if unknown:
         elsewhere, allowed = _locate_key(unknown[0], types, where), list_documented_keys(schema)
@@ -514,7 +521,7 @@ def _locate_key(key: str, types: Mapping[str, Any], where: str) -> str:
     """Says where a key that is none of these belongs, if one of them has it, or another verb."""
     for name, annotation in types.items():
         struct = _struct_in(annotation)
-        if has_fields(struct) and key in typing.get_type_hints(struct):
+        if has_fields(struct) and key in _list_plain_types(struct):
             return f", which belongs under {join_keys(where, name)}"
     return f", which is of the configuration of {OF_VERBS[key]}" if key in OF_VERBS and not where else ""
 
@@ -536,11 +543,12 @@ def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     return schema(kind, build_config(rest, module.Config, where))
 
 
-def _list_required_fields(schema: Any) -> list[str]:
+@functools.cache
+def _list_required_fields(schema: Any) -> Sequence[str]:
     if issubclass(schema, msgspec.Struct):
-        return [field.name for field in msgspec.structs.fields(schema) if field.required]
+        return tuple(field.name for field in msgspec.structs.fields(schema) if field.required)
     none = dataclasses.MISSING
-    return [field.name for field in dataclasses.fields(schema) if field.default is none is field.default_factory]
+    return tuple(field.name for field in dataclasses.fields(schema) if field.default is none is field.default_factory)
 
 
 def _struct_in(annotation: Any) -> Any:
@@ -560,7 +568,7 @@ def _list_choices(schema: Any, path: str) -> list[str]:
     annotation = schema
     for key in path.split("."):
         struct = _struct_in(annotation)
-        annotation = typing.get_type_hints(struct).get(key) if has_fields(struct) else None
+        annotation = _list_plain_types(struct).get(key) if has_fields(struct) else None
     return _list_values(annotation)
 
 

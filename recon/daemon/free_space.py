@@ -221,6 +221,7 @@ class GrowingMapper:
     def __init__(self, voxel: float | None, problems: Problems, stopping: threading.Event) -> None:
         """`voxel` is its side, in the unit of the scene; None: as `occupancy_map` chooses it."""
         self._voxel, self._problems, self._stopping = voxel, problems, stopping
+        self._pause = _make_pause(stopping)
         self._newest: GrowingScene | None = None
         self.made: ProvisionalMap | None = None  # the newest
 
@@ -237,7 +238,7 @@ class GrowingMapper:
                     continue
                 mapped = scene
                 try:
-                    self.made = map_growing_scene(scene, self._voxel, self._check_stopping)
+                    self.made = map_growing_scene(scene, self._voxel, self._pause)
                 except _Stopping:
                     return
                 except Exception as error:  # of one scene; the next one may do
@@ -249,13 +250,19 @@ class GrowingMapper:
                 event(log, logging.INFO, "provisional_map", views=len(scene.snapshot.cameras), after_s=after_s)
                 give_back_memory()
 
-    def _check_stopping(self) -> None:
-        if self._stopping.is_set():
-            raise _Stopping
-
 
 class _Stopping(Exception):
     """The daemon stops."""
+
+
+def _make_pause(stopping: threading.Event) -> Callable[[], None]:
+    """Returns a `pause` that raises _Stopping once the daemon stops."""
+
+    def pause() -> None:
+        if stopping.is_set():
+            raise _Stopping
+
+    return pause
 
 
 def drop_normals(pointmaps: Mapping[str, Pointmap]) -> dict[str, Pointmap]:
@@ -342,6 +349,7 @@ class WholeMapper:
         `find_growing` returns the map of the scene that grows, if there is one; None: it is not added.
         """
         self._out, self._voxel, self._problems, self._stopping = out, voxel, problems, stopping
+        self._pause = _make_pause(stopping)
         self._find_growing = find_growing
         self._found: MapSet | None = None
         self._parts: dict[str, dict[str, _Key]] = {}  # by map, the maps of its scenes
@@ -418,7 +426,7 @@ class WholeMapper:
 
     def _map_scene(self, folder: Path) -> _SceneMap | None:
         try:
-            made = occupancy_map(read_to_map(folder), self._voxel, pause=self._check_stopping)
+            made = occupancy_map(read_to_map(folder), self._voxel, pause=self._pause)
         except NoMap as error:
             log.info("%s has no map: %s", folder.name, error)
             return None
@@ -435,7 +443,7 @@ class WholeMapper:
             made = self._scenes[key]
             assert made is not None
             placed.append(PlacedMap(made.unpack(), joined.placements[name]))
-        whole = combine_maps(placed, self._check_stopping)
+        whole = combine_maps(placed, self._pause)
         if self._find_growing is not None:
             self._wholes[joined.name] = whole
         self._grown = None if self._grown is None or self._grown[0] == joined.name else self._grown
@@ -470,15 +478,11 @@ class WholeMapper:
             placement = find_shared_placement(made.of.snapshot.cameras, self._found, joined)
             if placement is not None:
                 part = PlacedMap(made.occupancy, placement)
-                whole = combine_maps([part], self._check_stopping, self._wholes[joined.name])
+                whole = combine_maps([part], self._pause, self._wholes[joined.name])
                 self._write_file(joined.name, whole, made.of.scene_id)
                 self._grown = joined.name, made
                 return True
         return False
-
-    def _check_stopping(self) -> None:
-        if self._stopping.is_set():
-            raise _Stopping
 
 
 def _mark_new(whole: OccupancyMap, base: OccupancyMap) -> npt.NDArray[np.bool_]:

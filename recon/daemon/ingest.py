@@ -415,7 +415,7 @@ class Intake:
         waiting = list(together)
         while waiting and not self._stopping.is_set():
             try:
-                stored = self._store_all([each.received for each in waiting])
+                stored = self._store.add_frames([each.received for each in waiting])
             except Exception as error:
                 name = waiting[0].received.frame.name
                 if is_shortage(error):
@@ -432,12 +432,6 @@ class Intake:
                 each.client.acknowledge(each.received)
             return stored
         return []
-
-    def _store_all(self, received: Sequence[ReceivedFrame]) -> list[StoredFrame]:
-        if len(received) > 1:
-            return self._store.add_frames(received)
-        stored = self._store.add_frame(received[0])
-        return [] if stored is None else [stored]
 
     def _enqueue_keyframes(self, captures: Captures, together: Sequence[StoredFrame], arrived_s: float) -> None:
         """Hands keyframes that were taken together to the worker, as one."""

@@ -23,7 +23,7 @@ from splatnode.capture.lenses import assign_lens, check_fits, read_lens, same_as
 from splatnode.capture.process.terminal import say
 from splatnode.recon.geometry import compute_rms_radius
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Features, Keyframe, longer_side, principal_point
-from splatnode.recon.locating import Located, NotLocated, Reason, pose_refinement, verification
+from splatnode.recon.locating import LensSource, Located, NotLocated, Reason, pose_refinement, verification
 from splatnode.recon.locating.pose_refinement import (
     CameraModel,
     Correspondences,
@@ -212,8 +212,9 @@ _MAX_GUIDED_BY_CHANCE = 0.1  # of what agrees then
 REACH = 0.02  # of the longer side: how far from where a camera sees it a landmark is looked for
 _AMPLE_NFA, _AMPLE_POINTS = -30.0, 100  # log10, and points that agree: so surely is no longer search needed
 
-# What the parts of an image say whose pixels are not square; then so many times as many points must agree.
-_OF_STRETCHED, _MORE_STRETCHED = (Reason.ELSEWHERE, Reason.INCONSISTENT), 1.25
+# What is said of an image whose pixels are not square; a lens of its own may be wrong of one, too. Then so many times
+# as many points must agree.
+_OF_STRETCHED, _MORE_STRETCHED = (Reason.ELSEWHERE, Reason.INCONSISTENT, Reason.LENS), 1.25
 
 
 class LocalizationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -295,7 +296,8 @@ def localize_with_inliers(
     assumed = pose_refinement.assume_lenses(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
     case = _find_best_hypothesis(judged, assumed)
     refusal = verification.run_checks(case, config.checks)
-    if refusal is not None and refusal.code in _OF_STRETCHED:
+    may_be_stretched = case.source is LensSource.FREE if refusal is None else refusal.code in _OF_STRETCHED
+    if may_be_stretched:
         stretched = choose_hypothesis(
             judged, search_cameras(judged, (), pose_refinement.make_non_square_lenses(judged.side)), assumed
         )

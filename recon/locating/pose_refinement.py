@@ -417,7 +417,8 @@ _GIVEN_SIGMA, _GIVEN_RADIAL_SIGMA, _GIVEN_SHIFT_SIGMA = 0.003, 0.005, 0.002
 # was cropped has its principal point anywhere, one of pixels that are not square any aspect.
 _FREE_SIGMA, _FREE_RADIAL_SIGMA, _FREE_SHIFT_SIGMA, _FREE_ASPECT_SIGMA = 0.3, 0.1, 0.2, 0.15
 _FOCALS = np.geomspace(0.45, 4.1, 10)  # over the longer side, 96 to 14 degrees of view: steps of 28 %
-_LOG_ASPECTS = -0.29, -0.14, 0.14, 0.29  # 3 : 4 to 4 : 3, as where a recording's pixels are taken for square
+# Up to 9 : 16 and 16 : 9: as where a recording's pixels are taken for square, or a photograph was made square (3 : 2)
+_LOG_ASPECTS = -0.575, -0.405, -0.29, -0.14, 0.14, 0.29, 0.405, 0.575
 _SAME_SHAPE = 0.01  # largest difference of two images' height over width
 _SAME_FOCAL = 0.15  # of log focals: an EXIF focal length that may be of the result's own lens
 _TOLD_APART = 0.002  # log focals of a result's lenses that are tried one by one

@@ -470,7 +470,6 @@ def _trim_information(J: Array, weight: Array) -> Array:
 
 # All cameras together.
 
-_NEIGHBOURS = 2  # in the order of the frames: so many after each are aligned with it
 _ROUNDS = 12  # of the joint adjustment
 _OPEN_M, _OPEN_RAD = 10.0, np.pi  # standard deviations of what surfaces leave open
 _LEAST_SIGMA_M, _LEAST_SIGMA_DEG = 0.002, 0.05  # of a placed camera
@@ -502,13 +501,13 @@ def place_by_depth(frames: Sequence[Frame], pause: Callable[[], None] = lambda: 
         names = sanitize_text(clouds[k].name), sanitize_text(clouds[other].name)
         log.warning("the depth image of %s fits the photograph %s much better, and is not used", *names)
     clouds = [cloud for k, cloud in enumerate(clouds) if k not in exchanged]
+    # Of frames that are farther from each other a corner may be taken for the next one, where rooms are alike
     aligned: dict[tuple[int, int], Array] = {}
-    for i in range(len(clouds)):
-        for j in range(i + 1, min(i + 1 + _NEIGHBOURS, len(clouds))):
-            pause()
-            T = choose_alignment(align_clouds(clouds[j], clouds[i]), clouds[j], clouds[i])
-            if T is not None:
-                aligned[i, j] = T
+    for i in range(len(clouds) - 1):
+        pause()
+        T = choose_alignment(align_clouds(clouds[i + 1], clouds[i]), clouds[i + 1], clouds[i])
+        if T is not None:
+            aligned[i, i + 1] = T
     poses = _join(len(clouds), aligned)
     if len(poses) < 2:
         return ()
@@ -517,22 +516,12 @@ def place_by_depth(frames: Sequence[Frame], pause: Callable[[], None] = lambda: 
 
 
 def _join(count: int, aligned: Mapping[tuple[int, int], Array]) -> dict[int, Array]:
-    """Poses of the largest group of clouds that pairs join, in the frame of its first one."""
+    """Poses of the longest run of clouds that pairs join, in the frame of its first one."""
     best: dict[int, Array] = {}
-    left = set(range(count))
-    while left:
-        start = min(left)
-        poses, edge = {start: np.eye(4)}, [start]
-        while edge:
-            i = edge.pop(0)
-            for (a, b), T in sorted(aligned.items(), key=lambda item: (item[0][1] - item[0][0], item[0])):
-                if a == i and b not in poses:
-                    poses[b] = poses[a] @ T
-                    edge.append(b)
-                elif b == i and a not in poses:
-                    poses[a] = poses[b] @ _invert(T)
-                    edge.append(a)
-        left -= poses.keys()
+    poses: dict[int, Array] = {}
+    for i in range(count):
+        pair = i - 1, i
+        poses = {**poses, i: poses[i - 1] @ aligned[pair]} if pair in aligned else {i: np.eye(4)}
         best = poses if len(poses) > len(best) else best
     return best
 
@@ -568,7 +557,7 @@ def _list_surest_first(clouds: Sequence[DepthCloud], poses: Mapping[int, Array])
         found = [
             _compute_information(clouds[i], clouds[j], _invert(poses[j]) @ poses[i]).sure
             for j in sorted(poses)
-            if abs(i - j) in range(1, _NEIGHBOURS + 1)
+            if abs(i - j) == 1
         ]
         least.append(float(np.linalg.eigvalsh(np.sum(found, axis=0))[0]) if found else 0.0)
     first = sorted(poses)[int(np.argmax(least))]

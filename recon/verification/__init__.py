@@ -144,6 +144,13 @@ WRONG_FOCAL = Refusal(
     "{change:+.0f} %.",
     _CALIBRATION,
 )
+WRONG_EXIF = Refusal(
+    Code.FOCAL_SUSPECT,
+    "The focal length that EXIF tells, {given:.0f} pixels, contradicts the photographs: they ask for {found:.0f}, "
+    "{change:+.0f} %.",
+    "Give the photographs as the camera stored them, neither cropped nor zoomed afterwards, or the lens by "
+    "--intrinsics.",
+)
 WRONG_LENS = Refusal(
     Code.FOCAL_SUSPECT,
     "{refuted} of {count} photographs contradict the lens that was given for them: they ask for other focal lengths, "
@@ -192,6 +199,12 @@ DISAGREEING = Refusal(
     "Pairs of photographs disagree by {degrees:.0f} degrees, in the median, with the poses of all of them about the "
     "direction in which the camera moved.",
     "Add photographs from further to the side; if the lens bends lines, calibrate the camera.",
+)
+NO_COMMON_LENS = Refusal(
+    Code.AMBIGUOUS,
+    "{own} of {count} photographs do not have the lens of the others, as after a zoom, a crop or a change of focus, "
+    "and with a lens for each the poses stay in doubt.",
+    "Keep zoom and focus as they are and do not crop, or give the lens of each photograph by --intrinsics.",
 )
 WEAKLY_JOINED = Refusal(
     Code.AMBIGUOUS,

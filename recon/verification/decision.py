@@ -117,7 +117,72 @@ def _refuse_doubtful_focal(graph: ViewGraph, config: DecisionConfig) -> Verdict 
         return None
     names = [keyframe.name for keyframe in graph.keyframes]
     change = 100 * (voted / told - 1.0)
+    if _select_exif_keyframes(graph):
+        return refuse(verification.WRONG_EXIF, names, given=told, found=voted, change=change)
     return refuse(verification.WRONG_FOCAL_BY_VOTE, names, given=told, voted=voted, change=change)
+
+
+# EXIF that the images contradict: it stays as it was when an image is cropped or zoomed afterwards.
+
+EXIF_LEFT_OUT = "They contradict the focal length that EXIF tells, as cropped ones do: it was not used."
+_EXCLUDED_AT = 2.5  # times the 95 % bound of a focal length: beyond it the measured answers were never wrong
+_ALIKE = 0.02  # largest difference of log focals over EXIF's, with which all images refute EXIF alike
+
+
+def contradicts_exif(
+    graph: ViewGraph,
+    registration: Registration | None,
+    evidence: Evidence | None,
+    verdict: Verdict,
+    config: DecisionConfig,
+) -> bool:
+    """Whether images are refused for the focal length that their EXIF tells, or most of them refute it alike."""
+    if not _select_exif_keyframes(graph):
+        return False
+    changes = [] if registration is None else _measure_exif_changes(graph, registration.cameras)
+    own = [change for camera, change in changes if camera.own_lens]
+    if 2 * len(own) > len(changes) and np.ptp(own) <= _ALIKE:
+        return True
+    if verdict.code is not Code.FOCAL_SUSPECT:
+        return False
+    return evidence is None or any(not each.trusted and _is_contradicted(each, config) for each in evidence.freed)
+
+
+def excludes_exif(graph: ViewGraph, registration: Registration, bounds: Mapping[str, Bounds]) -> bool:
+    """Whether a focal length that EXIF tells is far beyond the bounds of one that was estimated without EXIF."""
+    for camera, change in _measure_exif_changes(graph, registration.cameras):
+        bound = bounds.get(graph.names[camera.index])
+        if bound is not None and abs(change) > _EXCLUDED_AT * np.log1p(bound.focal_percent / 100.0):
+            return True
+    return False
+
+
+def _measure_exif_changes(
+    graph: ViewGraph, cameras: Sequence[RegisteredCamera]
+) -> list[tuple[RegisteredCamera, float]]:
+    """The cameras of whose lens EXIF tells, with the logarithm of their focal length over EXIF's."""
+    found = []
+    for camera in cameras:
+        lens = graph.keyframes[camera.index].frame.intrinsics
+        if lens is not None and lens.source == "exif":
+            found.append((camera, float(np.log(camera.focal / lens.fx))))
+    return found
+
+
+def forget_exif(graph: ViewGraph) -> ViewGraph:
+    """The graph without the focal lengths that EXIF tells."""
+    nominal = _select_exif_keyframes(graph)
+    keyframes = [
+        replace(each, frame=replace(each.frame, intrinsics=None)) if each.name in nominal else each
+        for each in graph.keyframes
+    ]
+    return replace(graph, keyframes=tuple(keyframes))
+
+
+def _select_exif_keyframes(graph: ViewGraph) -> set[str]:
+    """The names of the keyframes of whose lens EXIF alone tells."""
+    lenses = {keyframe.name: keyframe.frame.intrinsics for keyframe in graph.keyframes}
+    return {name for name, lens in lenses.items() if lens is not None and lens.source == "exif"}
 
 
 def _find_pure_rotations(graph: ViewGraph) -> list[Pair]:
@@ -220,7 +285,8 @@ def check_given_focal(case: EvidenceCase) -> Verdict | None:
         return None
     worst = max(doubted, key=lambda lens: abs(lens.found / lens.given - 1.0))
     change = 100 * (worst.found / worst.given - 1.0)
-    return refuse(verification.WRONG_FOCAL, case.names, given=worst.given, found=worst.found, change=change)
+    refusal = verification.WRONG_FOCAL if worst.trusted else verification.WRONG_EXIF
+    return refuse(refusal, case.names, given=worst.given, found=worst.found, change=change)
 
 
 def _is_contradicted(freed: FreedLens, config: DecisionConfig) -> bool:
@@ -575,6 +641,10 @@ def _refuse_contradictions(case: VerificationCase, against: str) -> Verdict:
         return refuse(verification.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
     if against == "camera_inlier_ratio":
         return refuse(verification.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
+    if against == "own_lens":
+        own = [camera.name for camera in case.evidence.cameras if camera.own_lens]
+        few = 2 * len(own) < len(case.names)  # then the others are judged without them
+        return refuse(verification.NO_COMMON_LENS, own if few else (weakest.name,), own=len(own), count=len(case.names))
     return refuse(verification.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 

@@ -61,6 +61,7 @@ BENCHMARKS = {
         "lens_assumptions",
         "registrations",
         "known_poses",
+        "given_scenes",
         "odometry_sets",
         "plain_rooms",
         "several_cameras",

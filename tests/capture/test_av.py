@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
@@ -55,6 +56,16 @@ def read(file: Path, from_s: float = 0.0, to_s: float | None = None, every: int 
     return list(decode_video(file, every, LIMIT, span))
 
 
+def read_here(file: Path, from_s: float, to_s: float | None) -> list[VideoFrame]:
+    """As `read`, in this process: `video_process` hands on what this gives."""
+    video = Video(file, threads=os.cpu_count() or 1)
+    try:
+        span = video.frames(round(from_s * 1e9), None if to_s is None else round(to_s * 1e9), 1, LIMIT)
+        return [VideoFrame(each.index, each.time_ns, each.image, each.pixel_aspect) for each in span]
+    finally:
+        video.close()
+
+
 def brightness(frame: VideoFrame) -> float:
     """That of all but the dark quarter, wherever it lies."""
     return float(np.median(frame.image))
@@ -86,7 +97,7 @@ def test_all_frames_come_at_the_containers_times_upright_whole_and_in_part(tmp_p
     assert all(frame.image[:40, 40:].max() < 30 for frame in every), "the dark quarter is at the upper right"
     for first, end in ((1, 4), (4, 5), (7, 19), (13, COUNT)):
         from_s, to_s = times_ms[first] / 1000, times_ms[end] / 1000 if end < COUNT else None
-        found = read(file, from_s, to_s)
+        found = read_here(file, from_s, to_s)
         assert [frame.index for frame in found] == list(range(first, end))
         for frame in found:
             assert frame.time_ns == every[frame.index].time_ns

@@ -265,7 +265,7 @@ def test_a_list_of_files_leads_nowhere_else(tmp_path, line):
 
 
 def test_long_lists_are_associated_in_the_time_of_sorting(tmp_path):
-    count = 100_000
+    count = 30_000
     rgb = "".join(f"{i} rgb/{i}.png\n" for i in range(count))
     depth = "".join(f"{i + 0.01:.2f} depth/{i}.png\n" for i in reversed(range(count)))
     found = find_rgbd_folder(write_lists(tmp_path, rgb, depth))

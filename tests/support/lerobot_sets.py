@@ -13,7 +13,11 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 
+from splatnode.capture.process import python
+from splatnode.capture.process.config import decoder_of
+from splatnode.extras import lerobot, pyarrow
 from tests.support.clips import scheduled_as_before
 
 RATE = 10  # frames a second
@@ -74,6 +78,16 @@ def write(folder: Path, episodes: Sequence[Mapping[str, Images]], codec: str = "
     }
     (folder / "meta" / "info.json").write_text(json.dumps({**told, **info}, indent=4))
     return folder
+
+
+def read_tables_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lets this process read tables: the start of another takes longer than what it reads."""
+
+    def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
+        assert module == pyarrow.__name__ and not arguments
+        return pyarrow._answer(decoder_of(lerobot.Request).decode(data))[:most], 0
+
+    monkeypatch.setattr(python, "answer", answer)
 
 
 def _write_tables(folder: Path, rows: Sequence[dict[str, Any]]) -> None:

@@ -27,7 +27,7 @@ from splatnode.recon.scene import Gaussians
 SMALL = synthetic.Config(views=6, width=320, height=240)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=32)  # of a megabyte each: what is evicted is rendered again
 def photographs(config: synthetic.Config = SMALL) -> tuple[Frame, ...]:
     """The stream of `config`, made once for all tests."""
     return tuple(synthetic.stream(config))

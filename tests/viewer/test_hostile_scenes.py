@@ -51,7 +51,7 @@ def one(value: float, shape: tuple[int, ...], rest: float = 0.5) -> np.ndarray:
     return array
 
 
-EDGES = (0.0, -1.0, 5e-324, 1e-45, 1e9, -1e9, 3e38, float("nan"), float("inf"))
+EDGES = (0.0, -1.0, 1e-45, 1e9, -1e9, 3e38, float("nan"), float("inf"))
 SHAPES = {"means": (COUNT, 3), "quats": (COUNT, 4), "scales": (COUNT, 3), "opacities": (COUNT,), "sh": (COUNT, 1, 3)}
 LENSES = [(0.001, 0.0, 0.0), (1e9, 0.0, 0.0), (100.0, 1e9, -1e9), (1e-3, 1e9, 1e9)]
 SCENES = {

@@ -81,6 +81,18 @@ def optimize_sparse_model(
     if model is None or len(model.registered) < methods.MIN_CAMERAS:
         yield methods.make_refusal(frames, clock)
         return
+    yield from refine_sparse_model(frames, model, seed, config, beginning, clock)
+
+
+def refine_sparse_model(
+    frames: Sequence[Frame],
+    model: SparseModel,
+    seed: int,
+    config: training.RefinementConfig,
+    beginning: Callable[[SparseModel, int], Scene],
+    clock: Clock,
+) -> Iterator[Snapshot]:
+    """The same from a model of the frames that is there, whoever made it."""
     scene = beginning(model, seed)
     clock.lap("points")
     refined = training.refine(scene, scale_rates_to_extent(config, scene), seed=seed)

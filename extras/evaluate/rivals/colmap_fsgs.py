@@ -44,7 +44,10 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: training.RefinementC
 
 
 def initialize_scene_with_depth(model: SparseModel, seed: int) -> Scene:
-    """The scene that 3DGS starts from, with a depth for every view."""
+    """The scene that 3DGS starts from, with a depth for every view.
+
+    Where a view observes too few points, all of the model tell the range of its depth.
+    """
     scene = colmap_3dgs.initialize_scene(model, seed)
     Ts, Ks = ([getattr(view, name).double().numpy() for view in scene.views] for name in ("T_world_camera", "K"))
     views, sparse = [], []
@@ -52,7 +55,8 @@ def initialize_scene_with_depth(model: SparseModel, seed: int) -> Scene:
         points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]
         points = points[points[:, 2] > 0]
         pixels = points @ K.T
-        near, far = stereo.estimate_depth_range(points[:, 2])
+        told = points if len(points) >= stereo.MIN_SPARSE_POINTS else (model.points - T[:3, 3]) @ T[:3, :3]
+        near, far = stereo.estimate_depth_range(told[:, 2])
         views.append(stereo.StereoView(view.image, K, T, (near, classical.Config().far_margin * far)))
         sparse.append(stereo.SparsePoints(pixels[:, :2] / pixels[:, 2:], points[:, 2]))
     maps = stereo.estimate_depth_maps(views, stereo.StereoConfig(), seed=seed, sparse=sparse)

@@ -136,7 +136,7 @@ def _row(matched: _Set, kind: str, seed: int) -> Row:
     for index, keyframe in enumerate(graph.keyframes):
         true[keyframe.name] = T = scene.cameras[keyframe.name].T_world_camera.copy()
         T[:3, 3] /= matched.away
-        told = _disturbed(T, generator, kind if index == false else "clean")
+        told = disturb_pose(T, generator, kind if index == false else "clean")
         frame = replace(keyframe.frame, given_pose=make_given_pose(told, SIGMA_M, SIGMA_DEG))
         keyframes.append(replace(keyframe, frame=frame))
     begun = time.process_time()
@@ -166,7 +166,8 @@ def _row(matched: _Set, kind: str, seed: int) -> Row:
     return Row(*told, len(registration.cameras), *worst, len(named), right, seconds, matches)
 
 
-def _disturbed(T: Array, generator: np.random.Generator, kind: str) -> Array:
+def disturb_pose(T: Array, generator: np.random.Generator, kind: str) -> Array:
+    """The pose with errors as its sigmas say; false besides, if `kind` says so."""
     told = T.copy()
     aside = generator.normal(size=3)
     aside /= np.linalg.norm(aside)

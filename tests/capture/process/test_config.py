@@ -1,11 +1,13 @@
+import typing
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.process.config import ConfigError, load_config, merge_config, parse_changes
+from splatnode.capture.process.config import ConfigError, build_config, load_config, merge_config, parse_changes
 
 FOLDER = "camera: {kind: folder, folder: photos}"
 SYNTHETIC = "camera: {kind: synthetic}"
@@ -100,6 +102,15 @@ def test_merging_leaves_its_arguments_alone():
     base = {"a": {"b": 1, "c": 2}, "d": 3}
     assert merge_config(base, {"a": {"b": 9}, "d": {"e": 1}}) == {"a": {"b": 9, "c": 2}, "d": {"e": 1}}
     assert base == {"a": {"b": 1, "c": 2}, "d": 3}
+
+
+def test_the_types_of_fields_are_evaluated_once(monkeypatch):
+    """Python evaluates annotations anew each time, which took most of the time that a configuration took."""
+    raw = {"camera": {"kind": "synthetic", "views": 3}, "selection": {"backlog": 5}}
+    once = build_config(raw, CaptureConfig)
+    for module, name in ((typing, "get_type_hints"), (msgspec.structs, "fields")):
+        monkeypatch.setattr(module, name, lambda *_, **__: pytest.fail("evaluated again"))
+    assert build_config(raw, CaptureConfig) == once
 
 
 def test_a_configured_camera_streams(tmp_path):

@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from splatnode import command_line
 from splatnode.capture.process.terminal import beneath, progress, sanitize_output, say
 from tests.conftest import ROOT
 from tests.support.hostile import TEXTS, unprintable
@@ -85,10 +86,19 @@ def test_a_process_without_standard_output_prints_nothing(monkeypatch):
         ["weights", "fetch", "\x1b[2J\n<0>x"],
     ],
 )
-def test_a_complaint_about_an_argument_only_shows(arguments):
-    done = subprocess.run(
-        [sys.executable, "-m", "splatnode", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+def test_a_complaint_about_an_argument_only_shows(arguments, capsys):
+    try:
+        code = command_line.main(arguments)
+    except SystemExit as error:  # of argparse
+        code = error.code
+    said = capsys.readouterr()
+    assert code == 2 and said.err and not unprintable(said.out + said.err)
+    assert not any(line.startswith("<0>") for line in said.err.splitlines())
+
+
+def test_a_complaint_of_the_process_only_shows():
+    arguments = ["view", "a", "b\n<0>forged", "\x1b]0;t\x07"]
+    done = subprocess.run([sys.executable, "-m", "splatnode", *arguments], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 2 and not unprintable(done.stdout + done.stderr)
     assert not any(line.startswith("<0>") for line in done.stderr.splitlines())
 
@@ -108,6 +118,6 @@ def test_verbs_print_by_this_module_alone():
         for path in files
         if path.name not in programs
         for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     ]
     assert printed and all(": print(json.dumps(" in each for each in printed)

@@ -127,10 +127,10 @@ def test_the_ablation_changes_one_part_at_a_time():
 
 
 def test_they_start_from_a_gaussian_a_pixel_and_keep_them():
-    few = msgspec.structs.replace(CONFIGS["paper"].optimize, iterations=30, checkpoints=())
+    few = msgspec.structs.replace(CONFIGS["paper"].optimize, iterations=5, checkpoints=())
     config = msgspec.structs.replace(CONFIGS["paper"], size=160, optimize=few)
     last = list(reconstruct(list(photographs()[:3]), config))[-1]
-    assert last.verdict.publishable and last.iterations == 30
+    assert last.verdict.publishable and last.iterations == 5
     assert len(last.gaussians) > 160 * 120
     told = build_report(last, seed=0, preset="paper", peak_rss_mb=None)["served_by"]
     assert isinstance(told, dict) and list(told) == ["point_render", "depth", "normal", "semantic"]

@@ -13,7 +13,7 @@ import pytest
 
 from splatnode.extras import lerobot
 from splatnode.extras.lerobot import UnusableDataSet, film, list_parts
-from tests.support.lerobot_sets import write
+from tests.support.lerobot_sets import read_tables_here, write
 
 pa = pytest.importorskip("pyarrow", reason="needs pyarrow")
 pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
@@ -25,6 +25,12 @@ MOST_OWN = 300_000_000  # bytes that our own process may take for a data set's t
 @pytest.fixture
 def folder(tmp_path) -> Path:
     return write(tmp_path / "set", [{TOP: [np.zeros((48, 64, 3), np.uint8)]}])
+
+
+@pytest.fixture
+def unguarded(monkeypatch):
+    """Tables are read by this process, which the other tests show to be guarded."""
+    read_tables_here(monkeypatch)
 
 
 def put(folder: Path, table: Any, **how: Any) -> Path:
@@ -49,7 +55,7 @@ def test_rows_are_counted_before_they_are_read(folder):
         list_parts(folder)
 
 
-def test_rows_of_all_files_together_are_bounded(folder):
+def test_rows_of_all_files_together_are_bounded(folder, unguarded):
     file = put(folder, columns(pa.array(np.zeros(400_000, np.int64))))
     for index in range(1, 3):
         (file.parent / f"file-00{index}.parquet").write_bytes(file.read_bytes())
@@ -71,14 +77,14 @@ def test_rows_of_all_files_together_are_bounded(folder):
         (pa.array([2**62 + 1]), "cannot be read|whole number"),
     ],
 )
-def test_numbers_of_episodes_are_whole_and_within_bounds(folder, episodes, told):
+def test_numbers_of_episodes_are_whole_and_within_bounds(folder, unguarded, episodes, told):
     put(folder, columns(episodes))
     with pytest.raises(UnusableDataSet, match=told):
         list_parts(folder)
 
 
 @pytest.mark.parametrize("value", [1e300, -1.0, 0.5, float("inf"), float("nan")])
-def test_numbers_of_files_are_whole_and_within_bounds(folder, value):
+def test_numbers_of_files_are_whole_and_within_bounds(folder, unguarded, value):
     given = {"chunk_index": pa.array([value]), "file_index": pa.array([0])}
     put(folder, columns(pa.array([0]), **given, from_timestamp=pa.array([0.0]), to_timestamp=pa.array([1.0])))
     with pytest.raises(UnusableDataSet, match="whole number|has no images"):
@@ -121,7 +127,7 @@ def test_damaged_bytes_are_refused_by_a_sentence(folder):
             assert str(error).isprintable()
 
 
-def test_a_pipe_is_no_table(folder, tmp_path):
+def test_a_pipe_is_no_table(folder, unguarded, tmp_path):
     os.mkfifo(folder / "meta" / "episodes" / "chunk-000" / "file-001.parquet")
     with pytest.raises(UnusableDataSet, match="must be a file, is a pipe or a device"):
         list_parts(folder)

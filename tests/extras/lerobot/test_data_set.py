@@ -20,7 +20,7 @@ from splatnode.extras import lerobot as data_set
 from splatnode.extras.cameras import lerobot
 from splatnode.extras.lerobot import UnusableDataSet, list_parts
 from splatnode.recon.replay_source import Request, load_source
-from tests.support.lerobot_sets import write
+from tests.support.lerobot_sets import read_tables_here, write
 
 pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
 
@@ -48,6 +48,12 @@ def made(tmp_path_factory):
 @pytest.fixture
 def copy(made, tmp_path):
     return Path(shutil.copytree(made, tmp_path / "copy"))
+
+
+@pytest.fixture
+def unguarded(monkeypatch):
+    """Tables are read by this process, which other tests show to be guarded."""
+    read_tables_here(monkeypatch)
 
 
 def frames(folder: Path, part: str) -> list[Any]:
@@ -93,7 +99,7 @@ def numbered(found: list[Any]) -> list[tuple[int, float]]:
 
 
 @pytest.mark.parametrize(("lost", "left"), [((1,), [0, 2]), ((0,), [1, 2]), ((0, 1), [2])])
-def test_after_frames_that_cannot_be_decoded_the_numbers_are_the_data_sets(copy, lost, left):
+def test_after_frames_that_cannot_be_decoded_the_numbers_are_the_data_sets(copy, unguarded, lost, left):
     video = copy / "videos" / TOP / "chunk-000" / "file-000.mp4"
     with av.open(str(video)) as container:
         packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
@@ -108,7 +114,7 @@ def test_after_frames_that_cannot_be_decoded_the_numbers_are_the_data_sets(copy,
 
 
 @pytest.mark.parametrize("rate", [9.99, 10.01, 10.0, 0.0, 1e300, 5.0])
-def test_a_whole_episode_is_numbered_without_gaps_where_the_rates_differ(tmp_path, monkeypatch, rate):
+def test_a_whole_episode_is_numbered_without_gaps_where_the_rates_differ(tmp_path, monkeypatch, unguarded, rate):
     """`rate` is the data set's; the video's, of 10, rounds times to whole frames of its own."""
     folder = write(tmp_path / "set", [{TOP: levels(0)}, {TOP: levels(0, 0)}], fps=rate)
     beside = rate if 9 < rate < 11 else 10.0
@@ -136,7 +142,7 @@ def test_a_data_set_without_videos_says_so(copy):
         load_source(Request(copy))
 
 
-def test_a_data_set_without_episodes_says_what_is_missing(copy):
+def test_a_data_set_without_episodes_says_what_is_missing(copy, unguarded):
     file = copy / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     pq.write_table(pq.read_table(file).slice(0, 0), file)
     expected = r"copy' must have a row for each episode in meta/episodes/\*/\*.parquet; "
@@ -170,7 +176,7 @@ def test_tables_are_read_once_until_they_change(copy, monkeypatch):
     assert data_set.film(copy, f"1/{TOP}").from_s == 0.5 and len(asked) == 1
 
 
-def test_depth_is_no_camera(copy):
+def test_depth_is_no_camera(copy, unguarded):
     info = json.loads((copy / "meta" / "info.json").read_text())
     info["features"][WRIST]["info"] = {"video.is_depth_map": True}
     (copy / "meta" / "info.json").write_text(json.dumps(info))
@@ -178,7 +184,7 @@ def test_depth_is_no_camera(copy):
     assert len(frames(copy, "1")) == 3, "the only camera need not be named"
 
 
-def test_an_episode_without_images_says_so(copy):
+def test_an_episode_without_images_says_so(copy, unguarded):
     change(copy, **{f"videos__{TOP}__to_timestamp": 0.4})
     with pytest.raises(UnusableDataSet, match=f"episode 1 has no images of {TOP}"):
         frames(copy, f"1/{TOP}")
@@ -188,7 +194,7 @@ def test_an_episode_without_images_says_so(copy):
     check(frames(copy, f"1/{WRIST}"))
 
 
-def test_a_video_that_is_not_there_or_cannot_be_read_says_so(copy):
+def test_a_video_that_is_not_there_or_cannot_be_read_says_so(copy, unguarded):
     video = copy / "videos" / TOP / "chunk-000" / "file-000.mp4"
     video.write_bytes(b"no video")
     with pytest.raises(ValueError, match=r"file-000.mp4' is no video that can be decoded, .* between 0.4 and 0.7 s"):
@@ -208,7 +214,7 @@ def test_what_is_not_there_is_told_with_what_is(made):
 
 
 @pytest.mark.parametrize("path", ["/etc/{video_key}", "../{chunk_index}", "{nothing}", "{file_index:x9}", ".", ""])
-def test_a_video_path_leads_nowhere_else(copy, path):
+def test_a_video_path_leads_nowhere_else(copy, unguarded, path):
     info = json.loads((copy / "meta" / "info.json").read_text())
     (copy / "meta" / "info.json").write_text(json.dumps({**info, "video_path": path}))
     with pytest.raises(UnusableDataSet, match="video_path"):
@@ -241,7 +247,7 @@ def test_the_camera_takes_a_configuration(made):
         "%s{video_key}}",
     ],
 )
-def test_a_video_path_is_no_format_of_pythons(copy, path):
+def test_a_video_path_is_no_format_of_pythons(copy, unguarded, path):
     info = json.loads((copy / "meta" / "info.json").read_text())
     (copy / "meta" / "info.json").write_text(json.dumps({**info, "video_path": path}))
     with pytest.raises(UnusableDataSet, match="video_path"):

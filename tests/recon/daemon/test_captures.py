@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -150,41 +151,53 @@ def plain(monkeypatch):
     monkeypatch.setattr(ingest, "prepare", lambda each, _: SimpleNamespace(name=each.name, frame=each))
 
 
-def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain, monkeypatch):
+@pytest.fixture
+def servers(tmp_path, monkeypatch) -> Iterator[dict[str, KeyframeServer]]:
+    """A capture for each of IDS, with a spool."""
     monkeypatch.setattr(ingest, "CONNECT_S", 30.0)  # a busy machine connects them one by one
-    patient = FrameSetConfig(wait_s=30.0)
-    network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
+    network, spool = Network(directory=tmp_path / "run"), SpoolConfig(directory=tmp_path / "state")
     with ExitStack() as resources:
-        servers = {
-            each: resources.enter_context(
-                KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "state"), each), each)
-            )
-            for each in IDS
-        }
-        assert find_captures(network) == sorted(IDS)
-        with pytest.raises(AlreadyRunning, match="capture.keyframes@left is offered .* camera_id of their own"):
-            KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "other"), "left"), "left")
-        for ms in range(0, 600, 200):
-            for offset, (camera_id, server) in enumerate(servers.items()):
-                server.offer(frame(camera_id, ms + offset))
-        store = Store(tmp_path / "checkpoint")
-        resources.callback(store.close)
+        yield {each: resources.enter_context(KeyframeServer(network, Spool(spool, each), each)) for each in IDS}
+
+
+def offer_sets(servers: dict[str, KeyframeServer], *ms: int) -> None:
+    """Offers a frame of each capture, a millisecond after one another, at each of these times."""
+    for at in ms:
+        for offset, (camera_id, server) in enumerate(servers.items()):
+            server.offer(frame(camera_id, at + offset))
+
+
+def take_in(folder: Path, servers: dict[str, KeyframeServer], number: int) -> tuple[list, set[str]]:
+    """Lets an intake take until no capture has a frame: the `number` events, and the names that are stored."""
+    network, inbox, stopping = Network(directory=folder / "run"), Inbox(), threading.Event()
+    found: list = []
+
+    def come():
+        for server in servers.values():
+            server.serve(0.01)
+        found.extend(inbox.dequeue(0))
+        return len(found) == number and not any(server.num_queued for server in servers.values())
+
+    with closing(Store(folder / "checkpoint")) as store:
+        patient = FrameSetConfig(wait_s=30.0)
         intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping, patient)
         thread = threading.Thread(target=intake.run)
         thread.start()
-        found: list = []
-
-        def come():
-            for server in servers.values():
-                server.serve(0.01)
-            found.extend(inbox.dequeue(0))
-            return len(found) == 9 and not any(server.num_queued for server in servers.values())
-
         try:
             wait_for(come, 30.0)
         finally:
             stopping.set()
             thread.join()
+        return found, set(store.names)
+
+
+def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_path, plain, servers):
+    network = Network(directory=tmp_path / "run")
+    assert find_captures(network) == sorted(IDS)
+    with pytest.raises(AlreadyRunning, match="capture.keyframes@left is offered .* camera_id of their own"):
+        KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "other"), "left"), "left")
+    offer_sets(servers, 0, 200, 400)
+    found, _ = take_in(tmp_path, servers, 9)
     assert [each.keyframe.name for each in found] == [
         f"{c}_{ms + i}" for ms in (0, 200, 400) for i, c in enumerate(IDS)
     ]
@@ -192,11 +205,9 @@ def test_each_of_three_captures_gets_its_answers_and_their_frames_are_sets(tmp_p
     assert {server.acknowledged for server in servers.values()} == {3}
 
 
-def test_no_image_of_a_frame_set_is_acknowledged_before_all_are_stored(tmp_path, plain, monkeypatch):
+def test_no_image_of_a_frame_set_is_acknowledged_before_all_are_stored(tmp_path, plain, monkeypatch, servers):
     """The disk takes the second of three images only the third time; what is odd of another set is refused alone."""
-    monkeypatch.setattr(ingest, "CONNECT_S", 30.0)
     monkeypatch.setattr(ingest, "RETRY_S", 0.05)
-    network, inbox, stopping = Network(directory=tmp_path / "run"), Inbox(), threading.Event()
     real, failures, acknowledged = ledger.write_frame, [OSError(28, "No space left"), MemoryError()], []
 
     def write(path, key, one, following=0):
@@ -208,39 +219,12 @@ def test_no_image_of_a_frame_set_is_acknowledged_before_all_are_stored(tmp_path,
         real(path, key, one, following)
 
     monkeypatch.setattr(checkpoint_store, "write_frame", write)
-    with ExitStack() as resources:
-        servers = {
-            each: resources.enter_context(
-                KeyframeServer(network, Spool(SpoolConfig(directory=tmp_path / "state"), each), each)
-            )
-            for each in IDS
-        }
-        for ms in (0, 200):
-            for offset, (camera_id, server) in enumerate(servers.items()):
-                server.offer(frame(camera_id, ms + offset))
-        store = Store(tmp_path / "checkpoint")
-        resources.callback(store.close)
-        sets = FrameSetConfig(wait_s=30.0)
-        intake = ingest.Intake(network, ReconstructionConfig(), store, inbox, Problems(), stopping, sets)
-        thread = threading.Thread(target=intake.run)
-        thread.start()
-        found: list = []
-
-        def come():
-            for server in servers.values():
-                server.serve(0.01)
-            found.extend(inbox.dequeue(0))
-            return len(found) == 5 and not any(server.num_queued for server in servers.values())
-
-        try:
-            wait_for(come, 30.0)
-        finally:
-            stopping.set()
-            thread.join()
+    offer_sets(servers, 0, 200)
+    found, names = take_in(tmp_path, servers, 5)
     assert not failures and acknowledged[:7] == [0] * 7  # two times of two images, then all three
     assert [each.frame_set for each in found] == [0, 0, 0, 3, 3]
     assert [server.acknowledged for server in servers.values()] == [1, 2, 2]
-    assert servers["left"].set_aside == 1 and store.names == {each.keyframe.name for each in found}
+    assert servers["left"].set_aside == 1 and names == {each.keyframe.name for each in found}
 
 
 def make_daemon(store: Store, places=None) -> SimpleNamespace:

@@ -104,8 +104,10 @@ def impatient(monkeypatch):
 
 def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plain, impatient):
     with taking(ipc(tmp_path), tmp_path) as node:
-        put, failures = node.store.add_frame, [OSError(28, "No space left"), OSError(5, "Input/output error")]
-        monkeypatch.setattr(node.store, "add_frame", lambda one: _raise(failures.pop()) if failures else put(one))
+        put, failures = node.store.add_frames, [OSError(28, "No space left"), OSError(5, "Input/output error")]
+        monkeypatch.setattr(
+            node.store, "add_frames", lambda together: _raise(failures.pop()) if failures else put(together)
+        )
         node.server.offer(frame(0))
         node.until(lambda: node.server.acknowledged == 1)
         assert node.store.names == {"0.png"} and not failures and node.intake.full == ""
@@ -113,11 +115,11 @@ def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plai
 
 def test_what_cannot_be_stored_is_refused_and_told_until_seen(tmp_path, monkeypatch, plain):
     with taking(ipc(tmp_path), tmp_path) as node:
-        put = node.store.add_frame
+        put = node.store.add_frames
         monkeypatch.setattr(
             node.store,
-            "add_frame",
-            lambda one: _raise(ArithmeticError("odd")) if one.frame.name == "0.png" else put(one),
+            "add_frames",
+            lambda together: _raise(ArithmeticError("odd")) if together[0].frame.name == "0.png" else put(together),
         )
         node.server.offer(frame(0))
         node.server.offer(frame(1))
@@ -149,7 +151,7 @@ def test_what_the_camera_could_not_give_is_remembered_and_disturbs_no_scene(tmp_
 
 def test_what_there_is_no_memory_for_waits_until_there_is(tmp_path, monkeypatch, plain, impatient):
     with taking(ipc(tmp_path), tmp_path) as node:
-        for module, what in ((node.store, "add_frame"), (ingest, "prepare")):
+        for module, what in ((node.store, "add_frames"), (ingest, "prepare")):
             real, failures = getattr(module, what), [MemoryError(), RuntimeError("can't allocate memory")]
 
             def short(*args, real=real, failures=failures):

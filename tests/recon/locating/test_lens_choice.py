@@ -24,6 +24,7 @@ from splatnode.recon.locating.pose_refinement import (
 from splatnode.recon.locating.verification import LensChoice, QueryContext, choose_lens, search_cameras
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
 from splatnode.recon.verification import evidence
+from tests.bench.quality import query_warps
 from tests.bench.quality.query_warps import WARPS, Query
 from tests.support.located import PLACE, errors, known_place, photograph
 
@@ -68,6 +69,15 @@ def test_an_image_whose_pixels_are_not_square_is_placed_with_two_focal_lengths(w
     query, found, camera = warped(2, warp)
     assert_right(query, found, camera)
     assert isinstance(found, Located) and abs(found.K[0, 0] / found.K[1, 1] - 1.0) > 0.05
+
+
+@pytest.mark.parametrize("index, share", [(0, 0.667), (1, 0.667), (3, 0.5625), (4, 0.5625)])
+def test_an_image_that_was_made_square_is_not_placed_with_square_pixels(index, share):
+    """Two of them were placed 11 and 14 bounds off, as if taken from afar through a long lens."""
+    image, camera = photograph(index)
+    query = query_warps.squeeze(image, camera[1], index, share)
+    found = localize_image(known_place().landmarks, query.image)
+    assert_right(query, found, camera)
 
 
 def test_a_lens_that_bends_lines_is_estimated():

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import TrueCamera
 from splatnode.extras.evaluate.stability.degradations import KINDS, correct_keystone, set_intrinsics, zoom_image
-from splatnode.extras.evaluate.stability.perturbations import TrialImage
+from splatnode.extras.evaluate.stability.perturbations import TrialImage, crop_image
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras, make_frames, make_world, score_cameras
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.estimation import Reconstruction, estimate_cameras
@@ -78,6 +78,19 @@ def test_an_image_that_contradicts_what_is_told_gets_a_lens_of_its_own(setting):
     found = estimate(photos)
     check_within_bounds(photos, found)
     assert own(found) == [photos[2].name]
+
+
+def test_exif_that_cropped_images_contradict_is_not_used():
+    """An editor that crops leaves EXIF as it was, which then tells too short a focal length of what is left."""
+    crops = [crop_image(photo, 0.6, 0.5, 0.5) for photo in photographs()]
+    width, height = crops[0].image.shape[1::-1]
+    stale = set_intrinsics(photographs(), "exif")[0].intrinsics
+    assert stale is not None
+    photos = [replace(photo, intrinsics=stale.resized(width, height)) for photo in crops]
+    found = estimate(photos)
+    check_within_bounds(photos, found)
+    assert "EXIF" in found.verdict.message
+    assert all(keyframe.frame.intrinsics is not None for keyframe in found.graph.keyframes)
 
 
 @pytest.mark.parametrize("kind", ["cameras 1 : 1.12", "breathing 2 %", "all keystone", "all off-centre crops"])

@@ -109,6 +109,12 @@ def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
     )
     given = refused(decide(told, None, None, DecisionConfig()), Code.FOCAL_SUSPECT)
     assert "64 pixels" in given.message and "+40 %" in given.message
+    nominal = replace(lens, source="exif")
+    told = replace(
+        silent, keyframes=tuple(replace(k, frame=replace(k.frame, intrinsics=nominal)) for k in silent.keyframes)
+    )
+    given = refused(decide(told, None, None, DecisionConfig()), Code.FOCAL_SUSPECT)
+    assert "EXIF tells, 64 pixels" in given.message and "cropped" in given.advice
 
 
 def test_a_given_focal_length_that_the_frames_contradict_is_named_with_how_much():
@@ -121,7 +127,8 @@ def test_a_given_focal_length_that_the_frames_contradict_is_named_with_how_much(
     assert (
         verdict(3, freed=(FreedLens(1000.0, False, 1030.0, 1100.0, 0.9),)).code == Code.OK
     )  # nominal ones are rounded
-    refused(verdict(3, freed=(FreedLens(1000.0, False, 1300.0, 1430.0, 0.9),)), Code.FOCAL_SUSPECT)
+    told = refused(verdict(3, freed=(FreedLens(1000.0, False, 1300.0, 1430.0, 0.9),)), Code.FOCAL_SUSPECT)
+    assert "EXIF tells, 1000 pixels" in told.message and "cropped" in told.advice  # nobody gave a calibration
     assert verdict(3, freed=(FreedLens(1000.0, False, 1420.0, 1430.0, 1.0),)).code == Code.OK  # put right already
 
 

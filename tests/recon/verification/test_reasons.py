@@ -149,6 +149,15 @@ def doubting(measure: str) -> VerdictModels:
         ("coverage", {2: {"coverage": 0.06}}, {}, Code.AMBIGUOUS, (2,), "fills only 6 % of its picture"),
         ("reflection", {}, {"reflection": Reflection(("1.png",), 0.3)}, Code.AMBIGUOUS, (1,), "the wrong way round"),
         ("flat_patch", {2: {"coverage": 0.04, "flat_share": 0.99}}, {}, Code.MOVING_SCENE, (2,), "4 % of its picture"),
+        ("own_lens", {2: {"own_lens": True}}, {}, Code.AMBIGUOUS, (2,), "1 of 4 photographs do not have the lens"),
+        (  # most have: they are not left out, the photograph that fits least is
+            "own_lens",
+            {index: {"own_lens": True, "inlier_ratio": 0.9 + 0.01 * index} for index in (1, 2, 3)},
+            {},
+            Code.AMBIGUOUS,
+            (1,),
+            "3 of 4",
+        ),
         ("travel_bound", {2: {"errors": unsure(centre=0.05)}}, {}, Code.AMBIGUOUS, (2,), "disagree about 2.png"),
         (
             "rotation_bound",

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from statistics import median, quantiles
+from statistics import mean, median, quantiles
 from typing import Any
 
-from tests.reference.measured.raw import bullets, change, part, percent, raw, require, span, table
+from tests.reference.measured.raw import bullets, change, part, percent, raw, require, scores, span, table
 
 QUERIES = {
     "zoomed 1.02 to 1.3 times": [f"zoom {factor}" for factor in (1.02, 1.05, 1.1, 1.2, 1.3)],
@@ -221,6 +221,92 @@ def known_poses() -> str:
         "largest error over bound",
     )
     return table(header, rows)
+
+
+GIVEN_OURS = "balanced", "fast"
+GIVEN_RIVALS = {"mcmc+fill": "MCMC", "3dgs": "3DGS", "fsgs": "FSGS"}
+
+
+def given_scenes() -> str:
+    """Scenes of poses that are given, beside other recipes from the same cameras and points."""
+    found = raw("given_scenes")
+    sets: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in found["rows"]:
+        sets.setdefault(f"{row['scene']}, {row['views']}", {})[row["method"]] = row
+    sets = {name: rows for name, rows in sets.items() if {*GIVEN_OURS} < rows.keys()}
+    require(all(rows[ours]["psnr"] for rows in sets.values() for ours in GIVEN_OURS), "both presets make each scene")
+    without = [
+        f"{GIVEN_RIVALS[method]} of {name} ({row['why']})"
+        for name, rows in sets.items() for method, row in rows.items() if row["why"]
+    ]  # fmt: skip
+    notes = [_tell_behind(ours, sets) for ours in GIVEN_OURS]
+    notes += [f"No scene by {', '.join(without)}."] if without else []
+    notes += [f"{found['note'][0].upper()}{found['note'][1:]}."] if found["note"] else []
+    beside = [_compare_given(ours, rival, sets) for ours in GIVEN_OURS for rival in GIVEN_RIVALS]
+    header = (
+        *(
+            "preset",
+            "beside",
+            "sets that both have",
+            "lead in PSNR, mean",
+            "PSNR at least as high",
+            "time at most as long",
+        ),
+        *("both", "its time over the other's, median"),
+    )
+    head = "set, views", "points", *(f"`{each}`" for each in GIVEN_OURS), *GIVEN_RIVALS.values()
+    cells = [
+        (name, rows[GIVEN_OURS[0]]["points"], *(_tell_given(rows.get(each)) for each in (*GIVEN_OURS, *GIVEN_RIVALS)))
+        for name, rows in sets.items()
+    ]
+    return f"{bullets(*notes)}\n\n{table(header, beside)}\n\n{table(head, cells)}"
+
+
+def _tell_given(row: dict[str, Any] | None) -> str:
+    if row is None:
+        return "not run"
+    return "no scene" if row["why"] else f"{scores(row)}; {row['processor_seconds']:.0f} s"
+
+
+def _tell_behind(ours: str, sets: dict[str, dict[str, dict[str, Any]]]) -> str:
+    """Says where a preset is worse than the best of the others, and than which it takes longer."""
+    clauses = []
+    for measure, sign, digits in (("psnr", 1, 2), ("ssim", 1, 3), ("lpips", -1, 3)):
+        told = []
+        for name, rows in sets.items():
+            leads = {
+                rival: sign * (rows[ours][measure] - rows[rival][measure])
+                for rival in GIVEN_RIVALS if rival in rows and not rows[rival]["why"]
+            }  # fmt: skip
+            best = min(leads, key=leads.__getitem__, default=None)
+            if best is not None and leads[best] < 0:
+                told.append(f"{name}: {change(sign * leads[best], digits)} beside {GIVEN_RIVALS[best]}")
+        where = f" ({'; '.join(told)})" if told else ""
+        clauses.append(f"in {measure.upper()} in {len(told)} of {len(sets)} sets{where}")
+    longer = []
+    for rival in GIVEN_RIVALS:
+        times = [mine["processor_seconds"] / other["processor_seconds"] for mine, other in _pair(ours, rival, sets)]
+        if slow := sum(time > 1 for time in times):
+            longer.append(f"{GIVEN_RIVALS[rival]} in {slow} of {len(times)}")
+    slower = f" It takes longer than {', '.join(longer)}." if longer else " It takes longer than none of them."
+    return f"`{ours}` is behind the best of the others {', '.join(clauses)}.{slower}"
+
+
+def _pair(
+    ours: str, rival: str, sets: dict[str, dict[str, dict[str, Any]]]
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Returns the rows of both where both have a scene."""
+    return [(rows[ours], rows[rival]) for rows in sets.values() if rival in rows and not rows[rival]["why"]]
+
+
+def _compare_given(ours: str, rival: str, sets: dict[str, dict[str, dict[str, Any]]]) -> tuple[object, ...]:
+    """Returns what a preset is beside another recipe, where both have a scene."""
+    pairs = _pair(ours, rival, sets)
+    leads = [mine["psnr"] - other["psnr"] for mine, other in pairs]
+    times = [mine["processor_seconds"] / other["processor_seconds"] for mine, other in pairs]
+    both = sum(lead >= 0 and time <= 1 for lead, time in zip(leads, times, strict=True))
+    counts = sum(lead >= 0 for lead in leads), sum(time <= 1 for time in times), both
+    return f"`{ours}`", GIVEN_RIVALS[rival], len(pairs), change(mean(leads), 2), *counts, part(median(times), 2)
 
 
 def odometry_sets() -> str:
@@ -484,6 +570,7 @@ BLOCKS = (
     rgbd,
     plain_rooms,
     known_poses,
+    given_scenes,
     odometry_sets,
     hard_sets,
     told_lenses,
