@@ -504,7 +504,7 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
             make_metric_views(snapshot), snapshot.landmarks, evidence.depths, others
         )
         if snapshot.given is not None and snapshot.given.from_depth:
-            told = []  # the same depth images give the unit already
+            told, checks = [], tuple(map(_describe_placing, checks))  # they give the unit already
         said, snapshot = said + told, replace(snapshot, depth_checks=checks)
     if not said:
         return snapshot
@@ -573,6 +573,16 @@ def _collect_measurements(
     if config.depth_network:
         said.append(_estimate_scale_from_network(snapshot, config.depth_network_sigma))
     return said, aligned
+
+
+def _describe_placing(check: DepthCheck) -> DepthCheck:
+    """The check of depth images that place the cameras: that points of the photographs are too few leaves them in."""
+    if check.code is not DepthCode.UNTESTED:
+        return check
+    message = (
+        f"depth images place the cameras; {check.num_points} points of the images have a depth, too few for a test"
+    )
+    return replace(check, message=message)
 
 
 def _align_to_given_world(snapshot: Snapshot, given: InGivenWorld) -> PoseAlignment | str:
