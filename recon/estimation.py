@@ -7,8 +7,9 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
+import numpy as np
 
-from splatnode.capture.frame import DroppedFrame, Frame, Stamp
+from splatnode.capture.frame import DroppedFrame, Frame, Stamp, make_given_pose
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
@@ -16,8 +17,9 @@ from splatnode.recon.core import give_back_memory
 from splatnode.recon.keyframes import LIBRARY_ERRORS, Features, Keyframe, Rejected, resize_image
 from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
-from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.metric.depth_fit import fill_measured_depth
+from splatnode.recon.matching.view_graph import Pair, ViewGraph
+from splatnode.recon.metric.depth_alignment import place_by_depth
+from splatnode.recon.metric.depth_fit import fill_measured_depth, fit_depth_images, make_depth_view
 from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
 from splatnode.recon.rasterize import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
@@ -26,7 +28,7 @@ from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
 from splatnode.recon.registration.posed_mapping import offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
-from splatnode.recon.result.snapshot import Landmarks
+from splatnode.recon.result.snapshot import DepthCode, Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Code, Verdict
 from splatnode.recon.threads import make_deadline_pause
 from splatnode.recon.verification.decision import (
@@ -117,6 +119,7 @@ def prepare_all(frames: Iterable[Frame], config: ReconstructionConfig) -> tuple[
 # that were taken for this one had up to 20.
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
+TELLING_MATCHES = 40  # of a pair that may contradict depth images
 LEAST_FITTING = 0.5  # share of all matches that fit given poses, below which these may be wrong together
 _NOTHING = 1e-6  # share of a keyframe that rounding leaves
 PROVISIONAL = "Provisional: checked again with all evidence when the camera rests."
@@ -314,12 +317,63 @@ def _estimate_from_poses(
     )
 
 
-def _is_contradicted(posed: Reconstruction) -> bool:
-    """Whether so few matches fit that the poses may be wrong together: then no single one stands out."""
+def estimate_cameras_by_depth(
+    graph: ViewGraph, config: ReconstructionConfig, pause: Callable[[], None] = lambda: None
+) -> Reconstruction | None:
+    """The estimate whose cameras depth images place, in metres, however little the images share.
+
+    None where depth images place fewer than two cameras, or what the images match contradicts them. `pause` is
+    called about once a second and may raise.
+    """
+    placed = {each.name: each for each in place_by_depth([each.frame for each in graph.keyframes], pause)}
+    if not placed:
+        return None
+    keyframes = []
+    for keyframe in graph.keyframes:
+        camera = placed.get(keyframe.name)
+        pose = None if camera is None else make_given_pose(camera.T_world_camera, camera.sigma_m, camera.sigma_deg)
+        keyframes.append(replace(keyframe, frame=replace(keyframe.frame, given_pose=pose)))
+    absolute = msgspec.structs.replace(config.registration, poses_drift=0.0, poses_drift_deg=0.0)
+    found = register_posed(keyframes, graph.pairs, absolute, pause)
+    give_back_memory()
+    if found is None or found.given is None:
+        return None
+    scale_sigma = float(np.hypot(found.given.scale_sigma, max(each.scale_sigma for each in placed.values())))
+    given = replace(found.given, from_depth=True, scale_sigma=scale_sigma)
+    registration = replace(found, given=given)
+    verdict = decide_posed(graph, registration, given, config.decision)
+    posed = Reconstruction(graph, registration, None, verdict)
+    is_refuted = _is_contradicted(posed, find_telling_pairs(graph)) or _points_contradict_depth(posed)
+    return None if is_refuted else posed
+
+
+def _points_contradict_depth(posed: Reconstruction) -> bool:
+    """Whether points that the images see from the cameras lie elsewhere than depth images have them."""
+    if posed.registration is None:
+        return False
+    keyframes = posed.graph.keyframes
+    views = [
+        make_depth_view(keyframes[camera.index], posed.registration, camera)
+        for camera in posed.registration.cameras
+        if keyframes[camera.index].frame.depth is not None
+    ]
+    return any(fit.check.code is DepthCode.CONTRADICTS for fit in fit_depth_images(views))
+
+
+def find_telling_pairs(graph: ViewGraph) -> set[Pair]:
+    """The pairs of so many matches that they may contradict depth images: edges of plain walls give wrong ones, too."""
+    return {pair for pair, found in graph.pairs.items() if len(found.matches) >= TELLING_MATCHES}
+
+
+def _is_contradicted(posed: Reconstruction, by: Collection[Pair] | None = None) -> bool:
+    """Whether so few matches fit that the poses may be wrong together: then no single one stands out.
+
+    `by` are the pairs that count; None: all.
+    """
     if posed.registration is None or not posed.graph.pairs:
         return False
-    ratios = posed.registration.inlier_ratios
-    known = {pair: ratio for pair, ratio in ratios.items() if pair in posed.graph.pairs}
+    ratios, counted = posed.registration.inlier_ratios, posed.graph.pairs if by is None else by
+    known = {pair: ratio for pair, ratio in ratios.items() if pair in counted}
     return bool(known) and compute_pooled_ratio(known, posed.graph.pairs) < LEAST_FITTING
 
 

@@ -7,6 +7,7 @@ unless somebody asked for a deadline. One rung is simulated tilts in both direct
 has them (Morel and Yu, 2009); another is matches by networks that were trained on wide baselines (XFeat, LighterGlue),
 where their weights are.
 
+Where photographs show too little and depth images came with them, these place the cameras.
 Where a refusal is about a few photographs, the rest is judged by itself. A photograph that shows little of what the
 others show, or only something that may have been moved, says nothing against these. They are judged as if it had never
 been taken.
@@ -28,7 +29,7 @@ import numpy.typing as npt
 
 from splatnode.recon import networks
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_cameras_by_depth, find_telling_pairs
 from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.keyframes import PLAIN, Rejected
 from splatnode.recon.matching.features import count_search_pixels
@@ -36,6 +37,7 @@ from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_
 from splatnode.recon.networks import Weights, depth_anything, find_mismatch, locate_weights
 from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
+from splatnode.recon.registration.known_poses import TOLD
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import is_over
 
@@ -269,6 +271,12 @@ log = logging.getLogger(__name__)
 RUNGS = (LEARNED_MATCHES, AFFINE_SIMULATION)  # what wins most for its work comes first
 CAMERAS = 0.2  # work of estimating the cameras again, for each keyframe
 LACKING_MATCHES = (Code.NO_OVERLAP, Code.SPLIT, Code.OK_PARTIAL, Code.AMBIGUOUS)
+# What is too little to be seen by photographs may be enough to be measured by a depth camera
+WANTING_SIGHT = (
+    *(Code.NO_OVERLAP, Code.SPLIT, Code.AMBIGUOUS, Code.LOW_TEXTURE, Code.NO_PARALLAX, Code.PLANAR_ONLY),
+    *(Code.BASELINE_TOO_SMALL, Code.UNDETERMINED),
+)
+LENS_FOR_DEPTH = "Give the lens (--intrinsics FILE; Python: intrinsics=): with it depth images can place the cameras."
 # Of the others, what more cameras may mend, where some keyframes have none: few leave much open.
 UNCERTAIN = (Code.OK_ROUGH, Code.TOO_ROUGH, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY, Code.BASELINE_TOO_SMALL)
 
@@ -291,7 +299,16 @@ def run_fallbacks(
         return estimate
     if _lacks_matches(estimate):
         estimate = _try_fallbacks(estimate, rejected, config, pause, rungs, until)
-    return estimate if is_over(until) else estimate_without_doubtful(estimate, rejected, config, pause)
+    if is_over(until):
+        return estimate
+    estimate = estimate_without_doubtful(estimate, rejected, config, pause)
+    if not _wants_depth(estimate):
+        return estimate
+    by_depth = estimate_cameras_by_depth(estimate.graph, config, pause)
+    if by_depth is None or not by_depth.publishable:
+        return _advise_lens(estimate)
+    log.info("depth images place %d cameras", len(by_depth.camera_names))
+    return by_depth
 
 
 def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, rungs: Sequence[Fallback] = RUNGS) -> str:
@@ -342,6 +359,21 @@ def _try_fallbacks(
         log.info("looked for more matches: %s: %s by %.1f of work", rung.name, gained, means.work - before.work)
         tried.append(rung.name)
     return _append_tried(estimate, {"Also tried": tried, "Not tried": not_tried})
+
+
+def _wants_depth(estimate: Reconstruction) -> bool:
+    """Whether photographs show too little, where few matches at most speak against a lens."""
+    code = estimate.verdict.code
+    return code in WANTING_SIGHT or (code is Code.FOCAL_SUSPECT and not find_telling_pairs(estimate.graph))
+
+
+def _advise_lens(estimate: Reconstruction) -> Reconstruction:
+    """Appends to the advice that depth images could place the cameras, where they came without a lens that was told."""
+    frames = [keyframe.frame for keyframe in estimate.graph.keyframes if keyframe.frame.depth is not None]
+    if len(frames) < 2 or any(frame.intrinsics is not None and frame.intrinsics.source in TOLD for frame in frames):
+        return estimate
+    advice = f"{estimate.verdict.advice} {LENS_FOR_DEPTH}".strip()
+    return replace(estimate, verdict=replace(estimate.verdict, advice=advice))
 
 
 def _lacks_matches(estimate: Reconstruction) -> bool:

@@ -321,7 +321,10 @@ def _find_given_world(conclusion: ReconstructionSummary) -> InGivenWorld | None:
     given = conclusion.given
     if given is None:
         return None
-    return InGivenWorld(given.scale, given.rotation, given.translation, given.scale_sigma, len(given.held))
+    placed = len(given.held)
+    return InGivenWorld(
+        given.scale, given.rotation, given.translation, given.scale_sigma, placed, from_depth=given.from_depth
+    )
 
 
 def _find_rig(conclusion: ReconstructionSummary) -> OnRig | None:

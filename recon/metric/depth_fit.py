@@ -8,7 +8,7 @@ better at another pixel: the images test it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -54,7 +54,8 @@ def smooth_depth(depth: DepthImage) -> tuple[Map, Map]:
     best, sigma, open_yet = nearness.copy(), noise.copy(), known.copy()
     for radius in _RADII:
         side = 2 * max(1, round(radius * max(z.shape) / 640)) + 1
-        value, rms, count = _fit_planes(nearness, known, side)
+        planes = fit_planes(nearness, known, side)
+        value, rms, count = planes.value, planes.rms, planes.count
         plane = (count >= _LEAST_WINDOW * side**2) & (rms < _PLANE_SIGMAS * noise) & open_yet & (value > 0)
         outlier = plane & (np.abs(nearness - value) > _OUTLIER_SIGMAS * noise)
         best[plane], best[outlier] = value[plane], 0.0
@@ -64,11 +65,19 @@ def smooth_depth(depth: DepthImage) -> tuple[Map, Map]:
     return smooth, sigma * smooth**2
 
 
-def _fit_planes(values: Map, known: Mask, side: int) -> tuple[Map, Map, Map]:
-    """The plane of the known values in the window around each pixel: its value there, rms distance, how many are known.
+@dataclass(frozen=True, eq=False)
+class Planes:
+    """The plane of the known values around each pixel, (H, W) each."""
 
-    Planes are fitted by least squares, from sums over windows.
-    """
+    value: Map  # of the plane, at the pixel
+    slope_x: Map  # a pixel across
+    slope_y: Map  # and down
+    rms: Map  # distance of the values from it; infinite where there are too few
+    count: Map  # of known values
+
+
+def fit_planes(values: Map, known: Mask, side: int) -> Planes:
+    """Fits a plane to the known values in the window of `side` pixels around each pixel, by least squares."""
     height, width = values.shape
     x, y = np.meshgrid(np.arange(width) - width / 2.0, np.arange(height) - height / 2.0)
     weight = known.astype(np.float64)
@@ -90,7 +99,7 @@ def _fit_planes(values: Map, known: Mask, side: int) -> tuple[Map, Map, Map]:
     slope_x, slope_y = (yy * xv - xy * yv) / safe, (xx * yv - xy * xv) / safe
     value = mean + slope_x * (x - mean_x) + slope_y * (y - mean_y)
     rms = np.sqrt(np.maximum(vv - slope_x * xv - slope_y * yv, 0.0))
-    return value, np.where(sound, rms, np.inf), count
+    return Planes(value, slope_x, slope_y, np.where(sound, rms, np.inf), count)
 
 
 # How depth images go with what the images themselves tell: the unit that they give, and what speaks against them.
@@ -327,11 +336,6 @@ def _explain_few(views: Sequence[DepthView], count: int) -> DepthFit:
     return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
 
 
-def group_by_name(fits: Sequence[DepthFit]) -> Mapping[str, DepthFit]:
-    """The fit of each image by its name, of those that may be used."""
-    return {name: fit for fit in fits if fit.is_usable for name in fit.names}
-
-
 def describe_doubtful_units(frames: Iterable[Frame | DroppedFrame]) -> str:
     """Describes what speaks against the units of depth images, by the first that it is about; empty: nothing does."""
     depths = {each.name: each.depth for each in frames if isinstance(each, Frame) and each.depth is not None}
@@ -383,21 +387,34 @@ def fill_measured_depth(
     views = [make_depth_view(keyframes[name], registration, cameras[name]) for name in cameras if name in keyframes]
     fits = fit_depth_images(views)
     for fit in fits:
-        log.log(logging.INFO if fit.is_usable else logging.WARNING, "%s", _describe_use(fit))
-    usable, by_name = group_by_name(fits), {view.name: view for view in views}
+        is_used = all(_find_unit(name, fits, registration) is not None for name in fit.names)
+        log.log(logging.INFO if is_used else logging.WARNING, "%s", _describe_use(fit, is_used))
+    by_name = {view.name: view for view in views}
     found = []
     for pointmap in pointmaps:
-        if (fit := usable.get(pointmap.name)) is not None:
+        unit = _find_unit(pointmap.name, fits, registration)
+        if unit is not None and pointmap.name in by_name:
             measured = warp_depth(by_name[pointmap.name], pointmap.K, pointmap.depth.shape)
-            unit = fit.metres_per_unit
             pointmap = fuse_depth(pointmap, MeasuredDepth(measured.z / unit, measured.sigma / unit))
         found.append(pointmap)
     return tuple(found)
 
 
-def _describe_use(fit: DepthFit) -> str:
+def _find_unit(name: str, fits: Sequence[DepthFit], registration: Registration) -> float | None:
+    """Metres of the scene's unit by which a depth image is taken; None where it is not."""
+    fit = next((each for each in fits if name in each.names), None)
+    if fit is None or fit.is_usable:
+        return None if fit is None else fit.metres_per_unit
+    given = registration.given  # the cameras stand where depth images placed them, in their unit
+    by_depth = given is not None and given.from_depth and fit.check.code is DepthCode.UNTESTED
+    return given.scale if given is not None and by_depth else None
+
+
+def _describe_use(fit: DepthFit, is_used: bool) -> str:
     who = f"depth images of {len(fit.names)} photographs" + (f" of {fit.camera_id}" if fit.camera_id else "")
-    if fit.is_usable:
+    if is_used and not fit.is_usable:
+        return f"{who} place the cameras and fill what the images cannot tell"
+    if is_used:
         return f"{who} fit the images and fill what these cannot tell"
     return f"{who} fill nothing: {fit.check.code.value}; the result tells why (depth_checks, report.json's depth)"
 

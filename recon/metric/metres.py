@@ -503,6 +503,8 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
         told, checks = estimate_scale_from_depth(
             make_metric_views(snapshot), snapshot.landmarks, evidence.depths, others
         )
+        if snapshot.given is not None and snapshot.given.from_depth:
+            told, checks = [], tuple(map(_describe_placing, checks))  # they give the unit already
         said, snapshot = said + told, replace(snapshot, depth_checks=checks)
     if not said:
         return snapshot
@@ -542,7 +544,10 @@ def _collect_measurements(
             make_metric_views(snapshot), evidence.sightings, config.marker_size_m, config.marker_size_sigma_m
         )
     aligned = None
-    if snapshot.given is not None:
+    if snapshot.given is not None and snapshot.given.from_depth:
+        known = f"depth images of {snapshot.given.num_poses} photographs, which place the cameras"
+        said.append(Measurement(snapshot.given.scale, snapshot.given.scale_sigma, known))
+    elif snapshot.given is not None:
         found = _align_to_given_world(snapshot, snapshot.given)
         aligned = None if isinstance(found, str) else found
         said.append(found if isinstance(found, str) else found.unit)
@@ -568,6 +573,16 @@ def _collect_measurements(
     if config.depth_network:
         said.append(_estimate_scale_from_network(snapshot, config.depth_network_sigma))
     return said, aligned
+
+
+def _describe_placing(check: DepthCheck) -> DepthCheck:
+    """The check of depth images that place the cameras: that points of the photographs are too few leaves them in."""
+    if check.code is not DepthCode.UNTESTED:
+        return check
+    message = (
+        f"depth images place the cameras; {check.num_points} points of the images have a depth, too few for a test"
+    )
+    return replace(check, message=message)
 
 
 def _align_to_given_world(snapshot: Snapshot, given: InGivenWorld) -> PoseAlignment | str:

@@ -106,6 +106,7 @@ class GivenWorld:
     turn_covariances: Array
     centre_covariances: Array
     held: frozenset[int]  # keyframes whose given pose holds their camera
+    from_depth: bool = False  # whether depth images gave the poses, and nobody told them
 
 
 @dataclass(frozen=True, eq=False)

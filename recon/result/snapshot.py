@@ -243,6 +243,7 @@ class InGivenWorld:
     translation: Array64  # (3,) metres
     scale_sigma: float  # standard deviation of the logarithm of the scale
     num_poses: int  # that hold it
+    from_depth: bool = False  # whether depth images gave the poses, and nobody told them
 
 
 @dataclass(frozen=True, eq=False)

@@ -382,10 +382,12 @@ def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld
     placed = {camera.index for camera in registration.cameras}
     left_out = tuple(name for index, name in enumerate(graph.names) if index not in placed)
     count = f"{'All' if not left_out else f'{len(placed)} of'} {len(graph.names)} photographs were placed"
-    code, message = (Code.OK_PARTIAL if left_out else Code.OK), f"{count}, {len(given.held)} of them by given poses."
+    by = "what their depth images measured" if given.from_depth else "given poses"
+    code, message = (Code.OK_PARTIAL if left_out else Code.OK), f"{count}, {len(given.held)} of them by {by}."
     if rough := _rough(registration, worst, config):
         code, message = Code.OK_ROUGH, f"{message[:-1]}, roughly: {rough}."
-    advice = f"Give a pose of {sanitize_text(left_out[0])}, or add a photograph beside it." if left_out else ""
+    give = "Take a depth image" if given.from_depth else "Give a pose"
+    advice = f"{give} of {sanitize_text(left_out[0])}, or add a photograph beside it." if left_out else ""
     verdict = Verdict(code, message, advice, left_out, publishable=True)
     return _naming(verdict, graph, given, placed)
 
@@ -417,11 +419,16 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
     if given.deviations:
         told = [_residual(graph, each, placed) for each in given.deviations[:_MOST_NAMED]]
         more = f", and {len(given.deviations) - _MOST_NAMED} more" if len(given.deviations) > _MOST_NAMED else ""
-        sentences.append(f"The photographs contradict given poses: {'; '.join(told)}{more}.")
-        advice.append("Check these poses, and whether their photographs were taken there.")
+        poses = "the poses by depth images" if given.from_depth else "given poses"
+        sentences.append(f"The photographs contradict {poses}: {'; '.join(told)}{more}.")
+        at = "that each depth image goes with its photograph" if given.from_depth else _CHECK_POSES
+        advice.append(f"Check {at}.")
     names = tuple(graph.names[each.index] for each in given.deviations)
     frames = (*verdict.frames, *(name for name in names if name not in verdict.frames))
     return replace(verdict, message=" ".join(sentences), advice=" ".join(filter(None, advice)), frames=frames)
+
+
+_CHECK_POSES = "these poses, and whether their photographs were taken there"
 
 
 def _format_sigma(sigma: float) -> str:

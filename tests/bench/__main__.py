@@ -63,6 +63,7 @@ BENCHMARKS = {
         "known_poses",
         "given_scenes",
         "odometry_sets",
+        "plain_rooms",
         "several_cameras",
         "rigs",
         "rgbd",
