@@ -230,9 +230,9 @@ class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     calibrated_focal: float = 0.002  # of log focal
     calibrated_shift: float = 0.001  # of the principal point, as a share of the longer side
     # Pixels far from square, which the search for deviations does not find, are tried where a free aspect differs at
-    # least so much (of the log aspect) and leaves at most such a share of the cost
+    # least so much (of the log aspect)
     least_aspect: float = 0.05
-    aspect_gain: float = 0.9
+    aspect_gain: float = 0.9  # and leaves at most this share of the cost
 
 
 @dataclass(frozen=True, eq=False)
