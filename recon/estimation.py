@@ -19,13 +19,13 @@ from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_by_depth
-from splatnode.recon.metric.depth_fit import fill_measured_depth, fit_depth_images, make_depth_view
+from splatnode.recon.metric.depth_fit import fill_measured_depth, fit_depth_images, make_depth_views
 from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
 from splatnode.recon.rasterize import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration
 from splatnode.recon.registration.known_poses import GivenWorld, Offset
 from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
-from splatnode.recon.registration.posed_mapping import offset_of, register_posed
+from splatnode.recon.registration.posed_mapping import TELLING_MATCHES, offset_of, register_posed
 from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.result.snapshot import DepthCode, Landmarks
@@ -119,7 +119,6 @@ def prepare_all(frames: Iterable[Frame], config: ReconstructionConfig) -> tuple[
 # that were taken for this one had up to 20.
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
-TELLING_MATCHES = 40  # of a pair that may contradict depth images
 LEAST_FITTING = 0.5  # share of all matches that fit given poses, below which these may be wrong together
 _NOTHING = 1e-6  # share of a keyframe that rounding leaves
 PROVISIONAL = "Provisional: checked again with all evidence when the camera rests."
@@ -290,7 +289,8 @@ def _estimate_without_exif(
     other = _register_and_verify(forget_exif(graph), config, pause)
     if other.registration is None or not other.verdict.publishable:
         return found
-    rougher = found.verdict.publishable and found.verdict.code is not Code.OK_ROUGH is other.verdict.code
+    was_exact = found.verdict.publishable and found.verdict.code is not Code.OK_ROUGH
+    rougher = was_exact and other.verdict.code is Code.OK_ROUGH
     if rougher or len(other.camera_names) < len(found.publishable_camera_names):
         return found
     if not excludes_exif(graph, other.registration, other.bounds):
@@ -351,13 +351,8 @@ def _points_contradict_depth(posed: Reconstruction) -> bool:
     """Whether points that the images see from the cameras lie elsewhere than depth images have them."""
     if posed.registration is None:
         return False
-    keyframes = posed.graph.keyframes
-    views = [
-        make_depth_view(keyframes[camera.index], posed.registration, camera)
-        for camera in posed.registration.cameras
-        if keyframes[camera.index].frame.depth is not None
-    ]
-    return any(fit.check.code is DepthCode.CONTRADICTS for fit in fit_depth_images(views))
+    fits = fit_depth_images(make_depth_views(posed.graph, posed.registration))
+    return any(fit.check.code is DepthCode.CONTRADICTS for fit in fits)
 
 
 def find_telling_pairs(graph: ViewGraph) -> set[Pair]:

@@ -7,10 +7,9 @@ unless somebody asked for a deadline. One rung is simulated tilts in both direct
 has them (Morel and Yu, 2009); another is matches by networks that were trained on wide baselines (XFeat, LighterGlue),
 where their weights are.
 
-Where photographs show too little and depth images came with them, these place the cameras.
 Where a refusal is about a few photographs, the rest is judged by itself. A photograph that shows little of what the
 others show, or only something that may have been moved, says nothing against these. They are judged as if it had never
-been taken.
+been taken. Where photographs show too little and depth images came with them, these place the cameras.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_
 from splatnode.recon.networks import Weights, depth_anything, find_mismatch, locate_weights
 from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
-from splatnode.recon.registration.known_poses import TOLD
+from splatnode.recon.registration.known_poses import has_told_lens
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import is_over
 
@@ -370,7 +369,7 @@ def _wants_depth(estimate: Reconstruction) -> bool:
 def _advise_lens(estimate: Reconstruction) -> Reconstruction:
     """Appends to the advice that depth images could place the cameras, where they came without a lens that was told."""
     frames = [keyframe.frame for keyframe in estimate.graph.keyframes if keyframe.frame.depth is not None]
-    if len(frames) < 2 or any(frame.intrinsics is not None and frame.intrinsics.source in TOLD for frame in frames):
+    if len(frames) < 2 or any(map(has_told_lens, frames)):
         return estimate
     advice = f"{estimate.verdict.advice} {LENS_FOR_DEPTH}".strip()
     return replace(estimate, verdict=replace(estimate.verdict, advice=advice))

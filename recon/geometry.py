@@ -219,6 +219,13 @@ def undistort_iterations(radials: Array) -> int:
 # Cross products of many vectors.
 
 
+def invert_pose(T: Array) -> Array:
+    """The inverse (4, 4) of a rigid motion `T` (4, 4)."""
+    inverse = np.eye(4)
+    inverse[:3, :3], inverse[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
 def cross_matrix(vectors: Array) -> Array:
     """(M, 3, 3) matrices of `vectors` (M, 3) with cross_matrix(v) @ x = v x x."""
     x, y, z = vectors.T

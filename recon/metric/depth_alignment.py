@@ -10,6 +10,7 @@ covariance, and a camera of which too much is open is not placed.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,9 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.text import sanitize_text
-from splatnode.recon.geometry import cross_matrix
+from splatnode.recon.geometry import cross_matrix, invert_pose
 from splatnode.recon.metric.depth_fit import DepthView, fit_planes, warp_depth
-from splatnode.recon.registration.known_poses import TOLD
+from splatnode.recon.registration.known_poses import has_told_lens
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -73,7 +74,7 @@ def make_depth_cloud(frame: Frame) -> DepthCloud | None:
     None without depth or a lens that was told, or where too little is measured.
     """
     lens = frame.intrinsics
-    if frame.depth is None or lens is None or lens.source not in TOLD:
+    if frame.depth is None or lens is None or not has_told_lens(frame):
         return None
     scale = _SIDE / max(frame.width, frame.height)
     width, height = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
@@ -237,6 +238,12 @@ def _compute_residuals(
     return _Residuals(off, n, sigma, counts, pixel, known)
 
 
+def _compare(cloud: DepthCloud, target: DepthCloud, T: Array) -> tuple[Array, _Residuals]:
+    """The chosen points of the cloud in the target's frame, where its camera is at `T` (4, 4), and their residuals."""
+    points, normals = cloud.points @ T[:3, :3].T + T[:3, 3], cloud.normals[cloud.chosen] @ T[:3, :3].T
+    return points, _compute_residuals(target, points, normals, cloud.sigma[cloud.chosen])
+
+
 @dataclass(frozen=True)
 class Agreement:
     """How the points of a cloud go with another cloud. Shares are of the points on known depth but the first."""
@@ -269,13 +276,12 @@ _LEAST_SEEN = 0.4  # as _LEAST_ON, of cameras far from each other, between which
 
 def compute_agreement(cloud: DepthCloud, target: DepthCloud, T: Array) -> Agreement:
     """How `cloud` goes with `target` where its camera is at `T` (4, 4) in the target's frame."""
-    points, sigmas = cloud.points @ T[:3, :3].T + T[:3, 3], cloud.sigma[cloud.chosen]
-    found = _compute_residuals(target, points, cloud.normals[cloud.chosen] @ T[:3, :3].T, sigmas)
+    points, found = _compare(cloud, target, T)
     known, on = found.known, found.is_on
     shared = int(known.sum())
     if shared < _LEAST_SHARED:
         return Agreement(0.0, 0.0, 0.0, 0.0)
-    margin = _BEFORE_SIGMAS * np.hypot(target.sigma[found.pixel], sigmas) + _BEFORE_M
+    margin = _BEFORE_SIGMAS * np.hypot(target.sigma[found.pixel], cloud.sigma[cloud.chosen]) + _BEFORE_M
     before = known & ~on & (points[:, 2] < target.surface[found.pixel, 2] - margin)
     difference = cloud.log_light[cloud.chosen] - target.log_light[found.pixel]
     gain = float(np.median(difference[on])) if on.any() else 0.0
@@ -348,7 +354,7 @@ def _refine(cloud: DepthCloud, target: DepthCloud, Ts: Array) -> list[Alignment]
     Ts = Ts[np.argsort(np.negative(scores), kind="stable")]
     Ts = _descend(cloud, target, Ts[_find_distinct(Ts)[:_KEPT]], cloud.chosen, _FINE_GATES_M)
     found = [
-        Alignment(T, compute_agreement(cloud, target, T), compute_agreement(target, cloud, _invert(T))) for T in Ts
+        Alignment(T, compute_agreement(cloud, target, T), compute_agreement(target, cloud, invert_pose(T))) for T in Ts
     ]
     return sorted(found, key=lambda each: -each.score)
 
@@ -428,12 +434,6 @@ def _count_sigmas(T: Array, other: Array, information: Array) -> float:
     return float(np.sqrt(max(error @ information @ error, 0.0)))
 
 
-def _invert(T: Array) -> Array:
-    inverse = np.eye(4)
-    inverse[:3, :3], inverse[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    return inverse
-
-
 @dataclass(frozen=True, eq=False)
 class _Information:
     """The information of surfaces on the turn and the shift (6) that move a cloud in the target's frame."""
@@ -444,8 +444,7 @@ class _Information:
 
 
 def _compute_information(cloud: DepthCloud, target: DepthCloud, T: Array) -> _Information:
-    points = cloud.points @ T[:3, :3].T + T[:3, 3]
-    found = _compute_residuals(target, points, cloud.normals[cloud.chosen] @ T[:3, :3].T, cloud.sigma[cloud.chosen])
+    points, found = _compare(cloud, target, T)
     weight = np.where(found.counts, 1.0 / (1.0 + (found.off / (2.0 * found.sigma)) ** 2) / found.sigma**2, 0.0)
     weight /= _POINTS_AS_ONE
     J, broad = (
@@ -502,26 +501,22 @@ def place_by_depth(frames: Sequence[Frame], pause: Callable[[], None] = lambda: 
         log.warning("the depth image of %s fits the photograph %s much better, and is not used", *names)
     clouds = [cloud for k, cloud in enumerate(clouds) if k not in exchanged]
     # Of frames that are farther from each other a corner may be taken for the next one, where rooms are alike
-    aligned: dict[tuple[int, int], Array] = {}
-    for i in range(len(clouds) - 1):
+    aligned = []
+    for target, cloud in itertools.pairwise(clouds):
         pause()
-        T = choose_alignment(align_clouds(clouds[i + 1], clouds[i]), clouds[i + 1], clouds[i])
-        if T is not None:
-            aligned[i, i + 1] = T
-    poses = _join(len(clouds), aligned)
+        aligned.append(choose_alignment(align_clouds(cloud, target), cloud, target))
+    poses = _join(aligned)
     if len(poses) < 2:
         return ()
     placed = _place(clouds, poses, pause)
     return () if placed is None else _make_cameras(clouds, *placed)
 
 
-def _join(count: int, aligned: Mapping[tuple[int, int], Array]) -> dict[int, Array]:
-    """Poses of the longest run of clouds that pairs join, in the frame of its first one."""
-    best: dict[int, Array] = {}
-    poses: dict[int, Array] = {}
-    for i in range(count):
-        pair = i - 1, i
-        poses = {**poses, i: poses[i - 1] @ aligned[pair]} if pair in aligned else {i: np.eye(4)}
+def _join(aligned: Sequence[Array | None]) -> dict[int, Array]:
+    """Poses of the longest run of clouds each of which is `aligned` with the next one, in the frame of its first."""
+    best = poses = {0: np.eye(4)}
+    for i, T in enumerate(aligned, 1):
+        poses = {i: np.eye(4)} if T is None else {**poses, i: poses[i - 1] @ T}
         best = poses if len(poses) > len(best) else best
     return best
 
@@ -544,7 +539,7 @@ def _place(
     for i in views:
         for j in views:
             if i != j:
-                agreement = compute_agreement(clouds[i], clouds[j], _invert(poses[j]) @ poses[i])
+                agreement = compute_agreement(clouds[i], clouds[j], invert_pose(poses[j]) @ poses[i])
                 if agreement.overlap >= _LEAST_OVERLAP and agreement.is_contradicted:
                     return None
     return {i: poses[i] for i in views}, sigmas
@@ -555,7 +550,7 @@ def _list_surest_first(clouds: Sequence[DepthCloud], poses: Mapping[int, Array])
     least = []
     for i in sorted(poses):
         found = [
-            _compute_information(clouds[i], clouds[j], _invert(poses[j]) @ poses[i]).sure
+            _compute_information(clouds[i], clouds[j], invert_pose(poses[j]) @ poses[i]).sure
             for j in sorted(poses)
             if abs(i - j) == 1
         ]
@@ -582,7 +577,7 @@ def _leave_out_open(
 def _make_cameras(
     clouds: Sequence[DepthCloud], poses: Mapping[int, Array], sigmas: Sequence[tuple[float, float]]
 ) -> tuple[PlacedCamera, ...]:
-    first, found = _invert(poses[min(poses)]), []
+    first, found = invert_pose(poses[min(poses)]), []
     for (sigma_m, sigma_deg), i in zip(sigmas, sorted(poses), strict=True):
         T, scale_sigma = first @ poses[i], clouds[i].scale_sigma
         sigma_m = float(np.linalg.norm([sigma_m, _LEAST_SIGMA_M, scale_sigma * np.linalg.norm(T[:3, 3])]))
@@ -600,11 +595,11 @@ def _adjust(
     A, sure, b = np.zeros((6 * count,) * 2), np.zeros((6 * count,) * 2), np.zeros(6 * count)
     for k, i in enumerate(views):
         for m, j in enumerate(views):
-            T_ji = _invert(poses[j]) @ poses[i]
+            T_ji = invert_pose(poses[j]) @ poses[i]
             if i == j or not (found := _compute_information(clouds[i], clouds[j], T_ji)).matrix.any():
                 continue
             # A turn and a shift of the world that move camera i do so in the frame of camera j, and the other way round
-            to_j, own, his = _adjoint(_invert(poses[j])), slice(6 * k, 6 * k + 6), slice(6 * m, 6 * m + 6)
+            to_j, own, his = _adjoint(invert_pose(poses[j])), slice(6 * k, 6 * k + 6), slice(6 * m, 6 * m + 6)
             for matrix, known in ((A, found.matrix), (sure, found.sure)):
                 world = to_j.T @ known @ to_j
                 matrix[own, own] += world

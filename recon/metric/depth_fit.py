@@ -380,11 +380,9 @@ def fill_measured_depth(
     numbers, for those of the result are of all points that matches and cameras agree on in the end. `graph`
     and `registration` are those that the point maps were made of.
     """
-    cameras = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
-    keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes if keyframe.frame.depth is not None}
-    if not keyframes:
+    views = make_depth_views(graph, registration)
+    if not views:
         return tuple(pointmaps)
-    views = [make_depth_view(keyframes[name], registration, cameras[name]) for name in cameras if name in keyframes]
     fits = fit_depth_images(views)
     for fit in fits:
         is_used = all(_find_unit(name, fits, registration) is not None for name in fit.names)
@@ -393,7 +391,7 @@ def fill_measured_depth(
     found = []
     for pointmap in pointmaps:
         unit = _find_unit(pointmap.name, fits, registration)
-        if unit is not None and pointmap.name in by_name:
+        if unit is not None:
             measured = warp_depth(by_name[pointmap.name], pointmap.K, pointmap.depth.shape)
             pointmap = fuse_depth(pointmap, MeasuredDepth(measured.z / unit, measured.sigma / unit))
         found.append(pointmap)
@@ -417,6 +415,12 @@ def _describe_use(fit: DepthFit, is_used: bool) -> str:
     if is_used:
         return f"{who} fit the images and fill what these cannot tell"
     return f"{who} fill nothing: {fit.check.code.value}; the result tells why (depth_checks, report.json's depth)"
+
+
+def make_depth_views(graph: ViewGraph, registration: Registration) -> list[DepthView]:
+    """The depth images of all registered cameras that have one, in the order of these."""
+    cameras = [(graph.keyframes[camera.index], camera) for camera in registration.cameras]
+    return [make_depth_view(key, registration, camera) for key, camera in cameras if key.frame.depth is not None]
 
 
 def make_depth_view(keyframe: Keyframe, registration: Registration, camera: RegisteredCamera) -> DepthView:

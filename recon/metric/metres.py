@@ -14,7 +14,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, GivenPose, Gravity, Mot
 from splatnode.capture.lenses import straighten_depth
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import LONGEST_TEXT
-from splatnode.recon.geometry import Similarity
+from splatnode.recon.geometry import Similarity, invert_pose
 from splatnode.recon.metric.depth_fit import DepthFit, DepthView, fit_depth_images, merge_lens
 from splatnode.recon.metric.measurement import (
     MAX_DEVIATION,
@@ -309,7 +309,7 @@ def _refuse_frame(snapshot: Snapshot, name: FrameName, missing: _Missing) -> Sna
 
 
 def _find_first_camera(snapshot: Snapshot, _config: MetricConfig, _evidence: Evidence) -> _Found:
-    return _Found(_invert(snapshot.cameras[0].T_world_camera))
+    return _Found(invert_pose(snapshot.cameras[0].T_world_camera))
 
 
 def _find_base(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) -> _Found | _Missing:
@@ -330,7 +330,7 @@ def _find_base(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) ->
     source, away_m = f"T_base_camera of {first.name}", float(np.linalg.norm(mount[:3, 3]))
     if away_m > FARTHEST_MOUNT_M:
         source += f", which is {away_m:.0f} m from the base: T_base_camera is in metres, not in millimetres"
-    return _Found(mount @ _invert(first.T_world_camera), source)
+    return _Found(mount @ invert_pose(first.T_world_camera), source)
 
 
 def _find_odometry(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> _Found | _Missing:
@@ -426,7 +426,7 @@ def make_upright_frame(T_world_camera: Array, up: Array) -> Array:
     T_world_upright = np.eye(4)
     T_world_upright[:3, :3] = np.stack([x, np.cross(up, x), up], 1)
     T_world_upright[:3, 3] = T_world_camera[:3, 3]
-    return _invert(T_world_upright)
+    return invert_pose(T_world_upright)
 
 
 _FINDERS = {
@@ -469,12 +469,6 @@ def transform_rigidly(snapshot: Snapshot, T: Array) -> Snapshot:
         up=up,
         given=None,  # it tells how the scene lay before
     )
-
-
-def _invert(T: Array) -> Array:
-    inverse = np.eye(4)
-    inverse[:3, :3], inverse[:3, 3] = T[:3, :3].T, -T[:3, :3].T @ T[:3, 3]
-    return inverse
 
 
 # A scene in metres, by all that was measured; where that cannot be had it stays relative, and its scale says why.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.frame import Frame
 from splatnode.recon.geometry import compute_rms_radius, cross_matrix
 from splatnode.recon.keyframes import PLAIN, REFERENCE_SIDE, Keyframe, longer_side, principal_point
 from splatnode.recon.matching.pair_matching import TwoView
@@ -177,8 +178,12 @@ def _let_drift(
 
 def has_pose(keyframe: Keyframe) -> bool:
     """Whether a pose may hold its camera: it came with one, and with its lens."""
-    lens = keyframe.frame.intrinsics
-    return keyframe.frame.given_pose is not None and lens is not None and lens.source in TOLD
+    return keyframe.frame.given_pose is not None and has_told_lens(keyframe.frame)
+
+
+def has_told_lens(frame: Frame) -> bool:
+    """Whether the lens of a frame was told: given, or by its camera's calibration."""
+    return frame.intrinsics is not None and frame.intrinsics.source in TOLD
 
 
 def distance(problem: bundle_adjustment.Problem, registered: Sequence[int]) -> float:

@@ -160,9 +160,8 @@ def test_walls_whose_brightness_differs_are_not_the_same():
     assert one is not None and other is not None
     alignments = align_clouds(one, other)
     assert choose_alignment(alignments, one, other) is not None
-    shade = np.linspace(0.0, 1.0, len(other.log_light))
-    assert choose_alignment(align_clouds(one, replace(other, log_light=other.log_light + shade)), one, replace(
-        other, log_light=other.log_light + shade)) is None  # fmt: skip
+    shaded = replace(other, log_light=other.log_light + np.linspace(0.0, 1.0, len(other.log_light)))
+    assert choose_alignment(align_clouds(one, shaded), one, shaded) is None
 
 
 def test_the_advice_names_the_lens_that_depth_images_want():
