@@ -62,8 +62,8 @@ def config(tmp_path) -> DaemonConfig:
 
 
 @contextmanager
-def running(config: DaemonConfig) -> Iterator[None]:
-    """The daemon in a thread of its own, until the block ends."""
+def running(config: DaemonConfig) -> Iterator[threading.Thread]:
+    """The daemon in a thread of its own, which is yielded, until the block ends."""
     stopping, errors = threading.Event(), []
 
     def run() -> None:
@@ -76,7 +76,7 @@ def running(config: DaemonConfig) -> Iterator[None]:
     thread = threading.Thread(target=run)
     thread.start()
     try:
-        yield
+        yield thread
     finally:
         stopping.set()
         thread.join(PATIENCE_S)

@@ -170,11 +170,11 @@ def test_a_place_whose_finishing_was_killed_is_finished_by_the_next_process(conf
     with (
         monkeypatch.context() as patch,
         pytest.raises(AssertionError, match="SystemExit"),
-        running(replace(config, new_submap_after=3)),
+        running(replace(config, new_submap_after=3)) as daemon,
     ):
         patch.setattr(worker, "_refine_to_end", die)
         offer_when_three_are_shown(peer, frames)
-        wait_for(lambda: peer.server.serve(0.02) or heartbeats(config.network, 0.5)["recon"] is None, PATIENCE_S)
+        wait_for(lambda: peer.server.serve(0.02) or not daemon.is_alive(), PATIENCE_S)
     assert (config.out / "scene-0001-provisional").exists() and not (config.out / "scene-0001").exists()
 
     with running(replace(config, new_submap_after=3)):
