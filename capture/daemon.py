@@ -20,8 +20,7 @@ import msgspec
 
 from splatnode.capture.config import CaptureConfig, camera_opener, encode_preview, is_live, mount_camera, name_camera
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.frame_set_selection import FrameSetSelection
-from splatnode.capture.keyframe_selection import TOGETHER, Decision, Selector
+from splatnode.capture.keyframe_selection import TOGETHER, Decision, FrameSetSelection, Selector
 from splatnode.capture.messaging.frame_set_link import FULL_S, FrameSetLink
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer, QuarantinedKeyframe, Spool, SpoolFull
 from splatnode.capture.messaging.messages import Amount, Count, Header, Name, Numbering, Text, WireError

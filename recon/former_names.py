@@ -1,4 +1,4 @@
-"""What recon's configuration keys, verbs and flags were called in the release before; they are read in this one.
+"""What keys, verbs and flags of recon and the viewer were called in the release before; they are read in this one.
 
 The tables go with the next release. A key stands as "section.former", and its present name stands in the same section
 (capture/process/config.py); sections above it are by their present names.
@@ -60,6 +60,7 @@ FLAGS = {
     "export": {"--only-seen": "--multi-view-only"},
     "locate": {"--calibration": "--intrinsics"},
     "audit": {"--calibration": "--intrinsics"},
+    "view": {"--photographs": "--images", "--pictures": "--num-frames", "--until-final": "--exit-when-final"},
     "bench": {
         "--interpolated-start": "--interpolate-start",
         "--best-gain": "--color-correct",

@@ -36,7 +36,6 @@ from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signa
 from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output, say, use_plain_lines
 from splatnode.capture.process.text import sanitize_lines, sanitize_text
 from splatnode.recon import former_names as recon_names
-from splatnode.viewer import former_names as viewer_names
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -52,7 +51,7 @@ _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a clos
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
 # Hidden aliases: no help lists them
 FORMER_VERBS = recon_names.VERBS | capture_names.VERBS
-FORMER_FLAGS = recon_names.FLAGS | viewer_names.FLAGS | capture_names.FLAGS
+FORMER_FLAGS = recon_names.FLAGS | capture_names.FLAGS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -44,7 +44,7 @@ def get_requires_for_build_editable(config_settings: Settings = None) -> list[st
 def build_wheel(wheel_directory: str, config_settings: Settings = None, metadata_directory: str | None = None) -> str:
     """The wheel's file name, tagged py3-none-<platform>.
 
-    With the setting `target`, one of TARGETS, it is for that kind of machine; see recon/core/wheels.py.
+    With the setting `target`, one of TARGETS, it is for that kind of machine; see recon/core/release.py.
     """
     settings = dict(config_settings or {})
     target = TARGETS[settings.pop("target")] if "target" in settings else None

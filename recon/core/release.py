@@ -1,4 +1,8 @@
-"""The release, and the proof that it works: `./run release [--out DIR] [TARGET ...]`.
+"""The release, and the proof that it works: `./run release [--out DIR] [TARGET ...]`; `./run wheels`: wheels alone.
+
+Wheels are for other machines, too: Zig compiles the core for each target with all its instruction sets, and a copy of
+the project with those libraries, and no others, goes through the build backend. Wheels are tied to a platform but to
+no version of Python.
 
 It makes the sdist and the wheels in `dist`. What this machine can run is installed in a clean environment outside the
 checkout, where it makes the demo's scene: its wheel, and the sdist with a compiler and without one. Wheels for Linux
@@ -6,6 +10,7 @@ must need no newer system than their names say, as auditwheel sees it."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -19,12 +24,45 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process import python
-from splatnode.recon.core.compile import TARGETS, find_compiler, find_zig, machine
-from splatnode.recon.core.wheels import FROM_COPY, ROOT, build_wheel, parse_arguments
+from splatnode.recon.core.compile import HERE, TARGETS, find_compiler, find_zig, machine
 
+ROOT = HERE.parents[1]
+_PACKED = ("capture", "configs", "recon", "splatnode", "viewer", "pyproject.toml", "README.md", "LICENSE")
+FROM_COPY = "import sys; sys.path.insert(0, sys.argv[1])"  # of the project, whose backend is the one that builds
+_BUILD = f"""
+{FROM_COPY}
+from splatnode.recon.core import backend
+print(backend.build_wheel(sys.argv[2], {{"target": sys.argv[3]}}))
+"""
 _OURS = ("PYTHON", "SPLATNODE", "VIRTUAL_ENV")  # how variables begin that would tell the environment of this one
 _LAST = 2000  # characters of what a program said that failed
 WANTED = {"webcam.yaml", "systemd/splatnode-capture.service", "udev/80-splatnode-oak.rules"}  # some of what is packed
+
+
+def build_wheel(target: str, out: Path) -> Path:
+    """The wheel for one of TARGETS, in the folder `out`. Raises RuntimeError where it cannot be built, with the reason.
+
+    It needs setuptools and ziglang in this environment, and the project's own folder: an installed package will not do.
+    """
+    if not (ROOT / "pyproject.toml").exists():
+        raise RuntimeError(f"{ROOT} is not the project's folder: wheels are built from a checkout or an sdist")
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splatnode-wheel-") as folder:
+        for name in _PACKED:
+            _copy(ROOT / name, Path(folder) / name)
+        command = python.make_isolated_command("-c", _BUILD, folder, str(out.resolve()), target)
+        result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if result.returncode != 0:
+        raise RuntimeError(f"the wheel for {target} was not built:\n{result.stderr[-4000:]}")
+    return out / result.stdout.splitlines()[-1]
+
+
+def _copy(source: Path, to: Path) -> None:
+    """Without what was compiled for this machine."""
+    if source.is_dir():
+        shutil.copytree(source, to, symlinks=True, ignore=shutil.ignore_patterns("_core_*", "__pycache__", ".build-*"))
+    else:
+        shutil.copy2(source, to)
 
 
 class TrialFailed(Exception):
@@ -210,9 +248,37 @@ def _row_or_failure(name: str, make: Callable[[], list[Row]]) -> list[Row]:
         return [Row(name, 0, None, "FAILED", good=False)]
 
 
+def parse_arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Reads the targets, all by default, the folder, and whether wheels alone are wanted."""
+    parser = argparse.ArgumentParser(prog="./run release", description=__doc__)
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"some of {', '.join(TARGETS)} (default: all)")
+    parser.add_argument("--out", type=Path, default=Path("dist"), metavar="DIR", help="default: dist")
+    parser.add_argument("--wheels-only", action="store_true", help="make the wheels, and try nothing: ./run wheels")
+    args = parser.parse_args(argv)
+    if unknown := set(args.targets) - set(TARGETS):
+        parser.error(f"no target {', '.join(sorted(unknown))}; there are: {', '.join(TARGETS)}")
+    args.targets = args.targets or list(TARGETS)
+    return args
+
+
+def build_wheels(targets: Sequence[str], out: Path) -> int:
+    """Builds the wheels and prints their paths; 1 where one could not be built."""
+    failed = 0
+    for target in targets:
+        try:
+            print(build_wheel(target, out), flush=True)
+        except RuntimeError as error:
+            print(error, file=sys.stderr)
+            failed = 1
+    return failed
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Makes the release and prints the table; 1 where anything is not good."""
-    targets, out = parse_arguments("release", __doc__, argv)
+    """Makes the release and prints the table, or the wheels alone; 1 where anything is not good."""
+    args = parse_arguments(argv)
+    targets, out = args.targets, args.out
+    if args.wheels_only:
+        return build_wheels(targets, out)
     rows: list[Row] = []
     for target in targets:
         print(f"building the wheel for {target}", file=sys.stderr, flush=True)

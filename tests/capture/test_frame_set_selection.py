@@ -14,8 +14,7 @@ import pytest
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.daemon import CaptureSession
 from splatnode.capture.frame import Clock, Frame, Stamp
-from splatnode.capture.frame_set_selection import MOST_HELD, FrameSetSelection
-from splatnode.capture.keyframe_selection import TOGETHER
+from splatnode.capture.keyframe_selection import MOST_HELD, TOGETHER, FrameSetSelection
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool
 from splatnode.capture.process.config import parse_config
 from splatnode.capture.reader import ReaderState

@@ -66,7 +66,6 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.recon.former_names",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.verbs",
-        "splatnode.viewer.former_names",
         "splatnode.viewer.verbs",
     ]
     assert heavy == "[]"

@@ -78,7 +78,7 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     ("target", "tag"), [("linux-aarch64", "manylinux_2_17_aarch64"), ("macos-arm64", "macosx_11_0_arm64")]
 )
 def test_a_wheel_for_another_machine_has_that_machines_libraries_alone(project, target, tag):
-    """Here the compiler is left out; recon/core/wheels.py says how such a wheel is made."""
+    """Here the compiler is left out; recon/core/release.py says how such a wheel is made."""
     for library in (project / "recon" / "core").glob("_core_*"):
         library.unlink()
     compiled = """

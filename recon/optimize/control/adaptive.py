@@ -124,7 +124,7 @@ class AdaptiveControl:
             size, most = extent(step.Ts_world_camera), limit(step, config)
             change = densify(gaussians, mean, size, most, config, self._generator)
             change = self._prune(change, step)
-            self._sum = torch.zeros(0)
+            self._sum = self._count = torch.zeros(0)
         if step.iteration % max(1, round(config.reset_every * step.iterations)) == 0:
             change = change or GaussianChange(gaussians, torch.arange(len(gaussians), device=gaussians.means.device))
             logits = change.gaussians.logit_opacities.clamp_max(logit(config.reset_opacity))

@@ -108,7 +108,6 @@ def test_verbs_print_by_this_module_alone():
     programs = {
         "terminal.py",
         "compile.py",
-        "wheels.py",
         "release.py",
         "probe.py",
     }  # all but the first run by themselves

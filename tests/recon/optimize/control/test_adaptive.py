@@ -37,7 +37,7 @@ def step(of: Gaussians, iteration: int = 10, gradient: float = 0.0) -> Optimizer
     apart[0, 3] = 1.0
     of.means.requires_grad_()
     of.means.grad = torch.zeros_like(of.means)
-    of.means.grad[0, 0] = gradient
+    of.means.grad[:1, 0] = gradient
     return OptimizerStep(iteration, 100, iteration / 100, 0, of, (torch.eye(4), apart), (IMAGE, IMAGE), None)
 
 
@@ -97,6 +97,13 @@ def test_all_become_faint_at_a_reset_and_the_large_go_after_it():
     assert len(change.gaussians) == 4
     assert change.gaussians.opacities.tolist() == pytest.approx([0.01] * 4)
     assert control.after_step(step(mixed, iteration=60)).origin.tolist() == [0, 1, 3]
+
+
+def test_where_all_are_pruned_the_refinement_goes_on_with_none():
+    control = adaptive.AdaptiveControl(CONFIG, 0)
+    left = control.after_step(step(gaussians(opacity=1e-4))).gaussians
+    assert len(left) == 0
+    assert control.after_step(step(left, iteration=11)) is None
 
 
 def test_there_is_an_end_to_growing():
