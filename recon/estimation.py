@@ -125,17 +125,25 @@ PROVISIONAL = "Provisional: checked again with all evidence when the camera rest
 
 
 @dataclass(frozen=True, eq=False)
+class View:
+    """The facts of one image beside its pose and its pixels."""
+
+    name: str  # of its keyframe
+    camera_id: str = ""  # of several cameras, which one; empty: there is one
+    captured_at: Stamp | None = None
+    bounds: Bounds | None = None  # of its camera's errors; None: it has no camera, or nothing was verified
+    masked: float | None = None  # share that a mask hides; None: it has no mask
+    moving: float = 0.0  # share that was found to move
+
+
+@dataclass(frozen=True, eq=False)
 class ReconstructionSummary:
-    """The cameras, verdict and bounds of a reconstruction, without its images, features and matches."""
+    """The views, verdict and bounds of a reconstruction, without its images, features and matches."""
 
     verdict: Verdict
-    bounds: Mapping[str, Bounds]  # of the errors of each camera, by the name of its keyframe
+    views: Mapping[str, View]  # by the name of their keyframes, all of them
     evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
-    captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
-    camera_ids: Mapping[str, str] = field(default_factory=dict)  # by keyframe, of several cameras
     landmarks: Landmarks | None = None  # of a scene that is to be saved
-    masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
-    moving: Mapping[str, float] = field(default_factory=dict)  # share that was found to move, by keyframe
     given: GivenWorld | None = None  # the world of given poses that hold the cameras; None: none do
     rig: RigEstimate | None = None  # that the cameras are on; None: they are on none
 
@@ -195,23 +203,24 @@ class Reconstruction:
     @property
     def summary(self) -> ReconstructionSummary:
         """Returns what snapshots publish of the cameras."""
-        stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
-        known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
-        masked, moving = self._hidden
-        ids = {each.name: each.frame.camera_id for each in self.graph.keyframes if each.frame.camera_id}
-        told = self.verdict, self.bounds, self.evidence_record, known, ids
-        return ReconstructionSummary(*told, masked=masked, moving=moving, given=self.prior_world, rig=self.rig)
+        views = {each.name: each for each in self.views}
+        return ReconstructionSummary(self.verdict, views, self.evidence_record, given=self.prior_world, rig=self.rig)
 
     @property
-    def _hidden(self) -> tuple[dict[str, float], dict[str, float]]:
-        """The share of each keyframe that a given mask hides, if it has one, and that moves, if anything was found."""
-        masked, moving = {}, {}
-        for keyframe in self.graph.keyframes:
-            if keyframe.moving:
-                moving[keyframe.name] = keyframe.moving
-            if (mask := keyframe.frame.mask) is not None:
-                masked[keyframe.name] = 1.0 - float(mask.mean()) - keyframe.moving
-        return {name: share for name, share in masked.items() if share > _NOTHING or name not in moving}, moving
+    def views(self) -> tuple[View, ...]:
+        """Returns what is known of each keyframe, in their order."""
+        bounds = self.bounds
+        return tuple(
+            View(
+                name=each.name,
+                camera_id=each.frame.camera_id,
+                captured_at=each.frame.captured_at,
+                bounds=bounds.get(each.name),
+                masked=_measure_masked_share(each),
+                moving=each.moving,
+            )
+            for each in self.graph.keyframes
+        )
 
     @property
     def summary_to_save(self) -> ReconstructionSummary:
@@ -255,6 +264,14 @@ def estimate_cameras(
     if posed is None or alone.verdict.code in SURE:
         return _remove_offset(alone, config, pause) or alone
     return posed
+
+
+def _measure_masked_share(keyframe: Keyframe) -> float | None:
+    """Returns the share of an image that a given mask hides; None where it has none, or one of what moves alone."""
+    if keyframe.frame.mask is None:
+        return None
+    share = 1.0 - float(keyframe.frame.mask.mean()) - keyframe.moving
+    return share if share > _NOTHING or not keyframe.moving else None
 
 
 def _estimate_from_images(

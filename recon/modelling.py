@@ -14,7 +14,7 @@ from splatnode.capture.masks import fill_masked
 from splatnode.capture.rig import form_frame_sets
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.estimation import Reconstruction, ReconstructionSummary
+from splatnode.recon.estimation import Reconstruction, ReconstructionSummary, View
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.keyframes import valid_masks
 from splatnode.recon.optimize import training
@@ -298,7 +298,7 @@ def snapshot(
         rig=_find_rig(conclusion) if scene and final else None,
         landmarks=conclusion.landmarks if scene and final else None,
         depths=_find_consistent_depths(scene) if scene and final else {},
-        masked=conclusion.masked,
+        masked={name: view.masked for name, view in conclusion.views.items() if view.masked is not None},
         moving=_moving(conclusion, scene),
         gains=scene.gains() if scene else {},
         falloffs=_falloffs(scene) if scene else {},
@@ -308,13 +308,18 @@ def snapshot(
 
 def _publish_cameras(scene: Scene, conclusion: ReconstructionSummary, tolerance_s: float) -> tuple[CameraEstimate, ...]:
     """The cameras of a scene; of several cameras each with its id, and the number of the frame set that it is of."""
-    cameras, ids = scene.cameras(conclusion.bounds, conclusion.captured_at), conclusion.camera_ids
-    if not ids:
-        return cameras
-    timed = [(each.name, ids.get(each.name, ""), each.captured_at) for each in cameras if each.captured_at]
-    sets = form_frame_sets(timed, tolerance_s)
-    numbers = {name: number for number, each in enumerate(sets) for name in each.names.values()}
-    return tuple(replace(each, camera_id=ids.get(each.name, ""), frame_set=numbers.get(each.name)) for each in cameras)
+    numbers: dict[str, int] = {}
+    if any(view.camera_id for view in conclusion.views.values()):
+        known = [view for each in scene.views if (view := conclusion.views.get(each.name)) is not None]
+        timed = [(view.name, view.camera_id, view.captured_at) for view in known if view.captured_at]
+        sets = form_frame_sets(timed, tolerance_s)
+        numbers = {name: number for number, each in enumerate(sets) for name in each.names.values()}
+    cameras = []
+    for camera in scene.cameras():
+        view = conclusion.views.get(camera.name, View(camera.name))
+        of_view = {"bounds": view.bounds, "captured_at": view.captured_at, "camera_id": view.camera_id}
+        cameras.append(replace(camera, **of_view, frame_set=numbers.get(camera.name)))
+    return tuple(cameras)
 
 
 def _find_given_world(conclusion: ReconstructionSummary) -> InGivenWorld | None:
@@ -345,7 +350,7 @@ def _falloffs(scene: Scene) -> dict[str, float]:
 
 def _moving(conclusion: ReconstructionSummary, scene: Scene | None) -> dict[str, float]:
     """Returns the share of each image that was left out of matching, or of the scene, because it moved."""
-    shares = dict(conclusion.moving)
+    shares = {name: view.moving for name, view in conclusion.views.items() if view.moving}
     for view in scene.views if scene else ():
         if view.moved:
             shares[view.name] = shares.get(view.name, 0.0) + view.moved

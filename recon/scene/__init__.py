@@ -8,19 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatnode.capture.frame import Intrinsics, Stamp
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon import keyframes
 from splatnode.recon.geometry import multiply_quats, quat_from_matrix
 from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.recon.result.verdict import Bounds
 
 # The Gaussians of a scene, in the unconstrained parameters that the optimiser moves.
 
@@ -153,15 +151,8 @@ class Scene:
         """The same scene with its Gaussians on `device`. Cameras and photographs stay on the processor."""
         return replace(self, gaussians=self.gaussians.map(lambda tensor: tensor.to(device)))
 
-    def cameras(
-        self,
-        bounds: Mapping[str, Bounds] = MappingProxyType({}),
-        captured_at: Mapping[str, Stamp] = MappingProxyType({}),
-    ) -> tuple[CameraEstimate, ...]:
-        """The views' cameras as they are published: copies, in float64.
-
-        `bounds` of their errors, and when their photographs were captured, are by name, as far as they are known.
-        """
+    def cameras(self) -> tuple[CameraEstimate, ...]:
+        """The views' cameras as they are published, without what the scene does not know: copies, in float64."""
         return tuple(
             CameraEstimate(
                 name=view.name,
@@ -170,8 +161,6 @@ class Scene:
                 K=view.K.double().numpy().copy(),
                 width=view.width,
                 height=view.height,
-                bounds=bounds.get(view.name),
-                captured_at=captured_at.get(view.name),
                 lens=view.lens,
                 consistent_depth=view.consistent_depth,
             )
