@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -30,7 +30,7 @@ from splatnode.recon.registration.registration import Registration, register, un
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.result.snapshot import DepthCode, Landmarks
 from splatnode.recon.result.verdict import SURE, Bounds, Code, Verdict
-from splatnode.recon.threads import make_deadline_pause
+from splatnode.recon.threads import BACKGROUND, RunContext
 from splatnode.recon.verification.decision import (
     EXIF_LEFT_OUT,
     contradicts_exif,
@@ -250,19 +250,19 @@ def estimate_cameras(
     graph: ViewGraph,
     rejected: Sequence[Rejected],
     config: ReconstructionConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> Reconstruction:
     """Registers the keyframes of a complete view graph, verifies the cameras, and decides whether they are published.
 
     There is no registration where it would be of no use. With trusted poses, those that the images do not contradict
-    hold the cameras. `pause` is called about once a second and may raise.
+    hold the cameras. It pauses about once a second, which may raise.
     """
-    posed = _estimate_from_poses(graph, config, pause)
+    posed = _estimate_from_poses(graph, config, run)
     if posed is not None and not _is_contradicted(posed):
         return posed
-    alone = _estimate_from_images(graph, rejected, config, pause)
+    alone = _estimate_from_images(graph, rejected, config, run)
     if posed is None or alone.verdict.code in SURE:
-        return _remove_offset(alone, config, pause) or alone
+        return _remove_offset(alone, config, run) or alone
     return posed
 
 
@@ -275,22 +275,22 @@ def _measure_masked_share(keyframe: Keyframe) -> float | None:
 
 
 def _estimate_from_images(
-    graph: ViewGraph, rejected: Sequence[Rejected], config: ReconstructionConfig, pause: Callable[[], None]
+    graph: ViewGraph, rejected: Sequence[Rejected], config: ReconstructionConfig, run: RunContext
 ) -> Reconstruction:
     """As `estimate_cameras`, whatever poses are given."""
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
         return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
-    found = _register_and_verify(graph, config, pause)
+    found = _register_and_verify(graph, config, run)
     doubted = contradicts_exif(graph, found.registration, found.evidence, found.verdict, config.decision)
-    return _estimate_without_exif(found, config, pause) if doubted else found
+    return _estimate_without_exif(found, config, run) if doubted else found
 
 
-def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, pause: Callable[[], None]) -> Reconstruction:
-    registration = register(graph.keyframes, graph.pairs, config.registration, pause, config.frame_set_tolerance_s)
-    pause()
+def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: RunContext) -> Reconstruction:
+    registration = register(graph.keyframes, graph.pairs, config.registration, run, config.frame_set_tolerance_s)
+    run.pause()
     seen = None if registration is None else registration.image_part
-    evidence = verify(graph, seen, config.verification, pause)
+    evidence = verify(graph, seen, config.verification, run)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
     if registration is not None and registration.rig is not None:
@@ -298,12 +298,10 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, pause: 
     return Reconstruction(graph, registration if verdict.publishable else seen, evidence, verdict)
 
 
-def _estimate_without_exif(
-    found: Reconstruction, config: ReconstructionConfig, pause: Callable[[], None]
-) -> Reconstruction:
+def _estimate_without_exif(found: Reconstruction, config: ReconstructionConfig, run: RunContext) -> Reconstruction:
     """The estimate as if EXIF told no focal length, where its bounds exclude what EXIF tells; else `found`."""
     graph = found.graph
-    other = _register_and_verify(forget_exif(graph), config, pause)
+    other = _register_and_verify(forget_exif(graph), config, run)
     if other.registration is None or not other.verdict.publishable:
         return found
     was_exact = found.verdict.publishable and found.verdict.code is not Code.OK_ROUGH
@@ -317,7 +315,7 @@ def _estimate_without_exif(
 
 
 def _estimate_from_poses(
-    graph: ViewGraph, config: ReconstructionConfig, pause: Callable[[], None], offset: Offset | None = None
+    graph: ViewGraph, config: ReconstructionConfig, run: RunContext, offset: Offset | None = None
 ) -> Reconstruction | None:
     """The estimate whose cameras given poses hold; None where they are not trusted, or cannot hold any.
 
@@ -325,7 +323,7 @@ def _estimate_from_poses(
     """
     if not config.registration.trust_poses or refuse_stereo_or_panorama(graph.keyframes) is not None:
         return None
-    registration = register_posed(graph.keyframes, graph.pairs, config.registration, pause, offset)
+    registration = register_posed(graph.keyframes, graph.pairs, config.registration, run, offset)
     give_back_memory()
     if registration is None or registration.given is None:
         return None
@@ -335,14 +333,14 @@ def _estimate_from_poses(
 
 
 def estimate_cameras_by_depth(
-    graph: ViewGraph, config: ReconstructionConfig, pause: Callable[[], None] = lambda: None
+    graph: ViewGraph, config: ReconstructionConfig, run: RunContext = BACKGROUND
 ) -> Reconstruction | None:
     """The estimate whose cameras depth images place, in metres, however little the images share.
 
-    None where depth images place fewer than two cameras, or what the images match contradicts them. `pause` is
-    called about once a second and may raise.
+    None where depth images place fewer than two cameras, or what the images match contradicts them. It pauses about
+    once a second, which may raise.
     """
-    placed = {each.name: each for each in place_by_depth([each.frame for each in graph.keyframes], pause)}
+    placed = {each.name: each for each in place_by_depth([each.frame for each in graph.keyframes], run.pause)}
     if not placed:
         return None
     keyframes = []
@@ -351,7 +349,7 @@ def estimate_cameras_by_depth(
         pose = None if camera is None else make_given_pose(camera.T_world_camera, camera.sigma_m, camera.sigma_deg)
         keyframes.append(replace(keyframe, frame=replace(keyframe.frame, given_pose=pose)))
     absolute = msgspec.structs.replace(config.registration, poses_drift=0.0, poses_drift_deg=0.0)
-    found = register_posed(keyframes, graph.pairs, absolute, pause)
+    found = register_posed(keyframes, graph.pairs, absolute, run)
     give_back_memory()
     if found is None or found.given is None:
         return None
@@ -389,29 +387,25 @@ def _is_contradicted(posed: Reconstruction, by: Collection[Pair] | None = None) 
     return bool(known) and compute_pooled_ratio(known, posed.graph.pairs) < LEAST_FITTING
 
 
-def _remove_offset(
-    alone: Reconstruction, config: ReconstructionConfig, pause: Callable[[], None]
-) -> Reconstruction | None:
+def _remove_offset(alone: Reconstruction, config: ReconstructionConfig, run: RunContext) -> Reconstruction | None:
     """The estimate held by given poses without what is wrong with all of them alike; None where nothing is."""
     if not config.registration.trust_poses or alone.registration is None or not alone.verdict.publishable:
         return None
     offset = offset_of(alone.graph.keyframes, alone.registration)
-    posed = None if offset is None else _estimate_from_poses(alone.graph, config, pause, offset)
+    posed = None if offset is None else _estimate_from_poses(alone.graph, config, run, offset)
     return None if posed is None or _is_contradicted(posed) else posed
 
 
-def estimate_depth(
-    estimate: Reconstruction, prior: Prior, pause: Callable[[], None] = lambda: None, until: float | None = None
-) -> Reconstruction:
-    """Adds a point map for each camera; none where the verdict forbids a scene. `pause` as above.
+def estimate_depth(estimate: Reconstruction, prior: Prior, run: RunContext = BACKGROUND) -> Reconstruction:
+    """Adds a point map for each camera; none where the verdict forbids a scene. It pauses as above.
 
-    A prior that can end early gives coarser depth from `until` on, a time of `time.monotonic()`.
+    A prior that can end early gives coarser depth from the deadline on.
     """
     if estimate.registration is None or not estimate.verdict.publishable:
         return estimate
-    pause = make_deadline_pause(until, pause) if prior.ends_early else pause
+    run = run.end_at_deadline() if prior.ends_early else run
     graph, registration = undistort_keyframes(estimate.graph, estimate.registration)
-    pointmaps = fill_measured_depth(prior.pointmaps(graph, registration, pause), graph, registration)
+    pointmaps = fill_measured_depth(prior.pointmaps(graph, registration, run), graph, registration)
     give_back_memory()
     return replace(estimate, pointmaps=apply_image_masks(pointmaps, graph))
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import logging
-import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +37,7 @@ from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
 from splatnode.recon.registration.known_poses import has_told_lens
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.threads import is_over
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 # The learned parts: what each is for, and whether it can be used here: its package, its weights and their licence.
 #
@@ -236,11 +235,11 @@ MIN_LEFT = 3  # photographs with cameras: of fewer, nothing tells whether one of
 
 
 def estimate_without_doubtful(
-    estimate: Reconstruction, rejected: Sequence[Rejected], config: ReconstructionConfig, pause: Callable[[], None]
+    estimate: Reconstruction, rejected: Sequence[Rejected], config: ReconstructionConfig, run: RunContext
 ) -> Reconstruction:
     """The estimate of the others, where they are most photographs, and are published exactly; else `estimate`.
 
-    The photographs that are left out stay in its view graph, without pairs. `pause` may raise.
+    The photographs that are left out stay in its view graph, without pairs.
     """
     other, left_out = estimate, frozenset[str]()
     while not other.verdict.publishable:
@@ -249,7 +248,7 @@ def estimate_without_doubtful(
         few = 2 * len(left_out) < len(estimate.graph.keyframes)
         if not doubtful or not few or len(other.camera_names - left_out) < MIN_LEFT:
             return estimate
-        other = estimate_cameras(estimate.graph.forget_pairs(left_out), rejected, config, pause)
+        other = estimate_cameras(estimate.graph.forget_pairs(left_out), rejected, config, run)
     if other is estimate or other.verdict.code is Code.OK_ROUGH:
         return estimate
     return _explain_left_out(other, estimate, left_out)
@@ -284,26 +283,25 @@ def run_fallbacks(
     estimate: Reconstruction,
     rejected: Sequence[Rejected],
     config: ReconstructionConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
     rungs: Sequence[Fallback] = RUNGS,
-    until: float = math.inf,
 ) -> Reconstruction:
     """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
 
     With `config.no_fallbacks` it is `estimate`. `config.fallbacks` bounds the work that is added: what it comes to is
-    looked at between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate
-    that have begun are finished. Where that does not help, photographs in doubt are left out. `pause` may raise.
+    looked at between pairs and before each rung, as is the deadline. A pair and an estimate
+    that have begun are finished. Where that does not help, photographs in doubt are left out.
     """
     if config.no_fallbacks:
         return estimate
     if _lacks_matches(estimate):
-        estimate = _try_fallbacks(estimate, rejected, config, pause, rungs, until)
-    if is_over(until):
+        estimate = _try_fallbacks(estimate, rejected, config, run, rungs)
+    if run.is_over:
         return estimate
-    estimate = estimate_without_doubtful(estimate, rejected, config, pause)
+    estimate = estimate_without_doubtful(estimate, rejected, config, run)
     if not _wants_depth(estimate):
         return estimate
-    by_depth = estimate_cameras_by_depth(estimate.graph, config, pause)
+    by_depth = estimate_cameras_by_depth(estimate.graph, config, run)
     if by_depth is None or not by_depth.publishable:
         return _advise_lens(estimate)
     log.info("depth images place %d cameras", len(by_depth.camera_names))
@@ -331,27 +329,26 @@ def _try_fallbacks(
     estimate: Reconstruction,
     rejected: Sequence[Rejected],
     config: ReconstructionConfig,
-    pause: Callable[[], None],
+    run: RunContext,
     rungs: Sequence[Fallback],
-    until: float,
 ) -> Reconstruction:
     means, most_s = FallbackState(estimate.graph, config), config.fallbacks.timeout_s
-    until = until if most_s is None else min(until, time.monotonic() + most_s)
+    run = run if most_s is None else run.advance_deadline(time.monotonic() + most_s)
     tried: list[str] = []
     not_tried: list[str] = []
     for rung in rungs:
         doubtful = find_doubtful_keyframes(estimate)
-        if not doubtful or _is_exhausted(means, until):
+        if not doubtful or _is_exhausted(means, run):
             break
         obstacle = rung.obstacle()
         if obstacle:
             not_tried.append(f"{rung.name} ({obstacle})")
             continue
         before = means
-        means = _run_fallback(rung.climb(before, doubtful), before, until, pause)
+        means = _run_fallback(rung.climb(before, doubtful), before, run)
         if means is before:
             continue
-        other = estimate_cameras(means.graph, rejected, means.config, pause)
+        other = estimate_cameras(means.graph, rejected, means.config, run)
         means = means.add_work(CAMERAS * len(means.graph.keyframes))
         estimate = choose_better_reconstruction(estimate, other)
         gained = "more photographs found their place" if estimate is other else "nothing gained"
@@ -380,21 +377,19 @@ def _lacks_matches(estimate: Reconstruction) -> bool:
     return code in LACKING_MATCHES or (code in UNCERTAIN and bool(find_unplaced_keyframes(estimate)))
 
 
-def _run_fallback(
-    climb: Iterator[FallbackState], means: FallbackState, until: float, pause: Callable[[], None]
-) -> FallbackState:
+def _run_fallback(climb: Iterator[FallbackState], means: FallbackState, run: RunContext) -> FallbackState:
     """The means after the last piece of work that begins before the climb ends."""
     for further in climb:
         means = further
-        pause()
-        if _is_exhausted(means, until):
+        run.pause()
+        if _is_exhausted(means, run):
             break
     return means
 
 
-def _is_exhausted(means: FallbackState, until: float) -> bool:
-    """Whether nothing further begins, for these means or from `until` on, a time of `time.monotonic()`."""
-    return means.work >= means.config.fallbacks.budget or is_over(until)
+def _is_exhausted(means: FallbackState, run: RunContext) -> bool:
+    """Whether nothing further begins, for these means or since the deadline has passed."""
+    return means.work >= means.config.fallbacks.budget or run.is_over
 
 
 def find_doubtful_keyframes(estimate: Reconstruction) -> frozenset[str]:

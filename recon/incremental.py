@@ -1,7 +1,7 @@
 """A reconstruction whose frames come one at a time: what it knows, and the steps by which it comes to know more.
 
 All that it knows is one frozen record, which each step replaces whole: a step that is abandoned leaves what was known.
-Only steps that take `pause` compute: it is called about once a second at least, and may raise to abandon the work.
+Only steps that take a RunContext compute: they pause about once a second at least, which may abandon the work.
 Estimates that were made a moment ago are kept: a keyframe may be tried and taken back, and nothing is estimated twice.
 """
 
@@ -11,7 +11,7 @@ import contextlib
 import itertools
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
@@ -43,7 +43,7 @@ from splatnode.recon.optimize import training
 from splatnode.recon.priors import Pointmap, apply_image_masks
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import Scene, growth
-from splatnode.recon.threads import Clock, OutOfTime, Timer
+from splatnode.recon.threads import BACKGROUND, Clock, OutOfTime, RunContext, Timer
 
 REMEMBERED = 8  # estimates: a keyframe that is tried with each of several others, and taken back
 REMEMBERED_MASKED = 2  # estimates with things that move, whose photographs are copies without these
@@ -107,12 +107,6 @@ log = logging.getLogger(__name__)
 
 MAX_CAMERA_SHIFT = 0.1  # in median depths: where a new estimate moves a camera further, a scene begins anew
 WORTH_S = 0.1  # of fallbacks that gained nothing, from which on it is worth to remember that
-
-Pause = Callable[[], None]
-
-
-def ignore_cancel() -> None:
-    """Does nothing: the pause of work that nobody interrupts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +184,7 @@ class IncrementalReconstruction:
         """Keeps in mind that there was a frame that was left out."""
         self.dropped.append(frame)
 
-    def add_frame(self, frame: Frame, pause: Pause = ignore_cancel) -> None:
+    def add_frame(self, frame: Frame, run: RunContext = BACKGROUND) -> None:
         """Adds a frame to the view graph unless it says nothing new. Time counts from the first one.
 
         A frame that turns out to be blurred beside a sharper one is left out again, and so is one that cannot become a
@@ -204,9 +198,9 @@ class IncrementalReconstruction:
         self.remove_keyframes({each.name for each in rejected})
         self.clock.lap("poses")
         if frame.name in self._known.screened.summaries:
-            self._prepare_and_add(frame, pause)
+            self._prepare_and_add(frame, run)
 
-    def _prepare_and_add(self, frame: Frame, pause: Pause) -> None:
+    def _prepare_and_add(self, frame: Frame, run: RunContext) -> None:
         try:
             keyframe = prepare(frame, self.config)
         except UnusableFrame as error:
@@ -216,7 +210,7 @@ class IncrementalReconstruction:
             self.drop(DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: ")))
             self.remove_keyframes({frame.name})
             return
-        self.add_keyframe(keyframe, pause)
+        self.add_keyframe(keyframe, run)
 
     def screen(self, frame: Frame) -> list[Rejected]:
         """The frames that say nothing beside the others, now that there is this one too: it, or earlier ones."""
@@ -224,11 +218,11 @@ class IncrementalReconstruction:
         self._known = replace(self._known, screened=screened)
         return rejected
 
-    def add_keyframe(self, keyframe: Keyframe, pause: Pause = ignore_cancel) -> None:
+    def add_keyframe(self, keyframe: Keyframe, run: RunContext = BACKGROUND) -> None:
         """Adds a keyframe to the view graph, matched with a few others at first."""
         graph = self.graph.add_keyframe(keyframe)
         self._known = replace(self._known, graph=graph, screened=self._known.screened.add_known_frame(keyframe.frame))
-        self._keep_matching(match_newest(graph, self._prior.matcher), pause)
+        self._keep_matching(match_newest(graph, self._prior.matcher), run)
         newest, num_features = len(self.graph.keyframes) - 1, len(keyframe.features.points)
         sharing = len(self.graph.partners(newest))
         compared = newest - sum(newest in pair for pair in self.graph.pending)
@@ -237,14 +231,14 @@ class IncrementalReconstruction:
         log.info("%s: %s (%d image features)", keyframe.name, told, num_features)
         self.clock.lap("poses")
 
-    def match_pending_pairs(self, pause: Pause = ignore_cancel) -> None:
-        """Matches the pairs that are still pending. What was matched is kept if `pause` raises."""
-        self._keep_matching(match_pending(self.graph, self._prior.matcher), pause)
+    def match_pending_pairs(self, run: RunContext = BACKGROUND) -> None:
+        """Matches the pairs that are still pending. What was matched is kept if a pause raises."""
+        self._keep_matching(match_pending(self.graph, self._prior.matcher), run)
 
-    def _keep_matching(self, graphs: Iterable[ViewGraph], pause: Pause) -> None:
+    def _keep_matching(self, graphs: Iterable[ViewGraph], run: RunContext) -> None:
         for graph in graphs:
             self._known = replace(self._known, graph=graph)
-            pause()
+            run.pause()
 
     def remove_keyframes(self, names: Collection[str]) -> None:
         """Forgets keyframes, and what the scene has from them alone."""
@@ -280,34 +274,34 @@ class IncrementalReconstruction:
         """The estimate of just these keyframes, if it was made a moment ago."""
         return self._known.memory.find_reconstruction(self._known.key)
 
-    def estimate_thoroughly(self, pause: Pause = ignore_cancel) -> Reconstruction:
+    def estimate_thoroughly(self, run: RunContext = BACKGROUND) -> Reconstruction:
         """Cameras and verdict from all that there is to know, whatever it takes; remembered while nothing changes."""
         estimate = self.find_reconstruction()
         if estimate is not None and not estimate.verdict.provisional:
             return estimate
         self.clock.lap("wait")
-        self.match_pending_pairs(pause)
+        self.match_pending_pairs(run)
         graph, rejected = (
-            mask_moving_objects(self.graph, self._prior.matcher, pause=pause),
+            mask_moving_objects(self.graph, self._prior.matcher, run=run),
             self._known.screened.rejected,
         )
-        estimate = estimate_cameras(graph, rejected, self.config, pause)
+        estimate = estimate_cameras(graph, rejected, self.config, run)
         self.clock.lap("poses")
-        estimate = self._run_fallbacks(estimate, rejected, pause)
+        estimate = self._run_fallbacks(estimate, rejected, run)
         self._remember(estimate)
         self.clock.lap("ladder")
         return estimate
 
     @contextlib.contextmanager
     def fallback_budget(self, seconds: float) -> Iterator[None]:
-        """Meanwhile all fallbacks together take at most so long; what a `pause` takes does not count."""
+        """Meanwhile all fallbacks together take at most so long; what pauses take does not count."""
         self._fallback_budget_s = self._fallbacks_left_s = seconds
         try:
             yield
         finally:
             self._fallback_budget_s = self._fallbacks_left_s = math.inf
 
-    def _run_fallbacks(self, estimate: Reconstruction, rejected: Sequence[Rejected], pause: Pause) -> Reconstruction:
+    def _run_fallbacks(self, estimate: Reconstruction, rejected: Sequence[Rejected], run: RunContext) -> Reconstruction:
         """The estimate after what else there is to try, unless that gained nothing from the same start before."""
         start, memory = make_fallback_key(estimate.graph, self.config), self._known.memory
         told = memory.find_fruitless_fallback(start)
@@ -317,9 +311,9 @@ class IncrementalReconstruction:
         left_s = self._fallbacks_left_s
         if left_s <= 0:
             return estimate
-        timer, found = Timer(left_s, pause), estimate
+        timer, found = Timer(left_s, run), estimate
         try:
-            found = run_fallbacks(estimate, rejected, self.config, timer.pause)
+            found = run_fallbacks(estimate, rejected, self.config, timer.run)
         except OutOfTime:
             log.info("fallbacks ended after %.1f s, all that there were", left_s)
             if left_s < self._fallback_budget_s:  # others had a part of it: another time there may be more
@@ -344,32 +338,32 @@ class IncrementalReconstruction:
         self.clock.lap("poses")
         return estimate
 
-    def estimate_soon(self, pause: Pause = ignore_cancel) -> Reconstruction:
+    def estimate_soon(self, run: RunContext = BACKGROUND) -> Reconstruction:
         """As `estimate_quickly`, else as `estimate_thoroughly`."""
-        return self.estimate_quickly() or self.estimate_thoroughly(pause)
+        return self.estimate_quickly() or self.estimate_thoroughly(run)
 
-    def estimate_with_depth(self, pause: Pause = ignore_cancel) -> Reconstruction:
+    def estimate_with_depth(self, run: RunContext = BACKGROUND) -> Reconstruction:
         """A thorough estimate, with point maps made afresh from all keyframes where a scene is allowed."""
-        estimate = self.estimate_thoroughly(pause)
-        pause()
-        estimate = estimate_depth(estimate, self._prior, pause)
+        estimate = self.estimate_thoroughly(run)
+        run.pause()
+        estimate = estimate_depth(estimate, self._prior, run)
         self.clock.lap("points")
         return estimate
 
     def _remember(self, estimate: Reconstruction) -> None:
         self._known = replace(self._known, memory=self._known.memory.add_reconstruction(self._known.key, estimate))
 
-    def update(self, pause: Pause = ignore_cancel) -> None:
+    def update(self, run: RunContext = BACKGROUND) -> None:
         """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""
-        if not self.grow(pause):
-            self.rebuild(pause)
+        if not self.grow(run):
+            self.rebuild(run)
             self.show(prepare_scene_for_display(self.initial_scene, self.config))
         for show in self.refine(self.scene, self.config.preview):
             self.show(show)
 
-    def grow(self, pause: Pause = ignore_cancel) -> bool:
+    def grow(self, run: RunContext = BACKGROUND) -> bool:
         """Adds to the shown scene what new keyframes show; False where it has to be begun anew, or given up."""
-        estimate, scene = self.estimate_soon(pause), self.scene
+        estimate, scene = self.estimate_soon(run), self.scene
         if scene is None or estimate.registration is None or not estimate.verdict.publishable:
             return False
         beside = growth.align_registration(scene, estimate.registration, estimate.graph, estimate.verdict.provisional)
@@ -387,19 +381,19 @@ class IncrementalReconstruction:
         self.clock.lap("points")
         return True
 
-    def rebuild(self, pause: Pause = ignore_cancel) -> None:
+    def rebuild(self, run: RunContext = BACKGROUND) -> None:
         """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it."""
-        estimate = self.estimate_with_depth(pause)
+        estimate = self.estimate_with_depth(run)
         begun = create_initial_scene(estimate, self.config, all_at_hand=False)
         self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
         self.clock.lap("points")
 
     def refine(
-        self, scene: Scene | None, steps: training.RefinementConfig, pause: Pause = ignore_cancel
+        self, scene: Scene | None, steps: training.RefinementConfig, run: RunContext = BACKGROUND
     ) -> Iterator[SceneWithVerdict]:
         """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet."""
         self.clock.lap("wait")
-        for show in refine_scene(scene, self.config, steps, gone_on=lambda done: pause()):
+        for show in refine_scene(scene, self.config, steps, gone_on=lambda done: run.pause()):
             self.clock.lap("optimise")
             yield show
             self.clock.lap("wait")

@@ -59,7 +59,7 @@ from splatnode.recon.result.levels_of_detail import remove_unconfirmed
 from splatnode.recon.result.report import write_result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import Scene
-from splatnode.recon.threads import Clock
+from splatnode.recon.threads import Clock, RunContext
 
 log = logging.getLogger(__name__)
 
@@ -113,15 +113,14 @@ def estimate_frame_cameras(
     keyframes, unusable = prepare_all(looked_through, config)
     deadline = clock.deadline(config.budget_s) or math.inf
     half = clock.started + (deadline - clock.started) / 2  # the least that cameras take is not bound by a budget
-    graph = match(keyframes, config.matching, prior.matcher, until=half, tell=tell)
-    graph = mask_moving_objects(graph, prior.matcher, half)
+    run = RunContext(deadline=deadline, tell=tell)
+    graph = match(keyframes, config.matching, prior.matcher, run.advance_deadline(half))
+    graph = mask_moving_objects(graph, prior.matcher, RunContext(deadline=half))
     for line in _format_shared_points(graph):
         tell(line)
-    estimate = estimate_cameras(graph, rejected, config, _make_progress_pause("finding and checking the cameras", tell))
+    estimate = estimate_cameras(graph, rejected, config, run.report("finding and checking the cameras"))
     clock.lap("poses")
-    estimate = run_fallbacks(
-        estimate, rejected, config, _make_progress_pause("looking for more matches", tell), until=deadline
-    )
+    estimate = run_fallbacks(estimate, rejected, config, run.report("looking for more matches"))
     clock.lap("ladder")
     return estimate, dropped + unusable
 
@@ -134,19 +133,14 @@ def _format_shared_points(graph: ViewGraph) -> Iterator[str]:
         yield f"{index + 1} of {len(graph.names)}: {sanitize_text(name)} {shared}"
 
 
-def _make_progress_pause(what: str, tell: Tell) -> Callable[[], None]:
-    """A `pause` that tells that this is being done, and never raises."""
-    return lambda: tell(ProgressStep(what))
-
-
 def _add_depth(
     estimate: Reconstruction, prior: Prior, config: ReconstructionConfig, clock: Clock, tell: Tell = ignore_progress
 ) -> Reconstruction:
     """Estimates depth; a budget allots it DEPTH_SHARE of what is left, or as near to that as can be."""
-    until = clock.deadline(config.budget_s)
-    if until is not None:
-        until = clock.last + DEPTH_SHARE * max(0.0, until - clock.last)
-    estimate = estimate_depth(estimate, prior, _make_progress_pause("estimating depth", tell), until=until)
+    run, end = RunContext(tell=tell), clock.deadline(config.budget_s)
+    if end is not None:
+        run = run.advance_deadline(clock.last + DEPTH_SHARE * max(0.0, end - clock.last))
+    estimate = estimate_depth(estimate, prior, run.report("estimating depth"))
     clock.lap("points")
     return estimate
 
@@ -198,7 +192,7 @@ def reconstruct_stream(frames: Iterable[Frame | DroppedFrame], config: Reconstru
 def rebuild_from_scratch(work: IncrementalReconstruction, tell: Tell = ignore_progress) -> Iterator[Snapshot]:
     """The snapshots of `reconstruct`, from its refinement on, for all frames that `work` has taken."""
     tell = add_remaining_time(tell)
-    estimate = work.estimate_with_depth(_make_progress_pause("finding and checking the cameras", tell))
+    estimate = work.estimate_with_depth(RunContext(tell=tell).report("finding and checking the cameras"))
     begun = create_initial_scene(estimate, work.config)
     yield from model_scene(
         estimate.summary_to_save,

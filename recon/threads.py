@@ -12,11 +12,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import torch
 
+from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.recon import core
 from splatnode.recon.core import current_thread_limit, limit_threads, num_usable_threads
 
@@ -112,46 +113,80 @@ class Clock:
         return {**self.seconds, "total": time.monotonic() - self.started}
 
 
-# A deadline that work asks about while it goes on.
+# What the caller of long work wants of it.
 
 
 class OutOfTime(Exception):
-    """The exception that a `pause` raises at its deadline: the work ends with what it has."""
+    """The exception that ends work at its deadline: it ends with what it has."""
 
 
-def make_deadline_pause(deadline: float | None, pause: Callable[[], None] = lambda: None) -> Callable[[], None]:
-    """A `pause` that raises OutOfTime from `deadline` on, a time of `time.monotonic()`; None: never."""
+def _go_on() -> None:
+    """Neither cancels the work nor does anything else meanwhile."""
 
-    def ask() -> None:
-        pause()
-        if deadline is not None and time.monotonic() >= deadline:
-            raise OutOfTime
 
-    return ask
+@dataclass(frozen=True)
+class RunContext:
+    """How a caller goes along with long work: it can cancel it, bound its time, and hear of its progress."""
+
+    # Called between parts of the work, about once a second: it may do other work, or raise, which cancels this one
+    pause: Callable[[], None] = _go_on
+    deadline: float = math.inf  # by `time.monotonic()`: what is not needed does not begin after it
+    tell: Tell = ignore_progress  # hears of each step
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the deadline has passed; no clock is read where there is none."""
+        return self.deadline < math.inf and time.monotonic() >= self.deadline
+
+    def advance_deadline(self, deadline: float) -> RunContext:
+        """Returns the same with `deadline` where that comes before its own."""
+        return replace(self, deadline=min(self.deadline, deadline))
+
+    def report(self, what: str) -> RunContext:
+        """Returns the same, whose pauses tell also that `what` is being done."""
+
+        def tell_and_pause() -> None:
+            self.tell(ProgressStep(what))
+            self.pause()
+
+        return replace(self, pause=tell_and_pause)
+
+    def end_at_deadline(self) -> RunContext:
+        """Returns the same, whose pauses raise OutOfTime once the deadline has passed."""
+
+        def pause_or_end() -> None:
+            self.pause()
+            if self.is_over:
+                raise OutOfTime
+
+        return replace(self, pause=pause_or_end)
+
+
+BACKGROUND = RunContext()  # of work that nobody cancels, bounds or watches
 
 
 class Timer:
     """Counts the seconds that work takes without its pauses, and ends it by OutOfTime after `most_s` of them."""
 
-    def __init__(self, most_s: float, pause: Callable[[], None] = lambda: None) -> None:
-        self._most_s, self._pause = most_s, pause
+    def __init__(self, most_s: float, run: RunContext = BACKGROUND) -> None:
+        self._most_s, self._run = most_s, run
         self._began_s, self._paused_s = time.monotonic(), 0.0
 
     @property
     def spent_s(self) -> float:
         return time.monotonic() - self._began_s - self._paused_s
 
-    def pause(self) -> None:
+    @property
+    def run(self) -> RunContext:
+        """The context of the work, whose pauses are not counted."""
+        return replace(self._run, pause=self._pause)
+
+    def _pause(self) -> None:
         """Pauses, then raises OutOfTime where the time is spent; the work calls it about once a second."""
         before = time.monotonic()
         try:
-            self._pause()
+            self._run.pause()
         finally:
             self._paused_s += time.monotonic() - before
         if self.spent_s >= self._most_s:
             raise OutOfTime
-
-
-def is_over(until: float) -> bool:
-    """True from `until` on, a time of `time.monotonic()`; infinity never ends, so no clock is read."""
-    return until < math.inf and time.monotonic() >= until

@@ -6,7 +6,7 @@ confidence and cameras. Written from the paper; modules carry the names of the p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -44,6 +44,7 @@ from splatnode.recon.networks.vit import (
 )
 from splatnode.recon.priors import Pointmap, Prior, make_registered_pointmap
 from splatnode.recon.registration.registration import Registration
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 # Depth Anything 3's transformer: DINOv2, of which every second block of the later ones looks at all views at once.
 
@@ -458,7 +459,7 @@ class Da3Prior(Prior):
         self.matcher = WarpMatcher(network, config.longer_side)
 
     def pointmaps(
-        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
+        self, graph: ViewGraph, registration: Registration, run: RunContext = BACKGROUND
     ) -> tuple[Pointmap, ...]:
         found = []
         cameras, at_once = registration.cameras, self._config.views_at_once
@@ -471,7 +472,7 @@ class Da3Prior(Prior):
             ):
                 depth, sure = answer.estimate.depth, answer.estimate.confidence
                 found.append(make_registered_pointmap(graph, registration, camera, answer.crop, depth, sure))
-            pause()
+            run.pause()
         return tuple(found)
 
 

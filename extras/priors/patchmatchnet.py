@@ -10,7 +10,7 @@ stereo.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from splatnode.recon.networks import find
 from splatnode.recon.priors import classical, stereo
 from splatnode.recon.priors.classical import ClassicalPrior
 from splatnode.recon.priors.stereo import DepthMap, Planes, SparsePoints, StereoView, make_level
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 # PatchmatchNet's image networks: a pyramid of features, and depth made twice as fine along a photograph's edges.
 
@@ -427,7 +428,7 @@ class NetworkStereo:
         *,
         seed: int = 0,
         sparse: Sequence[SparsePoints | None] | None = None,
-        pause: Callable[[], None] = lambda: None,
+        run: RunContext = BACKGROUND,
     ) -> list[DepthMap]:
         """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
 
@@ -437,7 +438,7 @@ class NetworkStereo:
         images = [_make_source(view) for view in views]
         planes, checked = [], []
         for index, view in enumerate(views):
-            pause()
+            run.pause()
             points = None if sparse is None else sparse[index]
             partners = stereo.rank_partners(views, index, config, points)
             checked.append(stereo.select_check_views(partners, config))

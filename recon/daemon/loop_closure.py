@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +28,7 @@ from splatnode.recon.matching import pair_matching
 from splatnode.recon.matching.features import compute_global_descriptor
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph, match_pending
 from splatnode.recon.result.verdict import Code
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 # Do two scenes show one place? A few photographs of both are estimated together, as the photographs of one scene are.
 #
@@ -84,15 +85,15 @@ def verify_loop(
     other: LoopSide,
     config: ReconstructionConfig,
     matcher: Matcher | None,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> VerifiedLoop | str:
-    """The bridge between the scenes, or why there is none. `pause` is called about once a second and may raise."""
-    pairs = verify_pairs(one, other, config, pause)
+    """The bridge between the scenes, or why there is none. It pauses about once a second, which may raise."""
+    pairs = verify_pairs(one, other, config, run)
     if len(_select_distinct_pairs(pairs)) < MIN_VERIFIED:
         return f"{len(pairs)} pairs of photographs show the same"
     why = ""
     for most in VIEWS:
-        found = _verify_with_views(one, other, pairs, most, config, matcher, pause)
+        found = _verify_with_views(one, other, pairs, most, config, matcher, run)
         if isinstance(found, VerifiedLoop):
             return found
         why = found.why
@@ -108,7 +109,7 @@ def _verify_with_views(
     most: int,
     config: ReconstructionConfig,
     matcher: Matcher | None,
-    pause: Callable[[], None],
+    run: RunContext,
 ) -> VerifiedLoop | _LoopRejection:
     """Verifies the loop with `most` images of each scene."""
     chosen = [select_views(side, [pair[end] for pair in pairs], most) for end, side in enumerate((one, other))]
@@ -117,9 +118,9 @@ def _verify_with_views(
         graph = graph.merge(_prefix_names(side, views))
     for whole in match_pending(graph, matcher):
         graph = whole
-        pause()
+        run.pause()
     twins = _find_twins(graph, one.scene_id)
-    estimate = estimate_cameras(graph.remove_keyframes(twins.keys()), (), config, pause)
+    estimate = estimate_cameras(graph.remove_keyframes(twins.keys()), (), config, run)
     names, cameras = estimate.graph.names, estimate.registration.cameras if estimate.registration else ()
     found = {names[camera.index]: camera.T_world_camera for camera in cameras}
     found |= {name: found[twin] for name, twin in twins.items() if twin in found}
@@ -133,7 +134,7 @@ def _verify_with_views(
     return VerifiedLoop(mine, theirs, len(pairs))
 
 
-def verify_pairs(one: LoopSide, other: LoopSide, config: ReconstructionConfig, pause: Callable[[], None]) -> list[Pair]:
+def verify_pairs(one: LoopSide, other: LoopSide, config: ReconstructionConfig, run: RunContext) -> list[Pair]:
     """The pairs, a keyframe of each scene by its position, that show the same; those with most matches first."""
     alike = one.codes @ other.codes.T
     order = np.argsort(-alike, axis=None, kind="stable")[: GLANCED * VERIFIED]
@@ -146,13 +147,13 @@ def verify_pairs(one: LoopSide, other: LoopSide, config: ReconstructionConfig, p
     glanced = {}
     for pair in likely:
         glanced[pair] = pair_matching.glance(*both(pair), glance_features, matching)
-        pause()
+        run.pause()
     found: dict[Pair, int] = {}
     for pair in sorted(glanced, key=lambda pair: -glanced[pair])[:VERIFIED]:
         geometry = pair_matching.match_plain(*both(pair), matching).geometry
         if geometry is not None:
             found[pair[0], pair[1]] = len(geometry.matches)
-        pause()
+        run.pause()
     return sorted(found, key=lambda pair: -found[pair])
 
 
@@ -321,10 +322,10 @@ class LoopDetector:
         """The scene is not judged any more."""
         self._codes.pop(scene, None)
 
-    def detect_loops(self, scene: str, graph: ViewGraph, pause: Callable[[], None]) -> Codes:
+    def detect_loops(self, scene: str, graph: ViewGraph, run: RunContext) -> Codes:
         """Links a scene that is judged with those before it that show the same; returns the codes of its images.
 
-        What `pause` raises ends the work. Raises ResultWriteError.
+        What a pause raises ends the work. Raises ResultWriteError.
         """
         if self._matcher is None:
             self._matcher = load_prior(self._config).matcher
@@ -333,8 +334,8 @@ class LoopDetector:
         mine = LoopSide(scene, graph, self._places.load_cameras(scene), centre_descriptors(codes[scene], common))
         loops: list[PoseGraphEdge] = []
         for other in [each for each in rank_similar_scenes(scene, codes) if each not in near][:TRIED]:
-            pause()
-            link = self._close_loop(other, mine, common, pause)
+            run.pause()
+            link = self._close_loop(other, mine, common, run)
             give_back_memory()
             loops += [] if link is None else [link]
             if len(loops) == MOST_LOOPS:
@@ -356,13 +357,13 @@ class LoopDetector:
         return ViewGraph(self._config.matching)
 
     def _close_loop(
-        self, other: str, mine: LoopSide, common: npt.NDArray[np.float32], pause: Callable[[], None]
+        self, other: str, mine: LoopSide, common: npt.NDArray[np.float32], run: RunContext
     ) -> PoseGraphEdge | None:
         graph, codes = self._load_graph(other), self._codes.get(other)
         if codes is None or len(graph.keyframes) != len(codes):
             return None  # something of it is damaged
         theirs = LoopSide(other, graph, self._places.load_cameras(other), centre_descriptors(codes, common))
-        found, link = verify_loop(theirs, mine, self._config, self._matcher, pause), None
+        found, link = verify_loop(theirs, mine, self._config, self._matcher, run), None
         if isinstance(found, VerifiedLoop):
             ends = found.one, found.other
             link = make_loop_edge(other, mine.scene_id, theirs.cameras, mine.cameras, ends, found.why)

@@ -54,7 +54,7 @@ from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, Landmarks, Snapshot
 from splatnode.recon.result.stored_snapshot import read_depths
-from splatnode.recon.threads import apply_thread_limit
+from splatnode.recon.threads import RunContext, apply_thread_limit
 
 Array = npt.NDArray[np.float64]
 
@@ -445,18 +445,16 @@ class OccupancyMapper:
         self._config = config
         self._made: OccupancyResult | None = None
 
-    def map_scene(
-        self, finished: FinalScene | None, state: ReconState, folder: Path, pause: Callable[[], None]
-    ) -> bool:
+    def map_scene(self, finished: FinalScene | None, state: ReconState, folder: Path, run: RunContext) -> bool:
         """Maps the final scene, of which `folder` is the result; False where there was nothing to do.
 
-        What `pause` raises ends the work.
+        What a pause raises ends the work.
         """
         if not self._config.live or finished is None or state is ReconState.LOST or self._is_map_of(finished):
             return False
         try:
             snapshot = _add_depths(finished.snapshot, folder)
-            occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=pause), ""
+            occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=run.pause), ""
         except ValueError as error:
             occupancy, why = None, str(error)
         self._made = OccupancyResult(finished, occupancy, why)

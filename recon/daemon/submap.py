@@ -13,10 +13,11 @@ import logging
 import math
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 from splatnode.capture.process.system import is_shortage
-from splatnode.capture.process.terminal import ProgressStep, Tell, event, ignore_progress
+from splatnode.capture.process.terminal import ProgressStep, event
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
@@ -27,27 +28,28 @@ from splatnode.recon.daemon.ingest import ArrivedKeyframe
 from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.output import Output, SubmapState
 from splatnode.recon.daemon.relocalization import FinalScene
-from splatnode.recon.incremental import IncrementalReconstruction, Pause, ignore_cancel
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import SceneWithVerdict
 from splatnode.recon.registration.rigs import form_sets
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 NEWEST = 3  # keyframes that are never given up: what comes next connects to them
 PLACE = 3  # keyframes that may be a place of their own
 MIN_KEPT_CAMERAS = 0.6  # share of a scene's cameras that a merged scene must keep to count as the same scene
 
 
-def add(work: IncrementalReconstruction, keyframes: Sequence[Keyframe], pause: Pause = ignore_cancel) -> set[str]:
+def add(work: IncrementalReconstruction, keyframes: Sequence[Keyframe], run: RunContext = BACKGROUND) -> set[str]:
     """Adds keyframes to the reconstruction; sets those aside that do not fit the scene at once, and names them.
 
     Where there is no scene that may be published there is nothing that they could fit, and all of them are kept.
     """
-    standing = _find_placed(work, pause)
+    standing = _find_placed(work, run)
     for keyframe in keyframes:
-        work.add_keyframe(keyframe, pause)
+        work.add_keyframe(keyframe, run)
     if not standing:
         return set()
     names = [keyframe.name for keyframe in keyframes]
@@ -57,18 +59,18 @@ def add(work: IncrementalReconstruction, keyframes: Sequence[Keyframe], pause: P
     return {name for name in names if len(names) == 1 or not _fits_alone(work, name)}
 
 
-def join(work: IncrementalReconstruction, names: Iterable[str], pause: Pause = ignore_cancel) -> bool:
+def join(work: IncrementalReconstruction, names: Iterable[str], run: RunContext = BACKGROUND) -> bool:
     """Brings keyframes back that were set aside, if all are a scene together: this one, estimated thoroughly.
 
-    Some of them may still be without a camera then. `pause` may raise to abandon the work, and they stay aside.
+    Some of them may still be without a camera then. A pause may raise to abandon the work, and they stay aside.
     """
     names = set(names)
     if not names or work.is_rejected(names.union(work.names)):
         return False
-    standing = _find_placed(work, pause)
+    standing = _find_placed(work, run)
     work.restore_keyframes(names)
     try:
-        placed = work.estimate_thoroughly(pause).publishable_camera_names
+        placed = work.estimate_thoroughly(run).publishable_camera_names
     except BaseException:
         work.defer_keyframes(names)
         raise
@@ -78,30 +80,30 @@ def join(work: IncrementalReconstruction, names: Iterable[str], pause: Pause = i
     return False
 
 
-def has_links_to_deferred(work: IncrementalReconstruction, pause: Pause = ignore_cancel) -> bool:
+def has_links_to_deferred(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> bool:
     """Whether any verified pairs lead from the scene to what was set aside; without them nothing can join the two."""
-    placed, aside = _find_placed(work, pause), {keyframe.name for keyframe in work.keyframes_deferred}
+    placed, aside = _find_placed(work, run), {keyframe.name for keyframe in work.keyframes_deferred}
     work.restore_keyframes(aside)
     try:
-        work.match_pending_pairs(pause)
+        work.match_pending_pairs(run)
         groups = [{work.names[index] for index in group} for group in work.graph.components()]
     finally:
         work.defer_keyframes(aside)
     return any(not group.isdisjoint(placed) and not group.isdisjoint(aside) for group in groups)
 
 
-def find_separate_groups(work: IncrementalReconstruction, pause: Pause = ignore_cancel) -> list[list[Keyframe]]:
+def find_separate_groups(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> list[list[Keyframe]]:
     """Returns groups of keyframes that verified pairs join to each other, and to none of the scene.
 
     Where there is no scene, what most keyframes show counts as it. Those that were set aside are asked, too.
     """
     placed, aside = (
-        work.estimate_soon(pause).publishable_camera_names,
+        work.estimate_soon(run).publishable_camera_names,
         {keyframe.name for keyframe in work.keyframes_deferred},
     )
     work.restore_keyframes(aside)
     try:
-        work.match_pending_pairs(pause)
+        work.match_pending_pairs(run)
         groups = [[work.graph.keyframes[index] for index in group] for group in work.graph.components()]
     finally:
         work.defer_keyframes(aside)
@@ -110,33 +112,33 @@ def find_separate_groups(work: IncrementalReconstruction, pause: Pause = ignore_
     return [group for group in others if len(group) >= PLACE]
 
 
-def is_split(work: IncrementalReconstruction, pause: Pause = ignore_cancel) -> bool:
+def is_split(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> bool:
     """Whether the keyframes show several places: groups that verified pairs join to each other, and to no other."""
-    work.match_pending_pairs(pause)
+    work.match_pending_pairs(run)
     return sum(len(group) > 1 for group in work.graph.components()) > 1
 
 
-def verify_provisional(work: IncrementalReconstruction, pause: Pause = ignore_cancel) -> None:
+def verify_provisional(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> None:
     """Estimates thoroughly what was added provisionally and what was set aside: together, else one after the other.
 
-    Keyframes by which the scene fails are set aside. `pause` may raise to abandon the work; what was not estimated by
+    Keyframes by which the scene fails are set aside. A pause may raise to abandon the work; what was not estimated by
     then is aside, or as it was.
     """
-    if join(work, _list_names(work.keyframes_deferred), pause):
+    if join(work, _list_names(work.keyframes_deferred), run):
         return
-    estimate = work.estimate_thoroughly(pause)
+    estimate = work.estimate_thoroughly(run)
     if not work.publishable_names:
         return
     if not estimate.verdict.publishable:
         work.defer_keyframes(set(work.names) - work.publishable_names)
-        work.estimate_thoroughly(pause)
+        work.estimate_thoroughly(run)
     for name in _list_names(work.keyframes_deferred):
-        join(work, [name], pause)
+        join(work, [name], run)
 
 
-def find_untracked(work: IncrementalReconstruction, pause: Pause = ignore_cancel) -> list[Keyframe]:
+def find_untracked(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> list[Keyframe]:
     """The last keyframes in a row, as their frames came, that have no camera in the scene that there is."""
-    placed = _find_placed(work, pause)
+    placed = _find_placed(work, run)
     if not placed:
         return []
     everyone = sorted([*work.graph.keyframes, *work.keyframes_deferred], key=lambda keyframe: keyframe.frame.frame_id)
@@ -144,12 +146,12 @@ def find_untracked(work: IncrementalReconstruction, pause: Pause = ignore_cancel
     return everyone[last + 1 :]
 
 
-def find_contradicting(work: IncrementalReconstruction, pause: Pause = ignore_cancel) -> list[Keyframe]:
+def find_contradicting(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> list[Keyframe]:
     """Keyframes that were set aside, after which others fitted."""
-    last = _list_names(find_untracked(work, pause))
+    last = _list_names(find_untracked(work, run))
     return (
         [keyframe for keyframe in work.keyframes_deferred if keyframe.name not in last]
-        if _find_placed(work, pause)
+        if _find_placed(work, run)
         else []
     )
 
@@ -190,9 +192,9 @@ def _fits(work: IncrementalReconstruction, names: Collection[str]) -> bool:
     return estimate is not None and estimate.publishable_camera_names.issuperset(names)
 
 
-def _find_placed(work: IncrementalReconstruction, pause: Pause) -> set[str]:
+def _find_placed(work: IncrementalReconstruction, run: RunContext) -> set[str]:
     """The keyframes that have a camera in the scene that there is, if it may be published."""
-    return work.estimate_soon(pause).publishable_camera_names if work.scene is not None else set()
+    return work.estimate_soon(run).publishable_camera_names if work.scene is not None else set()
 
 
 def _list_names(keyframes: Iterable[Keyframe]) -> list[str]:
@@ -222,31 +224,31 @@ def screen_keyframes(work: IncrementalReconstruction, keyframes: Iterable[Keyfra
     return kept
 
 
-def verify_keyframes(work: IncrementalReconstruction, forget: Forget, pause: Pause) -> None:
+def verify_keyframes(work: IncrementalReconstruction, forget: Forget, run: RunContext) -> None:
     """Estimates thoroughly which keyframes belong to the place; those that contradict it are forgotten."""
-    verify_provisional(work, pause)
-    for keyframe in find_contradicting(work, pause):
+    verify_provisional(work, run)
+    for keyframe in find_contradicting(work, run):
         forget(keyframe.name, "it contradicts the scene")
 
 
 def refine(
-    work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause, tell: Tell = ignore_progress
+    work: IncrementalReconstruction, config: ReconstructionConfig, run: RunContext
 ) -> Iterator[SceneWithVerdict]:
     """The scene of all keyframes at every checkpoint, and at the end; it is not shown yet.
 
-    Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
+    Yields nothing where the verdict forbids a scene. A pause in between may raise to abandon the work.
     """
     steps = itertools.count(1)
 
     def pause_periodically() -> None:
         done = next(steps)
-        tell(ProgressStep("refining the scene", done, config.optimize.steps, "step"))
+        run.tell(ProgressStep("refining the scene", done, config.optimize.steps, "step"))
         if done % STEP == 0:
-            pause()
+            run.pause()
 
-    tell(ProgressStep("estimating depth"))
-    work.rebuild(pause)
-    yield from work.refine(work.initial_scene, config.optimize, pause_periodically)
+    run.tell(ProgressStep("estimating depth"))
+    work.rebuild(run)
+    yield from work.refine(work.initial_scene, config.optimize, RunContext(pause_periodically))
 
 
 # The result of the present place's finished scene: written when the scene is, or when the disk takes it again.
@@ -299,6 +301,10 @@ class ActiveSubmap:
         self._config, self._recipe, self._store, self._output = config, recipe, store, output
         self._meter = meter or WorkMeter()
         self._pause_until = pause
+        # Raises Abandoned if the daemon stops, or something has come
+        self._until_disturbed = RunContext(partial(pause, -math.inf))
+        # Raises Abandoned if the daemon stops: what may be shown soon is not abandoned for what comes next
+        self._until_stopped = RunContext(partial(pause, math.inf))
         self._work = IncrementalReconstruction(recipe)
         self._final = FinalResult(store, output)
         self._compared: frozenset[str] = frozenset()  # those of the scene that was compared with the finished ones
@@ -353,7 +359,7 @@ class ActiveSubmap:
         keyframes = screen_keyframes(self._work, (each.keyframe for each in arrived), self._forget)
         standing = self._work.scene is not None
         strangers = self._add_to_graph(keyframes)
-        if not standing and keyframes and is_split(self._work, self._check_stopping):
+        if not standing and keyframes and is_split(self._work, self._until_stopped):
             strangers = {keyframe.name for keyframe in keyframes}
         self._work.remove_keyframes(strangers)  # they are screened again
         apart = [each for each in arrived if each.keyframe.name in strangers]
@@ -381,7 +387,7 @@ class ActiveSubmap:
     def _update_and_show(self, arrived: Sequence[ArrivedKeyframe]) -> None:
         """The scene with the keyframes that have come to belong to it."""
         self._limit_views()
-        self._work.update(self._check_stopping)
+        self._work.update(self._until_stopped)
         snapshot = self._show()
         if arrived:
             self.keyframe_s = time.monotonic() - arrived[0].at_s
@@ -398,7 +404,7 @@ class ActiveSubmap:
     def _add_to_graph(self, keyframes: list[Keyframe]) -> set[str]:
         """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
         try:
-            return add(self._work, keyframes, self._check_stopping)
+            return add(self._work, keyframes, self._until_stopped)
         except Abandoned:
             raise
         except Exception as error:  # one bad frame must not keep others out
@@ -418,10 +424,11 @@ class ActiveSubmap:
         If that does not help them, another place begins with them.
         """
         lost = len(self._find_untracked()) >= self._config.new_submap_after
-        pause = partial(self._pause_until, math.inf if lost else time.monotonic() + PATIENCE_S)
+        soon = math.inf if lost else time.monotonic() + PATIENCE_S
+        run = RunContext(partial(self._pause_until, soon))
         aside = [keyframe.name for keyframe in self._work.keyframes_deferred]
-        joined = has_links_to_deferred(self._work, pause) and (
-            join(self._work, aside, pause) or (not lost and join(self._work, newest, pause))
+        joined = has_links_to_deferred(self._work, run) and (
+            join(self._work, aside, run) or (not lost and join(self._work, newest, run))
         )
         if self._check_lost(newest):
             return True
@@ -447,7 +454,7 @@ class ActiveSubmap:
         event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
         self._work = IncrementalReconstruction(self._recipe)
         for keyframe in strangers:
-            self._work.add_keyframe(keyframe, self._check_stopping)
+            self._work.add_keyframe(keyframe, self._until_stopped)
 
     def _leave_submap(self, first: int, shared: Collection[str] = ()) -> str:
         """Begins another scene with frame `first`; the present one, whose id is returned, is finished later.
@@ -496,7 +503,7 @@ class ActiveSubmap:
         work.remove_keyframes(
             [each.name for each in (*work.graph.keyframes, *work.keyframes_deferred) if each.frame.frame_id < first]
         )
-        if len(work.estimate_thoroughly(self._check_stopping).publishable_camera_names) < len(newest):
+        if len(work.estimate_thoroughly(self._until_stopped).publishable_camera_names) < len(newest):
             return
         shared = {each.name for each in newest}
         before = self._leave_submap(first, shared=shared)
@@ -523,7 +530,7 @@ class ActiveSubmap:
             return False
         state, self.state, self._compared = self.state, ReconState.REFINING, names
         try:
-            atlas.detect_loops(self._store.scene_id, self._work.graph, self._pause)
+            atlas.detect_loops(self._store.scene_id, self._work.graph, self._until_disturbed)
         except Abandoned:
             self._compared = frozenset()  # only this is worth another time
             raise
@@ -560,11 +567,11 @@ class ActiveSubmap:
             fitted = set(self._work.names)
             with self._work.fallback_budget(self._config.fallback_timeout_s):
                 try:
-                    verify_keyframes(self._work, self._forget, self._pause)
+                    verify_keyframes(self._work, self._forget, self._until_disturbed)
                 finally:
                     self._save_fallbacks()
             more = self._check_lost(fitted)
-        for keyframes in find_separate_groups(self._work, self._pause):
+        for keyframes in find_separate_groups(self._work, self._until_disturbed):
             names = [keyframe.name for keyframe in keyframes]
             scene = self._store.split_off(names, present=True)
             self._output.add_split_submap(scene, names)
@@ -579,7 +586,7 @@ class ActiveSubmap:
 
     def _refine_verified(self) -> None:
         refined = SceneWithVerdict()
-        for refined in refine(self._work, self._recipe, self._pause, self._meter.tell):
+        for refined in refine(self._work, self._recipe, replace(self._until_disturbed, tell=self._meter.tell)):
             if refined.scene is not None and refined.scene.iterations in self._recipe.optimize.checkpoints:
                 self._work.show(refined)
                 self._show()
@@ -594,19 +601,11 @@ class ActiveSubmap:
         self.state = ReconState.WAITING if not shown else ReconState.LOST if self._find_untracked() else ReconState.IDLE
         give_back_memory()
 
-    def _pause(self) -> None:
-        """Raises Abandoned if the daemon stops, or something has come."""
-        self._pause_until(-math.inf)
-
-    def _check_stopping(self) -> None:
-        """Raises Abandoned if the daemon stops: what may be shown soon is not abandoned for what comes next."""
-        self._pause_until(math.inf)
-
     def _find_untracked(self) -> list[Keyframe]:
-        return find_untracked(self._work, self._check_stopping)
+        return find_untracked(self._work, self._until_stopped)
 
     def _show(self, final: bool = False) -> Snapshot:
-        self._work.estimate_soon(self._check_stopping)
+        self._work.estimate_soon(self._until_stopped)
         snapshot = self._work.snapshot(self._store.frames_dropped, final)
         measured = self._output.publish(snapshot, self._work)
         self.finished, self._shown = FinalScene(measured, self._work.graph.keyframes) if final else None, snapshot

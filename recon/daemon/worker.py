@@ -43,9 +43,10 @@ from splatnode.recon.daemon.output import Output, PublishedSnapshot, SubmapState
 from splatnode.recon.daemon.pose_graph import EdgeKind
 from splatnode.recon.daemon.relocalization import OccupancyMapper, OccupancyResult
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
-from splatnode.recon.incremental import IncrementalReconstruction, Pause
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.modelling import SceneWithVerdict
+from splatnode.recon.threads import RunContext
 
 # The thread that reconstructs: works keyframes in as they come, and makes scenes as good as they get in between.
 
@@ -173,16 +174,17 @@ class Worker:
             return
         if not (
             self._map_scene()
-            or self._left.verify_next(self._serve_active_submap)
+            or self._left.verify_next(RunContext(self._serve_active_submap))
             or self.place.detect_loops(self._atlas)
-            or self._left.finalize_next(self._serve_active_submap)
+            or self._left.finalize_next(RunContext(self._serve_active_submap))
         ):
             self.rests += 1
 
     def _map_scene(self) -> bool:
         """Maps the present scene, if it is final; False where that was done. Abandoned when something comes."""
         folder = self._config.out / self._store.scene_id
-        return self._free_space.map_scene(self.place.finished, self.place.state, folder, lambda: self._pause(-math.inf))
+        run = RunContext(lambda: self._pause(-math.inf))
+        return self._free_space.map_scene(self.place.finished, self.place.state, folder, run)
 
     def _process_events(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""
@@ -306,7 +308,7 @@ def _format_keyframe_count(number: int) -> str:
 
 AGAIN_S = 300.0  # after a place could not be finished
 
-_Step = Callable[[Store, checkpoint.RestoredReconstruction, Pause], bool]
+_Step = Callable[[Store, checkpoint.RestoredReconstruction, RunContext], bool]
 
 
 class InactiveSubmaps:
@@ -339,30 +341,30 @@ class InactiveSubmaps:
         if self._work is not None:
             self._work.clock.leave_out(seconds)
 
-    def verify_next(self, pause: Pause) -> bool:
+    def verify_next(self, run: RunContext) -> bool:
         """Judges the oldest place that is not judged yet with all its evidence, and compares it with the others.
 
         Its scene stays a draft, in a result folder, unless there is none to be made. False where there is none to be
-        judged now. What places that were left are to lose is taken out of them first. What `pause` raises ends the
+        judged now. What places that were left are to lose is taken out of them first. What a pause raises ends the
         work; it is begun again another time, as after a failure.
         """
         self._remove_keyframes()
         return self._process_first(
             [each for each in self._pending_folders if not self._atlas.has_scene(each.name)],
             self._verify,
-            pause,
+            run,
             Work.JUDGE,
         )
 
-    def finalize_next(self, pause: Pause) -> bool:
+    def finalize_next(self, run: RunContext) -> bool:
         """Makes the scene of the oldest place that is judged, as good as it gets, and writes its result.
 
-        False where there is none to be made now; `pause` as for `verify_next`.
+        False where there is none to be made now; `run` as for `verify_next`.
         """
         return self._process_first(
             [each for each in self._pending_folders if self._atlas.has_scene(each.name)],
             self._finalize,
-            pause,
+            run,
             Work.FINISH,
         )
 
@@ -379,7 +381,7 @@ class InactiveSubmaps:
         """Places that were left and are not judged."""
         return sum(not self._atlas.has_scene(each.name) for each in ledger.list_left_folders(self._here.directory))
 
-    def _process_first(self, folders: Sequence[Path], step: _Step, pause: Pause, work: Work) -> bool:
+    def _process_first(self, folders: Sequence[Path], step: _Step, run: RunContext, work: Work) -> bool:
         """Takes the step with the first of the places; False where there is none, or the disk did not take it."""
         if not folders:
             return False
@@ -391,7 +393,7 @@ class InactiveSubmaps:
                 self._work = found.work
                 give_back_memory()
                 with found.work.fallback_budget(self._fallback_s):
-                    done = step(store, found, pause)
+                    done = step(store, found, run)
         except OSError as error:
             raise_shortage(error)
             self._output.complain(
@@ -435,30 +437,28 @@ class InactiveSubmaps:
                 self._output.complain(f"{name} cannot be taken out of {scene}: {error}")
         self._here.confirm_removal(scene, name)
 
-    def _verify(self, store: Store, found: checkpoint.RestoredReconstruction, pause: Pause) -> bool:
+    def _verify(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> bool:
         """Whether the place is judged now, and its result written."""
         work = found.work
-        if (
-            found.final and not found.new and not self._split_off(store, work, pause)
-        ):  # as it was when the place was left
+        if found.final and not found.new and not self._split_off(store, work, run):  # as it was when the place was left
             self._output.mark_finished(store.scene_id)
         else:
             event(log, logging.INFO, "judging", scene=store.scene_id)
-            self._verify_keyframes(store, found, pause)
+            self._verify_keyframes(store, found, run)
             self._output.save_fallbacks(store, work)
-            if not work.estimate_soon(pause).publishable:
-                return self._finalize(store, found, pause)
-            work.update(pause)
+            if not work.estimate_soon(run).publishable:
+                return self._finalize(store, found, run)
+            work.update(run)
             snapshot = work.snapshot(store.frames_dropped, final=False)
             if not self._output.export(snapshot, work, store, SubmapState.LEFT, work.names):
                 return False
             self._output.save(store, work, final=False)
         work.release_scene()  # the checkpoint has it, and comparing takes memory, too
         give_back_memory()
-        self._atlas.add_scene(store, work.graph, self._atlas.detect_loops(store.scene_id, work.graph, pause))
+        self._atlas.add_scene(store, work.graph, self._atlas.detect_loops(store.scene_id, work.graph, run))
         return True
 
-    def _verify_keyframes(self, store: Store, found: checkpoint.RestoredReconstruction, pause: Pause) -> None:
+    def _verify_keyframes(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> None:
         """All evidence on all keyframes; those that do not belong to the place are forgotten."""
         work = found.work
 
@@ -467,16 +467,16 @@ class InactiveSubmaps:
             work.remove_keyframes([name])
 
         for keyframe in submap.screen_keyframes(work, found.new, forget):  # that came shortly before the place was left
-            work.add_keyframe(keyframe, pause)
-        submap.verify_keyframes(work, forget, pause)
-        if self._split_off(store, work, pause):
-            work.estimate_thoroughly(pause)
+            work.add_keyframe(keyframe, run)
+        submap.verify_keyframes(work, forget, run)
+        if self._split_off(store, work, run):
+            work.estimate_thoroughly(run)
         for keyframe in work.keyframes_deferred:
             forget(keyframe.name, "it does not fit the scene")
 
-    def _split_off(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> bool:
+    def _split_off(self, store: Store, work: IncrementalReconstruction, run: RunContext) -> bool:
         """Whether some of the keyframes showed other places, and are places of their own now, which wait here."""
-        parts = submap.find_separate_groups(work, pause)
+        parts = submap.find_separate_groups(work, run)
         for keyframes in parts:
             names = [keyframe.name for keyframe in keyframes]
             scene = store.split_off(names)
@@ -485,14 +485,14 @@ class InactiveSubmaps:
             work.remove_keyframes(names)
         return bool(parts)
 
-    def _finalize(self, store: Store, found: checkpoint.RestoredReconstruction, pause: Pause) -> bool:
+    def _finalize(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> bool:
         """Whether the scene of a place that is judged is final now, and its result written."""
         work = found.work
         if not found.final:
             event(log, logging.INFO, "finishing", scene=store.scene_id)
             work.release_scene()  # it is made anew
-            work.show(_refine_to_end(work, self._config, pause))
-            work.estimate_soon(pause)
+            work.show(_refine_to_end(work, self._config, run))
+            work.estimate_soon(run)
             snapshot = work.snapshot(store.frames_dropped, final=True)
             if not self._output.export(snapshot, work, store, SubmapState.FINISHED, work.names):
                 return False
@@ -506,8 +506,8 @@ class InactiveSubmaps:
         return True
 
 
-def _refine_to_end(work: IncrementalReconstruction, config: ReconstructionConfig, pause: Pause) -> SceneWithVerdict:
+def _refine_to_end(work: IncrementalReconstruction, config: ReconstructionConfig, run: RunContext) -> SceneWithVerdict:
     show = SceneWithVerdict()
-    for show in submap.refine(work, config, pause):  # noqa: B007
+    for show in submap.refine(work, config, run):  # noqa: B007
         pass
     return show

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-import math
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
@@ -21,7 +20,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.masks import apply_mask
 from splatnode.capture.process.config import Internal
 from splatnode.capture.process.system import raise_shortage
-from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
+from splatnode.capture.process.terminal import ProgressStep, Tell
 from splatnode.recon.keyframes import (
     LIBRARY_ERRORS,
     REFERENCE_SIDE,
@@ -44,7 +43,7 @@ from splatnode.recon.matching.pair_matching import (
     select_short_list_pairs,
     select_weak_pairs,
 )
-from splatnode.recon.threads import is_over, map_parallel, map_parallel_lazily
+from splatnode.recon.threads import BACKGROUND, RunContext, map_parallel, map_parallel_lazily
 
 # The configuration of matching: local features, which pairs are matched and how, which get simulated tilts.
 
@@ -267,14 +266,13 @@ def match(
     keyframes: Iterable[Keyframe],
     config: MatchingConfig,
     matcher: Matcher | None = None,
-    until: float = math.inf,
-    tell: Tell = ignore_progress,
+    run: RunContext = BACKGROUND,
 ) -> ViewGraph:
-    """The complete view graph of the keyframes. `until` as for `match_pending`; `tell` hears how far it is."""
+    """The complete view graph of the keyframes. The deadline counts as for `match_pending`; progress is told."""
     graph = ViewGraph(config)
     for keyframe in keyframes:
         graph = graph.add_keyframe(keyframe)
-    for further in _report_progress(match_pending(graph, matcher, until), tell):
+    for further in _report_progress(match_pending(graph, matcher, run), run.tell):
         graph = further
     return graph
 
@@ -309,12 +307,12 @@ def match_newest(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGrap
         yield from match_pending(graph, matcher)
 
 
-def match_pending(graph: ViewGraph, matcher: Matcher | None, until: float = math.inf) -> Iterator[ViewGraph]:
+def match_pending(graph: ViewGraph, matcher: Matcher | None, run: RunContext = BACKGROUND) -> Iterator[ViewGraph]:
     """The graph after each pair that was pending and is worth matching; the last one is complete.
 
     Pairs are matched by plain features. Those that match weakly but may overlap (`select_weak_pairs` of
     pair_matching.py) are matched again with tilted features, which bridge wider baselines, and with what a prior's
-    matcher proposes: but for those of which the turn comes after `until`, a time of `time.monotonic()`.
+    matcher proposes: but for those of which the turn comes after the deadline.
     """
     graph = yield from _glance_pairs(graph)
     while pairs := sorted(graph.select_pairs_to_match()):
@@ -322,7 +320,7 @@ def match_pending(graph: ViewGraph, matcher: Matcher | None, until: float = math
     to_tilt = graph.select_weak_pairs()
     weak = [pair for pair in graph.plain if pair in to_tilt and pair not in graph.tilted]
     for further in _match_weak_pairs(graph, weak, graph.config.tilting.tilts, matcher):
-        if is_over(until):
+        if run.is_over:
             break
         yield (graph := further)
     yield graph.select_geometries()
@@ -498,23 +496,21 @@ class _Group:
     moves: bool  # whether it is the smaller patch beyond doubt
 
 
-def mask_moving_objects(
-    graph: ViewGraph, matcher: Matcher | None, until: float = math.inf, pause: Callable[[], None] = lambda: None
-) -> ViewGraph:
+def mask_moving_objects(graph: ViewGraph, matcher: Matcher | None, run: RunContext = BACKGROUND) -> ViewGraph:
     """The complete view graph without what moved between the photographs: matched again where there is such a thing.
 
-    Such a keyframe has a mask over it, and its share in `moving`. `until` as for `match.completed`; `pause` is called
-    between parts of the work and may raise.
+    Such a keyframe has a mask over it, and its share in `moving`. The deadline counts as for
+    `match_pending`; it pauses between parts of the work, which may raise.
     """
-    pause()
+    run.pause()
     masks = moving_masks(graph)
     shown = [keyframe for keyframe in graph.keyframes if keyframe.name in masks]
     hidden = [_apply_moving_mask(keyframe, masks[keyframe.name]) for keyframe in shown]
     changed = [after for before, after in zip(shown, hidden, strict=True) if after is not before]
-    pause()
-    for further in match_pending(graph.replace_keyframes(changed), matcher, until) if changed else ():
+    run.pause()
+    for further in match_pending(graph.replace_keyframes(changed), matcher, run) if changed else ():
         graph = further
-        pause()
+        run.pause()
     return graph
 
 

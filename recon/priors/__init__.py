@@ -21,7 +21,7 @@ from splatnode.recon.networks.vit import Crop
 from splatnode.recon.priors.stereo import MIN_SPARSE_POINTS, SparsePoints, estimate_depth_range
 from splatnode.recon.registration.known_poses import axis_depths
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.threads import map_parallel
+from splatnode.recon.threads import BACKGROUND, RunContext, map_parallel
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,14 +331,14 @@ class Prior(Protocol):
     """
 
     matcher: Matcher | None  # what the view graph asks where plain features find few matches
-    ends_early: bool = False  # whether `pause` may raise OutOfTime, after which depth comes soon and coarser
+    ends_early: bool = False  # whether a pause may raise OutOfTime, after which depth comes soon and coarser
 
     def pointmaps(
-        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
+        self, graph: ViewGraph, registration: Registration, run: RunContext = BACKGROUND
     ) -> tuple[Pointmap, ...]:
         """A point map for each registered camera, in the order and the world of `registration`.
 
-        `pause` is called several times a second; it may raise to abandon the work.
+        It pauses several times a second, which may raise to abandon the work.
         """
         ...
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import msgspec
@@ -22,6 +22,7 @@ from splatnode.recon.priors import (
 )
 from splatnode.recon.priors.stereo import DepthMap
 from splatnode.recon.registration.registration import Registration
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,7 +43,7 @@ class DepthEstimator(Protocol):
         *,
         seed: int = ...,
         sparse: Sequence[stereo.SparsePoints | None] | None = ...,
-        pause: Callable[[], None] = ...,
+        run: RunContext = ...,
     ) -> list[DepthMap]: ...
 
 
@@ -58,10 +59,10 @@ class ClassicalPrior(Prior):
         self.ends_early = depth_maps is stereo.estimate_depth_maps
 
     def pointmaps(
-        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
+        self, graph: ViewGraph, registration: Registration, run: RunContext = BACKGROUND
     ) -> tuple[Pointmap, ...]:
         views, sparse = self._make_views(graph, registration)
-        maps = self._depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse, pause=pause)
+        maps = self._depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse, run=run)
         return tuple(map(_make_pointmap, _select_keyframes(graph, registration), views, maps))
 
     def further_pointmaps(

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,6 +55,7 @@ from splatnode.recon.networks.vit import (
 )
 from splatnode.recon.priors import Pointmap, Prior, make_registered_pointmap
 from splatnode.recon.registration.registration import Registration
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
@@ -636,12 +637,12 @@ class Mast3rPrior(Prior):
         self.matcher = DescriptorMatcher(self._asked)
 
     def pointmaps(
-        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
+        self, graph: ViewGraph, registration: Registration, run: RunContext = BACKGROUND
     ) -> tuple[Pointmap, ...]:
         """The aligned depth maps, each brought to the scale of the registered points that its camera sees."""
         keyframes = [graph.keyframes[camera.index] for camera in registration.cameras]
         views = align_views(self._asked.predict_points(keyframes, self._config.max_neighbours))
-        pause()
+        run.pause()
         crops = [self._asked.make_crop(keyframe) for keyframe in keyframes]
         return tuple(
             make_registered_pointmap(graph, registration, camera, to, view.depth, view.confidence)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -20,7 +20,7 @@ import numpy.typing as npt
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.core import library, pointer
 from splatnode.recon.keyframes import LIBRARY_ERRORS
-from splatnode.recon.threads import OutOfTime, map_parallel
+from splatnode.recon.threads import BACKGROUND, OutOfTime, RunContext, map_parallel
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -482,12 +482,12 @@ def estimate_depth_maps(
     *,
     seed: int = 0,
     sparse: Sequence[SparsePoints | None] | None = None,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> list[DepthMap]:
     """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
 
-    The result depends on the arguments only, not on the number of threads. `pause` is called several times a second;
-    it may raise to abandon the work, and OutOfTime to end it: after NEEDED_STAGES, depth is as fine as it is by then.
+    The result depends on the arguments only, not on the number of threads. It pauses several times a second,
+    which may raise to abandon the work, and OutOfTime to end it: depth is as fine then as it is after NEEDED_STAGES.
     """
     known_points = list(sparse) if sparse is not None else [None] * len(views)
     if len(known_points) != len(views):
@@ -507,7 +507,7 @@ def estimate_depth_maps(
         improved = list(planes)
         try:
             for i in (index for index, chosen in enumerate(sources) if chosen):
-                _call_pause(pause, may_end=stream >= NEEDED_STAGES)
+                _pause_or_go_on(run, may_end=stream >= NEEDED_STAGES)
                 improved[i] = improve_planes(
                     at_level[i], [at_level[j] for j in sources[i]], planes[i], stage.search, config.matching,
                     known={n: planes[j].inverse_depth for n, j in enumerate(sources[i])} if stage.geometric else {},
@@ -524,10 +524,10 @@ def estimate_depth_maps(
     return cross_check(levels[finest], planes, checked, config.matching, config.consistency)
 
 
-def _call_pause(pause: Callable[[], None], may_end: bool) -> None:
+def _pause_or_go_on(run: RunContext, may_end: bool) -> None:
     """Pauses; work that is needed goes on when time is over."""
     try:
-        pause()
+        run.pause()
     except OutOfTime:
         if may_end:
             raise

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -35,7 +35,7 @@ from splatnode.recon.registration.mapping_problem import (
 from splatnode.recon.registration.multiview_geometry import Tracks
 from splatnode.recon.registration.self_calibration import CORNER, LEAST_SHIFT
 from splatnode.recon.registration.subpixel import PatchImage
-from splatnode.recon.threads import map_parallel
+from splatnode.recon.threads import BACKGROUND, RunContext, map_parallel
 
 # Incremental mapping: a first pair, then one view after the other, with a bundle adjustment after each.
 
@@ -418,17 +418,17 @@ def build_map(
     pairs: Pairs,
     config: MapperConfig,
     images: Sequence[PatchImage] = (),
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> Map | None:
     """The best map of several attempts, or None when no two views can be registered.
 
-    `images`, one a view, make its observations exact to a tenth of a pixel. `pause` is called between attempts and may
+    `images`, one a view, make its observations exact to a tenth of a pixel. It pauses between attempts, which may
     raise to abandon the work.
     """
     problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
     attempts: list[tuple[float, PartialMap]] = []
     for first, focals in _starts(lenses, pairs, config.max_attempts):
-        pause()
+        run.pause()
         partial = grow(problem, focals, first, config.incremental)
         if partial is None:
             continue
@@ -438,12 +438,12 @@ def build_map(
             break
     if not attempts:
         return None
-    pause()
+    run.pause()
     _, best = max(attempts, key=_score)
     finished = run_final_adjustment(problem, best, images, config.finishing)
     if finished is None:
         return None
-    problem, finished = give_own_lenses(problem, finished, images, config, pause)
+    problem, finished = give_own_lenses(problem, finished, images, config, run)
     return make_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
 
 
@@ -452,7 +452,7 @@ def give_own_lenses(
     finished: FinalMap,
     images: Sequence[PatchImage],
     config: MapperConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> tuple[MapperInput, FinalMap]:
     """Both, with lenses of their own for the views that refute the common one, or with pixels that are not square.
 
@@ -460,7 +460,7 @@ def give_own_lenses(
     and the one that explains the matches better is kept; as well with fewer lenses is better, too. Where it explains
     them nearly as well with fewer lenses, the aspect counts as unknown.
     """
-    own = _separate_lenses(problem, finished, images, config, pause)
+    own = _separate_lenses(problem, finished, images, config, run)
     stretched = self_calibration.free_aspects(finished.map, finished.loss, config.own_lenses)
     if stretched is None:
         problem, stretched = own[0], self_calibration.free_aspects(own[1].map, own[1].loss, config.own_lenses)
@@ -470,7 +470,7 @@ def give_own_lenses(
     again = run_final_adjustment(problem, stretched, images, config.finishing)
     if again is None:
         return own
-    other = _separate_lenses(problem, again, images, config, pause)
+    other = _separate_lenses(problem, again, images, config, run)
     return _choose_aspect(own, other, config)
 
 
@@ -503,7 +503,7 @@ def _separate_lenses(
     finished: FinalMap,
     images: Sequence[PatchImage],
     config: MapperConfig,
-    pause: Callable[[], None],
+    run: RunContext,
 ) -> tuple[MapperInput, FinalMap]:
     """Both, with lenses of their own for the views that refute the common one.
 
@@ -511,7 +511,7 @@ def _separate_lenses(
     """
     searches = [_try_other_focals, _try_coarse_lenses]
     for _ in range(_MAX_SPLITS):
-        pause()
+        run.pause()
         before = finished
         for search in searches if _find_doubtful_views(problem, finished.map, config) else ():
             found = search(problem, finished.map, config)

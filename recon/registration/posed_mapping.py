@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -38,6 +38,7 @@ from splatnode.recon.registration.registration import (
     sort_by_content,
 )
 from splatnode.recon.registration.subpixel import PatchImage
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 # What is wrong with all given poses alike: how the camera sits on what carries it was told wrongly.
 
@@ -212,7 +213,7 @@ def build_map(
     given: Given,
     images: Sequence[PatchImage],
     config: incremental_mapper.MapperConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> PosedMap | None:
     """The map of all views with a given pose, and of the others that images place; None where too few poses hold.
 
@@ -221,19 +222,19 @@ def build_map(
     config, alike = _count_each(config), _LESS_SURE * math.sqrt(config.finishing.correlated)
     tolerance = _first_tolerance(problem, focals, given, config)
     partial = _adjust_until_settled(problem, _start(problem, focals, given), tolerance, config)
-    pause()
+    run.pause()
     partial = _release_single(problem, partial, given, config, alike)
-    pause()
+    run.pause()
     partial = _release_undecided_pairs(problem, _let_go(problem, partial, config), config)
     partial = _test_poses(problem, _count_as_given(problem, partial), given, config, alike)
-    pause()
+    run.pause()
     if partial is None:
         return None
     if len(partial.estimate.points) >= config.incremental.min_points:
         partial = incremental_mapper.extend(problem, partial, config.incremental)
     finished = _finish_map(problem, partial, images, config)
     for _ in range(_ROUNDS):
-        pause()
+        run.pause()
         again = _test_poses(problem, finished, given, config, alike)
         if again is None:
             return None
@@ -641,13 +642,13 @@ def register_posed(
     keyframes: Sequence[Keyframe],
     pairs: Pairs,
     config: RegistrationConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
     offset: Offset | None = None,
 ) -> Registration | None:
     """The cameras of the keyframes whose pose is given and true, and of those that images place beside them.
 
     None where given poses cannot hold a map: fewer than two have a pose and a lens that are told, or the images
-    contradict as many of them as they confirm. `offset` is taken out of all poses. `pairs` and `pause`: see `register`.
+    contradict as many of them as they confirm. `offset` is taken out of all poses. `pairs` and `run`: see `register`.
     """
     order = sort_by_content(keyframes)
     ordered, rank = [keyframes[index] for index in order], np.argsort(order)
@@ -657,7 +658,7 @@ def register_posed(
         return None
     grouping = self_calibration.group(ordered, across_sizes=True)
     matched = known_poses.add_guided_matches(ordered, relabel_pairs(pairs, rank), given)
-    pause()
+    run.pause()
     views = make_views(ordered, grouping)
     known = self_calibration.candidates(ordered, grouping, matched, config.lenses)
     settings = config.mapper
@@ -669,7 +670,7 @@ def register_posed(
         settings.max_final_tracks,
     )
     focals, images = [lens.focals[0] for lens in known], patch_images(ordered, grouping, config)
-    built = build_map(problem, focals, given, images, settings, pause)
+    built = build_map(problem, focals, given, images, settings, run)
     if built is None:
         return None
     moved = replace(built, map=built.map.relabel(order))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -41,6 +41,7 @@ from splatnode.recon.registration.known_poses import GivenWorld
 from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
 from splatnode.recon.registration.self_calibration import LEAST_SHIFT, Grouping
 from splatnode.recon.registration.subpixel import PatchImage, patch_image
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 # The configuration of registration: the lenses, and the mapper.
 
@@ -126,27 +127,27 @@ def register(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
     config: RegistrationConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
     tolerance_s: float = TOLERANCE_S,
 ) -> Registration | None:
     """The cameras of as many keyframes as can be registered together, or None when no two can.
 
     `pairs` holds the verified pairs by position (i < j). The result does not depend on the order of the keyframes.
-    Images of different cameras are taken together where at most `tolerance_s` is between them. `pause` is called
-    between steps and may raise to abandon the work.
+    Images of different cameras are taken together where at most `tolerance_s` is between them. It pauses
+    between steps, which may raise to abandon the work.
     """
     if not pairs:
         return None
     order = sort_by_content(keyframes)
     ordered = [keyframes[index] for index in order]
     rank = np.argsort(order)
-    built = _build(ordered, relabel_pairs(pairs, rank), config, pause)
+    built = _build(ordered, relabel_pairs(pairs, rank), config, run)
     if built is None:
         return None
     found, grouping = built
     scales = [grouping.scales[i] for i in rank]
     alone = make_registration(found.relabel(order), keyframes, scales, config)
-    pause()
+    run.pause()
     given = config.rig or form_mounted_rig(each.frame for each in keyframes)
     on_rig = rigs.adjust_with_rig(found, ordered, given, tolerance_s)
     if on_rig is None:
@@ -193,18 +194,18 @@ def _build(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
     config: RegistrationConfig,
-    pause: Callable[[], None],
+    run: RunContext,
 ) -> tuple[incremental_mapper.Map, Grouping] | None:
     """The map, in the pixels of its lenses, and their grouping: one lens for all sizes unless the map disagrees."""
     together, apart = (self_calibration.group(keyframes, across_sizes) for across_sizes in (True, False))
-    built = _map(keyframes, pairs, together, config, pause)
+    built = _map(keyframes, pairs, together, config, run)
     if built is None or together == apart:
         return None if built is None else (built, together)
     if not self_calibration.sizes_disagree(
         built.estimate, built.prior, built.loss, built.views[0], together, config.lenses
     ):
         return built, together
-    built = _map(keyframes, pairs, apart, config, pause)
+    built = _map(keyframes, pairs, apart, config, run)
     return None if built is None else (built, apart)
 
 
@@ -213,13 +214,13 @@ def _map(
     pairs: Mapping[tuple[int, int], TwoView],
     grouping: Grouping,
     config: RegistrationConfig,
-    pause: Callable[[], None],
+    run: RunContext,
 ) -> incremental_mapper.Map | None:
     """The map of keyframes with the lenses of `grouping`, in the pixels of these."""
     images = patch_images(keyframes, grouping, config)
     known = self_calibration.candidates(keyframes, grouping, pairs, config.lenses)
     views, scaled = make_views(keyframes, grouping), convert_to_lens_pixels(pairs, grouping)
-    return incremental_mapper.build_map(views, known, scaled, config.mapper, images, pause)
+    return incremental_mapper.build_map(views, known, scaled, config.mapper, images, run)
 
 
 def patch_images(keyframes: Sequence[Keyframe], grouping: Grouping, config: RegistrationConfig) -> list[PatchImage]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import combinations
 from typing import Any
@@ -20,7 +20,7 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import multiview_geometry
 from splatnode.recon.registration.mapping_problem import compute_pooled_ratio
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.threads import map_parallel_lazily
+from splatnode.recon.threads import BACKGROUND, RunContext, map_parallel_lazily
 from splatnode.recon.verification import refit
 from splatnode.recon.verification.refit import Distortion, Errors, FreedLens, PoseErrors
 
@@ -509,19 +509,19 @@ def verify(
     graph: ViewGraph,
     registration: Registration | None,
     config: VerificationConfig,
-    pause: Callable[[], None] = lambda: None,
+    run: RunContext = BACKGROUND,
 ) -> Evidence | None:
     """Numbers for and against `registration`; None where it has fewer than two cameras.
 
-    `pause` is called between the sources of evidence; it may raise to abandon the work.
+    It pauses between the sources of evidence, which may raise to abandon the work.
     """
     if registration is None or len(registration.cameras) < 2:
         return None
     fit = refit.build_fit(graph.keyframes, registration, config.tracks_per_camera)
     sizes = refit.measure_errors(fit, registration)
-    pause()
+    run.pause()
     cameras = _collect_camera_evidence(graph, registration, sizes.cameras, sizes.focals)
-    pause()
+    run.pause()
     return Evidence(
         cameras=cameras,
         inlier_ratio=compute_inlier_ratio(graph, registration, None),

@@ -14,6 +14,7 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction, ReconstructionCache, StreamState
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import registration
+from splatnode.recon.threads import RunContext
 from splatnode.recon.verification import evidence
 from tests.support.synthetic import photographs, places, view_graph
 
@@ -109,13 +110,13 @@ def test_work_that_is_abandoned_leaves_what_was_known(graph):
     before.estimate_soon()
     work = holding(graph, before.state.memory)
     with pytest.raises(InterruptedError):
-        work.estimate_thoroughly(pause)
+        work.estimate_thoroughly(RunContext(pause))
     assert work.state.memory is before.state.memory and work.estimate_soon().verdict.provisional
 
 
 def test_a_thorough_estimate_can_be_abandoned_at_any_of_its_stages(graph):
     fresh, calls = match_later(graph), []
-    holding(fresh).estimate_thoroughly(lambda: calls.append(None))
+    holding(fresh).estimate_thoroughly(RunContext(lambda: calls.append(None)))
     assert len(calls) > 6 + 3  # pairs, attempts at a map, what speaks for it
     for moment in (1, len(calls) // 2, len(calls)):
         left = iter(range(moment - 1))
@@ -126,7 +127,7 @@ def test_a_thorough_estimate_can_be_abandoned_at_any_of_its_stages(graph):
 
         work = holding(fresh)
         with pytest.raises(InterruptedError):
-            work.estimate_thoroughly(pause)
+            work.estimate_thoroughly(RunContext(pause))
         assert work.publishable_names == frozenset() and work.find_reconstruction() is None
         assert len(work.graph.pending) == max(6 - moment, 0)  # what was compared by then is kept
         assert work.estimate_thoroughly().publishable

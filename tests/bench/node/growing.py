@@ -40,7 +40,7 @@ from splatnode.extras.cameras import building
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.free_space import GrowingScene, map_growing_scene
 from splatnode.recon.geometry import Similarity, align_cameras
-from splatnode.recon.incremental import IncrementalReconstruction, ignore_cancel
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.locating import LocateAnswer, Located, LocateRequest, parse_outcome
 from splatnode.recon.occupancy import MapHeader, OccupancyMap, VoxelState, decode_map
 from splatnode.recon.result.message import SceneHeader, decode_snapshot
@@ -97,7 +97,7 @@ def _time_steps(config: building.Config) -> list[float]:
         work.add_frame(Frame(index, name, index, image, None))
         work.update()
         scene = GrowingScene(work.snapshot(), "alone", index, 0, work.state.pointmaps, 0.0)
-        made = map_growing_scene(scene, None, ignore_cancel)
+        made = map_growing_scene(scene, None, lambda: None)
         if made.occupancy is not None:
             seconds.append(time.thread_time() - began_s)
     return seconds

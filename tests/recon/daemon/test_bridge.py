@@ -30,6 +30,7 @@ from splatnode.recon.daemon.pose_graph import EdgeKind, make_loop_edge
 from splatnode.recon.estimation import estimate_cameras, prepare
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.result.verdict import Code
+from splatnode.recon.threads import RunContext
 from tests.support.synthetic import SMALL
 
 VIEWS = msgspec.structs.replace(SMALL, views=7)
@@ -127,7 +128,7 @@ def test_what_pause_raises_ends_the_work(sides):
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        verify_loop(sides["scene-0001"], replace(sides["scene-0002"]), ReconstructionConfig(), None, end)
+        verify_loop(sides["scene-0001"], replace(sides["scene-0002"]), ReconstructionConfig(), None, RunContext(end))
 
 
 @pytest.mark.parametrize(("code", "placed"), [(Code.AMBIGUOUS, 6), (Code.SPLIT, 6), (Code.AMBIGUOUS, 3)])

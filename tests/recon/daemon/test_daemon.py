@@ -283,8 +283,8 @@ def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_to
 def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
     add = submap.add
 
-    def failing(work, keyframes, pause):
-        strangers = add(work, keyframes, pause)
+    def failing(work, keyframes, run):
+        strangers = add(work, keyframes, run)
         if any(keyframe.name == frames[1].name for keyframe in keyframes):
             raise ArithmeticError("for the test")
         return strangers

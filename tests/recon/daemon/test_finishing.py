@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,7 @@ from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.modelling import SceneWithVerdict
 from splatnode.recon.optimize import training
 from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.threads import BACKGROUND, RunContext
 from tests.support.synthetic import photographs
 
 
@@ -24,16 +25,14 @@ class Work:
     initial_scene: str = "initial_scene"
     asked: list[training.RefinementConfig] = field(default_factory=list)
 
-    def rebuild(self, pause: Callable[[], None]) -> None:
-        pause()
+    def rebuild(self, run: RunContext) -> None:
+        run.pause()
 
-    def refine(
-        self, scene: str, steps: training.RefinementConfig, pause: Callable[[], None]
-    ) -> Iterator[SceneWithVerdict]:
+    def refine(self, scene: str, steps: training.RefinementConfig, run: RunContext) -> Iterator[SceneWithVerdict]:
         assert scene == self.initial_scene
         self.asked.append(steps)
         for _ in range(steps.steps):
-            pause()
+            run.pause()
         yield SceneWithVerdict()
 
 
@@ -45,7 +44,7 @@ def test_the_scene_is_that_of_an_offline_run_to_the_bit():
     work = IncrementalReconstruction(config)
     for frame in frames:
         work.add_frame(frame)
-    *_, live = submap.refine(work, config, lambda: None)
+    *_, live = submap.refine(work, config, BACKGROUND)
     *_, offline = reconstruct(frames, config)
     assert live.scene is not None and len(offline.gaussians) > 1000
     found = live.scene.arrays()
@@ -56,7 +55,7 @@ def test_the_scene_is_that_of_an_offline_run_to_the_bit():
 @pytest.mark.parametrize("name", PRESETS)
 def test_its_refinement_is_that_of_photographs_that_are_all_at_hand(name):
     work = Work()
-    assert len(list(submap.refine(work, PRESETS[name], lambda: None))) == 1
+    assert len(list(submap.refine(work, PRESETS[name], BACKGROUND))) == 1
     # No checkpoint more: before one that comes early a scene would not start with soft Gaussians.
     assert work.asked == [PRESETS[name].optimize]
 
@@ -74,7 +73,7 @@ def test_it_can_be_abandoned_every_few_steps():
 
     config = PRESETS["fast"]
     with pytest.raises(Abandoned):
-        list(submap.refine(Work(), config, pause))
+        list(submap.refine(Work(), config, RunContext(pause)))
     paused.clear()
-    list(submap.refine(Work(), config, lambda: paused.append(0)))
+    list(submap.refine(Work(), config, RunContext(lambda: paused.append(0))))
     assert len(paused) == 1 + config.optimize.steps // submap.STEP

@@ -15,6 +15,7 @@ from splatnode.recon.daemon.relocalization import NOT_FINAL, FinalScene, Occupan
 from splatnode.recon.daemon.submap import Abandoned
 from splatnode.recon.occupancy import OccupancyMap
 from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.threads import BACKGROUND, RunContext
 from tests.recon.daemon.test_daemon import PATIENCE_S, Peer, config, finished, peer, running  # noqa: F401
 from tests.support.occupied import room_snapshot
 from tests.support.synthetic import photographs, places
@@ -96,12 +97,12 @@ def test_a_map_is_abandoned_for_a_keyframe_and_made_afterwards(tmp_path):
         if next(calls) == 2:
             raise Abandoned
 
-    space = OccupancyMapper(LIVE)
+    space, run = OccupancyMapper(LIVE), RunContext(interrupted)
     with pytest.raises(Abandoned):
-        space.map_scene(scene, ReconState.IDLE, tmp_path, interrupted)
+        space.map_scene(scene, ReconState.IDLE, tmp_path, run)
     assert space.find_current_map(scene, ReconState.IDLE) == NOT_FINAL
-    assert space.map_scene(scene, ReconState.IDLE, tmp_path, interrupted)
-    assert not space.map_scene(scene, ReconState.IDLE, tmp_path, interrupted)
+    assert space.map_scene(scene, ReconState.IDLE, tmp_path, run)
+    assert not space.map_scene(scene, ReconState.IDLE, tmp_path, run)
     found = space.find_current_map(scene, ReconState.IDLE)
     assert not isinstance(found, str) and found.occupancy is not None
     assert (
@@ -116,6 +117,6 @@ def test_rough_cameras_and_voxels_that_are_too_many_give_no_map_but_a_reason(tmp
     cases = ((rough, None, "could call free what is solid"), (room, 1e-6, "give a voxel of at least"))
     for snapshot, voxel, why in cases:
         space, scene = OccupancyMapper(OccupancyConfig(live=True, voxel=voxel)), FinalScene(snapshot, ())
-        assert space.map_scene(scene, ReconState.IDLE, tmp_path, lambda: None)
+        assert space.map_scene(scene, ReconState.IDLE, tmp_path, BACKGROUND)
         found = space.find_current_map(scene, ReconState.IDLE)
         assert not isinstance(found, str) and found.occupancy is None and why in found.why

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +14,7 @@ from splatnode.recon.daemon import submap
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.threads import BACKGROUND, RunContext
 
 
 def keyframe(name: str) -> SimpleNamespace:
@@ -43,10 +44,10 @@ class FakeReconstruction:
     def keyframes_deferred(self) -> list[SimpleNamespace]:
         return [each for each in self._all if each.name not in self.names]
 
-    def match_pending_pairs(self, pause: Callable[[], None]) -> None:
-        pause()
+    def match_pending_pairs(self, run: RunContext) -> None:
+        run.pause()
 
-    def add_keyframe(self, added: SimpleNamespace, pause: Callable[[], None]) -> None:
+    def add_keyframe(self, added: SimpleNamespace, run: RunContext) -> None:
         self._all.append(added)
         self.names.append(added.name)
 
@@ -59,8 +60,8 @@ class FakeReconstruction:
     def is_rejected(self, names: Collection[str]) -> bool:
         return frozenset(names) in self.refusals
 
-    def estimate_soon(self, pause: Callable[[], None]) -> Any:
-        return self.estimate_quickly() or self.estimate_thoroughly(pause)
+    def estimate_soon(self, run: RunContext) -> Any:
+        return self.estimate_quickly() or self.estimate_thoroughly(run)
 
     def estimate_quickly(self) -> Any:
         if self.publishable_names == frozenset(self.names):
@@ -69,8 +70,8 @@ class FakeReconstruction:
         all_placed = len(estimated.publishable_camera_names) == len(self.names)
         return estimated if estimated.verdict.publishable and all_placed else None
 
-    def estimate_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Any:
-        pause()
+    def estimate_thoroughly(self, run: RunContext = BACKGROUND) -> Any:
+        run.pause()
         estimated = self._estimated(("late", "far", "other") if self._called("late") < 2 else ("far", "other"), "worse")
         if estimated.verdict.publishable:
             self.publishable_names = frozenset(self.names)
@@ -134,9 +135,9 @@ def test_what_was_refused_once_is_not_estimated_again_and_stays_aside():
 def test_frames_with_which_most_of_the_scene_has_no_place_do_not_join_it():
     work = reconstruction("0", "1", "2")
     come(work, "3-far")
-    work.estimate_thoroughly = lambda pause: work._estimated(("0", "1"))  # of the scene, one of three is left
+    work.estimate_thoroughly = lambda run: work._estimated(("0", "1"))  # of the scene, one of three is left
     assert not submap.join(work, ["3-far"]) and named(work.keyframes_deferred) == ["3-far"]
-    work.estimate_thoroughly = lambda pause: work._estimated(("0",))
+    work.estimate_thoroughly = lambda run: work._estimated(("0",))
     assert submap.join(work, ["3-far"])
 
 
@@ -180,7 +181,7 @@ def test_proof_that_is_abandoned_changes_nothing():
     come(work, "3-worse")
     come(work, "4-bad")
     with pytest.raises(InterruptedError):
-        submap.verify_provisional(work, pause)
+        submap.verify_provisional(work, RunContext(pause))
     assert work.names == ["0", "1", "2", "3-worse"] and named(work.keyframes_deferred) == ["4-bad"]
 
 

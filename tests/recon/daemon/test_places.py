@@ -27,6 +27,7 @@ from splatnode.recon.daemon.submap import ActiveSubmap
 from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.verdict import Code
+from splatnode.recon.threads import BACKGROUND
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import (
     PATIENCE_S,
@@ -203,12 +204,12 @@ def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer
     begun, shown = threading.Event(), threading.Event()
     last = worker._refine_to_end
 
-    def slow(work, recipe, pause):
+    def slow(work, recipe, run):
         begun.set()
         while not shown.is_set():
-            pause()
+            run.pause()
             time.sleep(0.01)
-        return last(work, recipe, pause)
+        return last(work, recipe, run)
 
     monkeypatch.setattr(worker, "_refine_to_end", slow)
     frames = places(msgspec.structs.replace(SMALL, views=8))
@@ -314,14 +315,14 @@ def test_a_place_that_turns_out_to_be_two_becomes_two(config):
         output = Output(config, store, lambda _: None, pytest.fail)
         atlas = LoopDetector(store.directory, config.reconstruction, output.places)
         waiting = InactiveSubmaps(store, config.reconstruction, output, atlas)
-        assert waiting.verify_next(lambda: None)
+        assert waiting.verify_next(BACKGROUND)
         first, part = [folder.name for folder in ledger.list_left_folders(config.checkpoint)]
         ours, other = by_id(config)
         assert first == ours["scene_id"] == "scene-0001" and part == other["scene_id"] and ours["judged"]
         assert {each["reason"] for each in ours["frames_dropped"]} == {f"it shows another place: {part}"}
         assert {each["name"] for each in ours["frames_dropped"]} == {each["name"] for each in other["frames_dropped"]}
         assert not other["judged"]
-        assert waiting.verify_next(lambda: None) and not waiting.verify_next(lambda: None)
+        assert waiting.verify_next(BACKGROUND) and not waiting.verify_next(BACKGROUND)
         ours, other = by_id(config)
         names = [frame.name for frame in frames]
         assert other["judged"] and sorted([ours["frames_used"], other["frames_used"]]) == [names[:3], names[3:]]

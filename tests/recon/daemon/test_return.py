@@ -25,6 +25,7 @@ from splatnode.recon.estimation import prepare
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.result.export import read_cameras
+from splatnode.recon.threads import BACKGROUND
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, finished, peer, running
 from tests.support.synthetic import SMALL, photographs, places
@@ -123,7 +124,7 @@ def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_
 def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kidnapped, peer, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(
-            LoopDetector, "detect_loops", lambda _, scene, graph, pause: compute_global_descriptors(graph.keyframes)
+            LoopDetector, "detect_loops", lambda _, scene, graph, run: compute_global_descriptors(graph.keyframes)
         )  # with no other
         with walked(kidnapped, peer):
             pass
@@ -163,5 +164,5 @@ def test_a_finished_place_whose_files_are_damaged_is_not_recognised_and_stops_no
     seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "verify_loop", lambda one, *_: seen.append(one.scene_id) or "for the test")
-        atlas.detect_loops("scene-0003", work.graph, lambda: None)
+        atlas.detect_loops("scene-0003", work.graph, BACKGROUND)
     assert seen == ["scene-0002"] and index.links == ()

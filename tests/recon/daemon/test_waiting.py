@@ -27,6 +27,7 @@ from splatnode.recon.daemon.worker import InactiveSubmaps, Worker
 from splatnode.recon.estimation import prepare
 from splatnode.recon.fallbacks import make_fallback_key
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.threads import BACKGROUND, RunContext
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, index, running
 from tests.support.synthetic import SMALL, photographs, places
@@ -112,7 +113,7 @@ def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(
         waiting = InactiveSubmaps(
             store, config.reconstruction, output, LoopDetector(store.directory, config.reconstruction, output.places)
         )
-        while waiting.verify_next(lambda: None) or waiting.finalize_next(lambda: None):
+        while waiting.verify_next(BACKGROUND) or waiting.finalize_next(BACKGROUND):
             pass
     assert submaps(config) == [names[:4], names[4:]]
 
@@ -122,7 +123,7 @@ def rounds(monkeypatch) -> list[list[str]]:
     """The keyframes of each round of fallbacks, which all gain nothing."""
     found: list[list[str]] = []
 
-    def run_fallbacks(estimate, rejected, config, pause):
+    def run_fallbacks(estimate, rejected, config, run):
         found.append(sorted(estimate.graph.names))
         message = f"{estimate.verdict.message} Also tried: nothing."
         return replace(estimate, verdict=replace(estimate.verdict, message=message))
@@ -181,12 +182,12 @@ def test_what_gained_nothing_is_kept_as_soon_as_a_scene_was_judged(config, round
 def test_making_a_scene_final_takes_no_more_fallbacks_than_its_budget(config, monkeypatch):
     spent = []
 
-    def climb_for_ever(estimate, rejected, recipe, pause):
+    def climb_for_ever(estimate, rejected, recipe, run):
         began = time.monotonic()
         try:
             while True:
                 time.sleep(0.01)
-                pause()
+                run.pause()
         finally:
             spent.append(time.monotonic() - began)
 
@@ -210,14 +211,14 @@ def test_a_pause_does_not_count_as_fallback_time(monkeypatch):
         work.add_keyframe(prepare(frame, work.config))
     done = []
 
-    def run_fallbacks(estimate, rejected, recipe, pause):
-        pause()
+    def run_fallbacks(estimate, rejected, recipe, run):
+        run.pause()
         done.append(True)
         return estimate
 
     monkeypatch.setattr(incremental, "run_fallbacks", run_fallbacks)
     with work.fallback_budget(0.2):
-        work.estimate_thoroughly(lambda: time.sleep(0.25))
+        work.estimate_thoroughly(RunContext(lambda: time.sleep(0.25)))
     assert done
 
 

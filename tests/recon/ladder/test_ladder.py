@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import time
 from collections.abc import Collection, Iterator
 from dataclasses import replace
@@ -21,6 +20,7 @@ from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.fallbacks import Fallback, FallbackState, choose_better_reconstruction, run_fallbacks
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.threads import RunContext
 from tests.support.row_of_views import graph_of, registration_of
 from tests.support.synthetic import SMALL, places
 
@@ -57,7 +57,7 @@ def estimated(monkeypatch):
     def of(*answers: Reconstruction) -> list[int]:
         coming = iter(answers)
 
-        def estimate_cameras(graph, rejected, config, pause):
+        def estimate_cameras(graph, rejected, config, run):
             seeds.append(config.seed)
             return next(coming)
 
@@ -125,9 +125,9 @@ def test_no_work_is_no_ladder(estimated):
 def test_a_deadline_ends_the_climb_and_without_one_no_clock_is_read(estimated, monkeypatch):
     seeds, clock = estimated(NO_OVERLAP, NO_OVERLAP, NO_OVERLAP), itertools.count(0.0, 1.0)
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=6.0)
+    run_fallbacks(NO_OVERLAP, (), working(1000.0), run=RunContext(deadline=6.0), rungs=[rung("long", 100)])
     assert 1 < seeds[0] <= 6 and (read := next(clock)) < 10
-    run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=math.inf)
+    run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)])
     assert seeds[1] == 100 and next(clock) == read + 1
     climb(NO_OVERLAP, rung("long", 100), config=apply_changes(working(1000.0), {"fallbacks": {"timeout_s": 6.0}}))
     assert 1 < seeds[2] <= 6
@@ -187,7 +187,7 @@ def test_pause_may_abandon_the_climb(estimated):
 
     estimated(NO_OVERLAP)
     with pytest.raises(Abandoned):
-        run_fallbacks(NO_OVERLAP, (), ReconstructionConfig(), pause, [rung("a")])
+        run_fallbacks(NO_OVERLAP, (), ReconstructionConfig(), RunContext(pause), [rung("a")])
 
 
 @pytest.mark.parametrize("quick", [False, True])

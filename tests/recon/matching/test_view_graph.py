@@ -16,6 +16,7 @@ from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.matching.pair_matching import MatchedPair
 from splatnode.recon.matching.view_graph import FIRST_COMPARISONS, ViewGraph, match, match_newest, match_pending
 from splatnode.recon.registration import registration as registration_registration
+from splatnode.recon.threads import RunContext
 from tests.support.synthetic import photographs, places, view_graph
 
 NO_MATCHES = np.zeros((0, 2), np.int64)
@@ -151,7 +152,7 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
 
 def test_out_of_time_no_pair_is_matched_with_tilted_features(compared):
     graph: Any = ViewGraph(matching.MatchingConfig(), (keyframe("a1"),))
-    *_, whole = match_pending(graph.add_keyframe(keyframe("A2")), None, until=0.0)
+    *_, whole = match_pending(graph.add_keyframe(keyframe("A2")), None, RunContext(deadline=0.0))
     assert compared == [("A2", "a1")] and not whole.pending and not whole.tilted
 
 
@@ -160,7 +161,7 @@ def test_who_waits_hears_how_many_pairs_are_matched_and_how_many_weak_ones_again
     match(
         [keyframe(name) for name in ("a", "b", "A")],
         matching.MatchingConfig(),
-        tell=lambda step: told.append(str(step)),
+        run=RunContext(tell=lambda step: told.append(str(step))),
     )
     matched = [f"matching: {done} of 3 photograph pairs" for done in (1, 2, 3)]
     assert told[:3] == matched and told[-1] == "matching weak pairs again: 3 of 3 photograph pairs"

@@ -24,7 +24,7 @@ from splatnode.recon.priors.stereo import (
     rank_partners,
     select_sources,
 )
-from splatnode.recon.threads import OutOfTime
+from splatnode.recon.threads import OutOfTime, RunContext
 from tests.bench.speed import stereo as bench
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
@@ -147,7 +147,7 @@ def test_the_work_can_be_abandoned_between_views(views):
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        estimate_depth_maps(views, StereoConfig(), pause=pause)
+        estimate_depth_maps(views, StereoConfig(), run=RunContext(pause))
     assert len(calls) == 2
 
 
@@ -155,7 +155,7 @@ def test_when_time_is_over_depth_is_as_fine_as_it_is_by_then(views):
     def over() -> None:
         raise OutOfTime
 
-    for T, early in zip(CAMERAS, estimate_depth_maps(views, StereoConfig(), seed=1, pause=over), strict=True):
+    for T, early in zip(CAMERAS, estimate_depth_maps(views, StereoConfig(), seed=1, run=RunContext(over)), strict=True):
         _, depth, _ = render(T)
         known = early.depth > 0
         assert early.depth.shape == depth.shape and known.mean() > 0.3
