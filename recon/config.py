@@ -47,6 +47,9 @@ PREVIEW = training.RefinementConfig(
 )
 
 
+BALANCED = training.RefinementConfig(doubtful_iterations=200)
+
+
 class FallbackConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The fallbacks, tried before images are rejected or left out for want of matches."""
 
@@ -81,7 +84,7 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
     # In place of completion, initialization and background: a Gaussian a pixel, for comparison
     pixelwise: Internal[initialization.PixelwiseConfig | None] = None
     preview: Internal[training.RefinementConfig] = PREVIEW  # the refinement after each keyframe
-    optimize: training.RefinementConfig = training.RefinementConfig()  # the refinement after the last keyframe
+    optimize: training.RefinementConfig = BALANCED  # the refinement after the last keyframe
     metric: metric.MetricConfig = metric.MetricConfig()  # the scale in metres of what is published
     # Images of several cameras were taken together, as a frame set, where their times are no further apart; seconds
     frame_set_tolerance_s: Annotated[float, Meta(gt=0, le=10)] = TOLERANCE_S
@@ -127,6 +130,7 @@ PRESETS: dict[str, ReconstructionConfig] = {
     "quality": ReconstructionConfig(
         initialization=initialization.GaussianInitializationConfig(max_error=0.0009),
         optimize=training.RefinementConfig(
+            doubtful_iterations=200,
             checkpoints=(150, 500),
             ensemble=ensemble.EnsembleConfig(members=2),
             perceptual=photometric_losses.PerceptualLossConfig(weight=0.08, start=0.0, every=2),

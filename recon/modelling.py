@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -222,6 +223,13 @@ def _find_transient_masks(
         used.append(rim if mask is None else rim & mask)
     found = zip(pointmaps, transients.find_transient_masks(pointmaps, pictures, used), used, strict=True)
     return {pointmap.name: hidden & own for pointmap, hidden, own in found if hidden is not None}
+
+
+def limit_refinement(config: ReconstructionConfig, scene: Scene | None) -> ReconstructionConfig:
+    """Returns the configuration with as many steps of refinement as the scene is worth."""
+    if scene is None:
+        return config
+    return msgspec.structs.replace(config, optimize=training.limit_iterations(config.optimize, scene))
 
 
 def refine_scene(

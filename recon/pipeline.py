@@ -49,6 +49,7 @@ from splatnode.recon.modelling import (
     create_coarse_preview,
     create_initial_scene,
     find_budget_hits,
+    limit_refinement,
     prepare_scene_for_display,
     refine_scene,
     snapshot,
@@ -157,6 +158,7 @@ def model_scene(
 ) -> Iterator[Snapshot]:
     """The scene, if one was begun, refined. `numbers` are those of the snapshots."""
     numbers = numbers or itertools.count(1)
+    config = limit_refinement(config, begun)
     show = prepare_scene_for_display(begun, config)
     clock.lap("points")
     if show_begun:

@@ -31,7 +31,7 @@ from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.modelling import SceneWithVerdict
+from splatnode.recon.modelling import SceneWithVerdict, limit_refinement
 from splatnode.recon.registration.rigs import form_sets
 from splatnode.recon.result import snapshot as result_snapshot
 from splatnode.recon.result.snapshot import Snapshot
@@ -238,17 +238,17 @@ def refine(
 
     Yields nothing where the verdict forbids a scene. A pause in between may raise to abandon the work.
     """
-    steps = itertools.count(1)
+    run.tell(ProgressStep("estimating depth"))
+    work.rebuild(run)
+    steps, optimize = itertools.count(1), limit_refinement(config, work.initial_scene).optimize
 
     def pause_periodically() -> None:
         done = next(steps)
-        run.tell(ProgressStep("refining the scene", done, config.optimize.steps, "step"))
+        run.tell(ProgressStep("refining the scene", done, optimize.steps, "step"))
         if done % STEP == 0:
             run.pause()
 
-    run.tell(ProgressStep("estimating depth"))
-    work.rebuild(run)
-    yield from work.refine(work.initial_scene, config.optimize, RunContext(pause_periodically))
+    yield from work.refine(work.initial_scene, optimize, RunContext(pause_periodically))
 
 
 # The result of the present place's finished scene: written when the scene is, or when the disk takes it again.

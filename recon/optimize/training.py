@@ -80,9 +80,12 @@ CAUTIOUS = LearningRates(means=8e-4, means_unit="depth")
 
 
 class RefinementConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The refinement of the preset `balanced`."""
+    """The refinement of a scene; the preset `balanced` has these values, and fewer steps for doubtful scenes."""
 
     iterations: Annotated[int, Meta(ge=0)] = 500  # steps of the optimiser, one view each
+    # Steps of a scene of which other views confirm little: more of them fit what nothing holds in its place, and cost
+    # in views that are held out. null: always `iterations`
+    doubtful_iterations: Annotated[int, Meta(ge=0)] | None = None
     # Iterations after which the scene is shown and judged, besides the last one
     checkpoints: Internal[tuple[int, ...]] = (150,)
     looks: Internal[tuple[int, ...]] = ()  # iterations after which it is shown, too, to somebody who watches
@@ -109,6 +112,23 @@ class RefinementConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Returns the number of steps of all refinements together."""
         one = self.ensemble.members == 1
         return self.iterations if one else self.ensemble.members * self.iterations + self.ensemble.iterations
+
+
+DOUBTFUL, CERTAIN = 0.4, 0.5  # share of multi-view consistent depth up to which steps are few, and from which all
+
+
+def limit_iterations(config: RefinementConfig, scene: Scene) -> RefinementConfig:
+    """Returns the refinement with fewer iterations where little of the scene's depth is multi-view consistent.
+
+    Between DOUBTFUL and CERTAIN of it their number grows from `doubtful_iterations` to `iterations`.
+    """
+    shares = [view.consistent_depth for view in scene.views if view.consistent_depth is not None]
+    few = config.doubtful_iterations
+    if few is None or few >= config.iterations or not shares:
+        return config
+    certainty = (sum(shares) / len(shares) - DOUBTFUL) / (CERTAIN - DOUBTFUL)
+    iterations = round(few + min(max(certainty, 0.0), 1.0) * (config.iterations - few))
+    return msgspec.structs.replace(config, iterations=iterations)
 
 
 def refine(

@@ -180,7 +180,8 @@ def _frames(directions: Array) -> Array:
 # A plain wall or the sky gives stereo nothing to match. Left empty it would be black in every new view. So a pixel
 # that no other view's point of like colour explains gets the first of these depths that hides no known surface from
 # another view: stereo's own doubtful depth; the smoothest depth that may jump at the image's edges (the stated prior);
-# a far background. Where points of another colour fall on it, something nearer stands before them: it gets a depth
+# a far background, which lies beyond all cameras, or it would be a wall before those that look at the scene from its
+# other side. Where points of another colour fall on it, something nearer stands before them: it gets a depth
 # close to the camera.
 
 Mask = npt.NDArray[np.bool_]
@@ -202,6 +203,9 @@ class DepthCompletionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     min_object_px: int = 15  # width of a region of other colour from which on it is taken for a foreground object
     foreground_depth: float = 0.4  # depth of an unknown foreground, over the nearest known depth of its view
     background_depth: float = 1.5  # depth of an unknown background, over the farthest known depth of its view
+    # An unknown background lies outside the sphere around the middle of the cameras whose radius is so many times the
+    # distance of the farthest one
+    surround: float = 2.0
     confidence: float = 0.1  # that filled depths get
     most_partners: int = 16  # other views that a view is compared with, at most: those that share most with it
     reduction: int = 4  # the smooth depth is found at 1 / `reduction` of the resolution
@@ -223,6 +227,7 @@ def complete(
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
     partners = priors.find_overlapping(known, config.most_partners)
     smooth = map_parallel(partial(_smooth, config=config), known, images)
+    beyond = _leave_cameras(known, config.surround)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         others = [(completed[i], blurred[i]) for i in partners[j]]
@@ -237,7 +242,7 @@ def complete(
         filling = smooth[j]
         if filling is None or not hole.any():
             continue
-        for guess in _propose_fills(pointmaps[j], known[j], filling, covered, occluder, config):
+        for guess in _propose_fills(pointmaps[j], known[j], (filling, beyond[j]), covered, occluder, config):
             guess = guess.apply_mask(hole)
             guess = guess.apply_mask(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
             filled = guess.depth > 0
@@ -252,15 +257,40 @@ def complete(
 
 
 def _propose_fills(
-    doubtful: Pointmap, known: Pointmap, smooth: Float32, covered: Mask, occluder: Mask, config: DepthCompletionConfig
+    doubtful: Pointmap,
+    known: Pointmap,
+    guesses: tuple[Float32, Float32],
+    covered: Mask,
+    occluder: Mask,
+    config: DepthCompletionConfig,
 ) -> Iterator[Pointmap]:
-    """The point maps that a hole may be filled from, the best first."""
+    """The point maps that a hole may be filled from, the best first; `guesses` are smooth depths, and those beyond."""
+    smooth, beyond = guesses
     near, far = np.percentile(known.depth[known.depth > 0], [NEAREST_PERCENTILE, 100.0])
     yield doubtful
     facing = _facing_camera(known)
     yield replace(facing, depth=smooth).apply_mask(~covered)
-    yield replace(facing, depth=np.full_like(smooth, config.background_depth * far)).apply_mask(~covered)
+    yield replace(facing, depth=np.maximum(beyond, np.float32(config.background_depth * far))).apply_mask(~covered)
     yield replace(facing, depth=np.full_like(smooth, config.foreground_depth * near)).apply_mask(occluder)
+
+
+def _leave_cameras(pointmaps: Sequence[Pointmap], surround: float) -> list[Float32]:
+    """(h, w) of each view: the depths at which its rays leave the sphere around the cameras, `surround` times as large.
+
+    Cameras beside each other that look the same way have a small one, which changes nothing for them.
+    """
+    centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
+    offsets = centres - centres.mean(0)
+    radius = surround * float(np.linalg.norm(offsets, axis=1).max())
+    found = []
+    for pointmap, offset in zip(pointmaps, offsets, strict=True):
+        height, width = pointmap.depth.shape
+        rays = _compute_rays(pointmap.K, width, height) @ pointmap.T_world_camera[:3, :3].T
+        squared, along = (rays**2).sum(-1), rays @ offset
+        found.append(
+            ((np.sqrt(along**2 + squared * (radius**2 - offset @ offset)) - along) / squared).astype(np.float32)
+        )
+    return found
 
 
 def _smooth(pointmap: Pointmap, image: Image, config: DepthCompletionConfig) -> Float32 | None:
@@ -327,9 +357,15 @@ def _hides_known(filled: Pointmap, others: Sequence[Pointmap], occlusion_toleran
 
 def _facing_camera(pointmap: Pointmap) -> Pointmap:
     """The point map with normals along the rays towards the camera."""
-    height, width = pointmap.depth.shape
-    K = pointmap.K
-    u = ((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]).astype(np.float32)
-    v = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]).astype(np.float32)[:, None]
+    rays = _compute_rays(pointmap.K, *pointmap.depth.shape[::-1])
+    u, v = rays[..., 0], rays[..., 1]
     inverse_length = -1 / np.sqrt(u * u + v * v + 1)
     return replace(pointmap, normal=np.stack([u * inverse_length, v * inverse_length, inverse_length], -1))
+
+
+def _compute_rays(K: Array, width: int, height: int) -> Float32:
+    """(h, w, 3) the points at depth 1 that the pixels' middles show, in the camera's frame."""
+    u = ((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]).astype(np.float32)
+    v = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]).astype(np.float32)
+    across, down = np.meshgrid(u, v)
+    return np.stack([across, down, np.ones_like(across)], -1)

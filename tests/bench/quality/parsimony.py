@@ -58,7 +58,9 @@ class Row:
 def configurations(chosen: int) -> dict[str, ReconstructionConfig]:
     """By method, with `chosen` the size that splatnode chose."""
     ours = preset("balanced")
-    ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
+    ours = replace(
+        ours, optimize=replace(ours.optimize, iterations=ITERATIONS, doubtful_iterations=None, checkpoints=())
+    )
     fine = replace(ours.initialization, max_error=1e-4, min_area_px=1.0)
     by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
     by_pixel = replace(ours, pixelwise=initialization.PixelwiseConfig(), optimize=replace(ours.optimize, control=None))

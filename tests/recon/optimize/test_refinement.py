@@ -18,7 +18,7 @@ from splatnode.recon.optimize import ensemble, fit, regularizers, training
 from splatnode.recon.optimize.fit import Trainer
 from splatnode.recon.optimize.losses import LossChoice, normal
 from splatnode.recon.optimize.regularizers import PseudoView
-from splatnode.recon.optimize.training import LearningRates, RefinementConfig, refine
+from splatnode.recon.optimize.training import LearningRates, RefinementConfig, limit_iterations, refine
 from splatnode.recon.priors import Pointmap
 from splatnode.recon.result.snapshot import SHELL
 from splatnode.recon.scene import Scene, TrainingView, initialization, logit
@@ -120,6 +120,14 @@ def test_a_checkpoint_keeps_what_it_showed(truth):
     means = first.gaussians.means.clone()
     list(shown)
     assert torch.equal(first.gaussians.means, means)
+
+
+@pytest.mark.parametrize(("share", "iterations"), [(0.1, 200), (0.45, 350), (0.8, 500), (None, 500)])
+def test_a_scene_of_which_views_confirm_little_gets_fewer_iterations(truth, share, iterations):
+    scene = replace(truth, views=tuple(replace(view, consistent_depth=share) for view in truth.views))
+    assert limit_iterations(plain(iterations=500, doubtful_iterations=200), scene).iterations == iterations
+    assert limit_iterations(plain(iterations=500), scene).iterations == 500
+    assert limit_iterations(plain(iterations=150, doubtful_iterations=200), scene).iterations == 150
 
 
 def test_no_iterations_give_the_start(truth):

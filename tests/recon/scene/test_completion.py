@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from splatnode.recon.priors import Pointmap
-from splatnode.recon.scene.background import DepthCompletionConfig, complete, smooth_depth
+from splatnode.recon.scene.background import (
+    DepthCompletionConfig,
+    _leave_cameras,
+    complete,
+    smooth_depth,
+)
 from tests.support.synthetic import plane_pointmap, without
 
 WIDTH, HEIGHT = 64, 48
@@ -119,6 +124,28 @@ def test_the_background_is_taken_where_nothing_nearer_is_possible():
     hole = holed.depth == 0
     filled, _ = complete([holed, beyond], [GREY, GREY], DepthCompletionConfig(background_depth=3.0))
     np.testing.assert_allclose(filled.depth[hole], 6.0, rtol=1e-5)
+
+
+def test_the_background_lies_outside_the_sphere_around_the_cameras():
+    """Cameras .9 apart, a sphere of 50 times their distance from their middle, and rays that nearly go straight out."""
+    holed, beyond = contradicted()
+    hole = holed.depth == 0
+    config = DepthCompletionConfig(background_depth=3.0, surround=50.0)
+    filled, _ = complete([holed, beyond], [GREY, GREY], config)
+    points = filled.points @ filled.T_world_camera[:3, :3].T + filled.T_world_camera[:3, 3]
+    np.testing.assert_allclose(np.linalg.norm(points[hole] - [0.45, 0.0, 0.0], axis=1), 0.45 * 50.0, rtol=1e-4)
+
+
+def test_of_cameras_that_look_at_each_other_it_lies_behind_the_other():
+    opposite = np.diag([-1.0, 1.0, -1.0, 1.0])
+    opposite[2, 3] = 4.0
+    both = [wall(), replace(wall(), T_world_camera=opposite, frame_id=1)]
+    assert all(depth.min() > 4.0 for depth in _leave_cameras(both, DepthCompletionConfig().surround))
+
+
+def test_cameras_beside_each_other_leave_the_background_where_it_was():
+    near = _leave_cameras([wall(), wall(x=0.3)], DepthCompletionConfig().surround)
+    assert max(depth.max() for depth in near) < 1.5 * 2.0
 
 
 def test_a_view_that_knows_nothing_stays_empty():
