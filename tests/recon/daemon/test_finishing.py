@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,14 +23,16 @@ from tests.support.synthetic import photographs
 class Work:
     """What finishing needs of an IncrementalReconstruction."""
 
-    initial_scene: str = "initial_scene"
+    initial_scene: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(views=()))
     asked: list[training.RefinementConfig] = field(default_factory=list)
 
     def rebuild(self, run: RunContext) -> None:
         run.pause()
 
-    def refine(self, scene: str, steps: training.RefinementConfig, run: RunContext) -> Iterator[SceneWithVerdict]:
-        assert scene == self.initial_scene
+    def refine(
+        self, scene: SimpleNamespace, steps: training.RefinementConfig, run: RunContext
+    ) -> Iterator[SceneWithVerdict]:
+        assert scene is self.initial_scene
         self.asked.append(steps)
         for _ in range(steps.steps):
             run.pause()
@@ -58,6 +61,12 @@ def test_its_refinement_is_that_of_photographs_that_are_all_at_hand(name):
     assert len(list(submap.refine(work, PRESETS[name], BACKGROUND))) == 1
     # No checkpoint more: before one that comes early a scene would not start with soft Gaussians.
     assert work.asked == [PRESETS[name].optimize]
+
+
+def test_a_scene_of_which_views_confirm_little_is_refined_in_fewer_steps_live_too():
+    work = Work(SimpleNamespace(views=(SimpleNamespace(consistent_depth=0.1),)))
+    list(submap.refine(work, PRESETS["balanced"], BACKGROUND))
+    assert [steps.iterations for steps in work.asked] == [200]
 
 
 def test_it_can_be_abandoned_every_few_steps():
