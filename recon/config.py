@@ -122,15 +122,15 @@ class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
 PRESETS: dict[str, ReconstructionConfig] = {
     "preview": ReconstructionConfig(
-        size=384, optimize=training.RefinementConfig(half_resolution_share=0.25, iterations=150)
+        size=384, optimize=msgspec.structs.replace(BALANCED, half_resolution_share=0.25, iterations=150)
     ),
-    "fast": ReconstructionConfig(optimize=training.RefinementConfig(iterations=200)),
+    "fast": ReconstructionConfig(optimize=msgspec.structs.replace(BALANCED, iterations=200)),
     "balanced": ReconstructionConfig(),
     # Two scenes and one that agrees with both. For texture: two thirds more Gaussians, and LPIPS where its weights are
     "quality": ReconstructionConfig(
         initialization=initialization.GaussianInitializationConfig(max_error=0.0009),
-        optimize=training.RefinementConfig(
-            doubtful_iterations=200,
+        optimize=msgspec.structs.replace(
+            BALANCED,
             checkpoints=(150, 500),
             ensemble=ensemble.EnsembleConfig(members=2),
             perceptual=photometric_losses.PerceptualLossConfig(weight=0.08, start=0.0, every=2),
