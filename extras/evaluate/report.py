@@ -596,7 +596,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def _format_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
-    """The rows with their seconds and regions as columns of their own; empty where not measured."""
+    """The rows with their seconds, regions and exposures as columns of their own; empty where not measured."""
     flat = []
     for record in records:
         seconds = {f"seconds_{stage}": value for stage, value in record["seconds"].items()}
@@ -605,8 +605,13 @@ def _format_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
             for region, scores in record["regions"].items()
             for measure, value in scores.items()
         }
-        plain = {name: value for name, value in record.items() if name not in ("seconds", "regions")}
-        flat.append(plain | seconds | regions)
+        exposures = {
+            f"{exposure}_{measure}": value
+            for exposure, scores in record["exposures"].items()
+            for measure, value in scores.items()
+        }
+        plain = {name: value for name, value in record.items() if name not in ("seconds", "regions", "exposures")}
+        flat.append(plain | seconds | regions | exposures)
     text = io.StringIO()
     columns = dict.fromkeys(name for row in flat for name in row)
     writer = csv.DictWriter(text, list(columns), lineterminator="\n")

@@ -6,6 +6,7 @@ Both compare a render with a TrainingImage, the photograph at the resolution of 
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -25,7 +26,7 @@ from splatnode.recon import rasterize
 from splatnode.recon.core import library
 from splatnode.recon.networks.lpips import MIN_SIDE, Lpips, load_lpips
 from splatnode.recon.optimize.losses import Schedule
-from splatnode.recon.scene import TrainingView
+from splatnode.recon.scene import Exposure, TrainingView
 
 # Perceptual distance of two images: LPIPS where its weights are present, else image gradients over several scales.
 
@@ -402,7 +403,10 @@ def perceptual_loss(
 # TrainingImage: the photograph of a view at the resolution at which its render is compared with it.
 
 _PROCESSOR = torch.device("cpu")
-_PRIOR = 0.1  # weight of a gain of 1 against what a render and its photograph say, of what exposure is left
+# Weight of a gain of 1 against what a render and its photograph say, of what is left of an exposure that was taken out:
+# of one by a factor of 2. The share of an exposure that is no gain is much the same, so the weight is its square's
+# reciprocal; of a small one nothing is left.
+_PRIOR = 0.1
 _WHOLLY_SHOWN = 1e-3  # tolerance on the share of a pixel that shows the scene, above the rounding of the resize
 
 
@@ -427,7 +431,7 @@ class _ExposureCompensatedLoss:
     loss: Callable[[Tensor], Tensor]
     target: Tensor  # (height, width, 3) the photograph
     told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
-    prior: Tensor  # (3,) as much as _PRIOR of the photograph, squared
+    prior: Tensor  # (3,) as much as the weight of a gain of 1 of the photograph, squared
 
     def __call__(self, rgb: Tensor) -> Tensor:
         rgb = rgb * self._gains(rgb.detach())
@@ -476,9 +480,15 @@ def make_training_image(
         share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         told = told & torch.from_numpy(share == 0).to(device)
     known = target * told
-    prior = _PRIOR * (known * known).sum((0, 1))
+    prior = _weigh_prior(view.exposure) * (known * known).sum((0, 1))
     exposed = partial(_ExposureCompensatedLoss, target=target, told=told, prior=prior)
     return TrainingImage(K, width, height, exposed(loss), perceptual and exposed(perceptual))
+
+
+def _weigh_prior(exposure: Exposure) -> float:
+    """Returns the weight of a gain of 1, where `exposure` was taken out."""
+    taken_out = max(exposure.falloff, *(abs(math.log(gain)) for gain in exposure.gains))
+    return _PRIOR * (math.log(2.0) / max(taken_out, 1e-3)) ** 2
 
 
 def scale_intrinsics(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:
