@@ -40,8 +40,8 @@ def relative_illumination(falloff: float, width: int, height: int) -> Float32:
 
 MEAN_SIGMA = 1.0  # of the prior of the views' common log gain
 AMPLITUDES = (0.01, 0.03, 0.1, 0.3)  # standard deviations of the smooth part of a log gain
-OWN_SHARES = (0.0, 0.5)  # of an amplitude: the standard deviation of each view's own part
-REACHES = (1.0, 2.0, 4.0, 8.0, np.inf)  # lengths, in spacings of the views, over which the smooth part changes
+OWN_SHARES = (0.0, 0.3)  # of an amplitude: the standard deviation of each view's own part
+REACHES = (2.0, 4.0, 8.0, np.inf)  # lengths, in spacings of the views, over which the smooth part changes
 MIN_SPACING = (1e-2, np.radians(0.5), 0.05)  # of positions (the scene's unit), directions and times (s)
 LEAST_SIGMA = 2e-3  # of a view's log gain
 MAX_VIEWS = 32  # nearest to the novel view, by which it is told

@@ -257,7 +257,7 @@ class ExposureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Share from which on they are not left, however unsure they are
     most: Internal[Annotated[float, Meta(ge=0)]] = 0.3
     # A lens whose corners get more than exp(-least_falloff) of the light in the middle keeps its vignetting
-    least_falloff: Internal[Annotated[float, Meta(ge=0)]] = 0.5
+    least_falloff: Internal[Annotated[float, Meta(ge=0)]] = 0.1
 
 
 def estimate_exposures(
