@@ -259,7 +259,8 @@ def fit_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
 
 # The gains of a scene's training views, which tell those of a held-out one: the same for all methods. Those that were
 # taken out of the photographs are published; of a method that was trained on photographs as they are, what is left
-# between each photograph and the scene from its camera is measured.
+# between each photograph and the scene from its camera is measured. Photographs are taken to be in the order in which
+# they were taken, so that a gain is interpolated in that, too.
 
 MIN_GAIN_SIGMAS = 4.0  # of a measured log gain: where none is above, all are 1
 
@@ -268,14 +269,16 @@ def find_view_gains(
     appearance: Appearance, snapshot: Snapshot, scene: EvaluationScene, falloff: float, longer_side: int
 ) -> ViewGains:
     """Finds the gains of the training views over the scene: as published, else measured."""
-    if snapshot.gains or not snapshot.cameras:
-        return collect_view_gains(snapshot.cameras, snapshot.gains, snapshot.gain_sigmas)
     cameras = [camera for camera in snapshot.cameras if camera.name in scene.paths]
+    order = list(scene.paths)
+    times = np.array([order.index(camera.name) for camera in cameras], np.float64)
+    if snapshot.gains:
+        return replace(collect_view_gains(cameras, snapshot.gains, snapshot.gain_sigmas), times_s=times)
     measured = [_measure_view_gain(appearance, camera, scene, falloff, longer_side) for camera in cameras]
     logs, sigmas = (np.array(each).reshape(-1, 3) for each in zip(*measured, strict=True))
     if not (np.abs(logs) > MIN_GAIN_SIGMAS * sigmas).any():
         logs = np.zeros_like(logs)
-    return replace(collect_view_gains(cameras, {}, {}), logs=logs, sigmas=sigmas)
+    return replace(collect_view_gains(cameras, {}, {}), logs=logs, sigmas=sigmas, times_s=times)
 
 
 def _measure_view_gain(
@@ -623,9 +626,9 @@ def _score_test_views(
         return []
     true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
     true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
-    scores = []
+    scores, order = [], list(scene.paths)
     for view in load_held_out_views(scene, split, cameras[0].lens, settings.longer_side):
-        name, whole, used = view.name, view.photograph, view.used
+        name, whole, used, place = view.name, view.photograph, view.used, float(order.index(view.name))
         rows, columns = view.shown
         height, width = whole.shape[:2]
         whole_K = average_intrinsics(cameras, width, height)
@@ -644,13 +647,13 @@ def _score_test_views(
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
             target = target / fit_gains(target, begun, used[rows, columns])
         elif gains.logs.any():  # what is darker in the photograph is so in the render
-            target = target / torch.from_numpy(interpolate_gains(gains, start).gains).float()
+            target = target / torch.from_numpy(interpolate_gains(gains, start, place).gains).float()
         T_world_camera = find_test_pose(
             appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.comparison_mask
         ).T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
-        exposures = _score_exposures(with_rim, view, networks, interpolate_gains(gains, T_world_camera))
+        exposures = _score_exposures(with_rim, view, networks, interpolate_gains(gains, T_world_camera, place))
         if settings.best_gain:
             with_rim = with_rim * fit_gains(truth, with_rim[rows, columns], used[rows, columns])
         with_rim = with_rim.clamp(0.0, 1.0)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import Stamp
 from splatnode.recon.result.snapshot import CameraEstimate
 
 Array = npt.NDArray[np.float64]
@@ -42,6 +41,7 @@ MEAN_SIGMA = 1.0  # of the prior of the views' common log gain
 AMPLITUDES = (0.01, 0.03, 0.1, 0.3)  # standard deviations of the smooth part of a log gain
 OWN_SHARES = (0.0, 0.3)  # of an amplitude: the standard deviation of each view's own part
 REACHES = (2.0, 4.0, 8.0, np.inf)  # lengths, in spacings of the views, over which the smooth part changes
+TIME_ALONE = 0.8  # probability that gains change with time alone, where it is known
 MIN_SPACING = (1e-2, np.radians(0.5), 0.05)  # of positions (the scene's unit), directions and times (s)
 LEAST_SIGMA = 2e-3  # of a view's log gain
 MAX_VIEWS = 32  # nearest to the novel view, by which it is told
@@ -88,16 +88,15 @@ def collect_view_gains(
     return ViewGains(np.array([camera.T_world_camera for camera in cameras]).reshape(-1, 4, 4), logs, known, times)
 
 
-def interpolate_gains(known: ViewGains, T_world_camera: Array, captured_at: Stamp | None = None) -> InterpolatedGains:
-    """Interpolates the gains of a view at `T_world_camera` (4, 4), taken at `captured_at` on the views' clock.
+def interpolate_gains(known: ViewGains, T_world_camera: Array, time_s: float | None = None) -> InterpolatedGains:
+    """Interpolates the gains of a view at `T_world_camera` (4, 4), taken at `time_s` on the views' clock.
 
     Where no view differs from the scene, neither does this one; far from all views it has their mean, and the sigma of
     what it may be. Raises ValueError without views.
     """
     if not len(known.logs):
         raise ValueError("gains of at least one view must be known to interpolate them")
-    time = captured_at.ns / 1e9 if captured_at is not None else None
-    distances = _measure_distances(known, T_world_camera, time)
+    distances = _measure_distances(known, T_world_camera, time_s)
     nearest = np.sort(np.argsort(sum(each[-1, :-1] ** 2 for each in distances), kind="stable")[:MAX_VIEWS])
     rows = np.append(nearest, -1)
     distances = [each[np.ix_(rows, rows)] for each in distances]
@@ -111,14 +110,14 @@ def interpolate_gains(known: ViewGains, T_world_camera: Array, captured_at: Stam
     return InterpolatedGains(mean, np.sqrt(spread))
 
 
-def _measure_distances(known: ViewGains, T_world_camera: Array, time: float | None) -> list[Array]:
+def _measure_distances(known: ViewGains, T_world_camera: Array, time_s: float | None) -> list[Array]:
     """Measures distances (V + 1, V + 1) of positions, directions and times, in spacings; the novel view is last."""
     Ts = np.concatenate([known.Ts_world_camera, np.asarray(T_world_camera, np.float64)[None]])
     apart = np.linalg.norm(Ts[:, None, :3, 3] - Ts[:, :3, 3], axis=-1)
-    cosines = (np.einsum("iab,jab->ij", Ts[:, :3, :3], Ts[:, :3, :3]) - 1.0) / 2.0
-    found = [apart, np.arccos(np.clip(cosines, -1.0, 1.0))]
-    if known.times_s is not None and time is not None:
-        times = np.append(known.times_s, time)
+    turned = Ts[:, None, :3, :3] - Ts[:, :3, :3]  # of norm sqrt(8) sin(angle / 2): a kernel of angles may be none
+    found = [apart, np.linalg.norm(turned, axis=(-2, -1)) / np.sqrt(2.0)]
+    if known.times_s is not None and time_s is not None:
+        times = np.append(known.times_s, time_s)
         found.append(np.abs(times[:, None] - times))
     return [each / _find_spacing(each[:-1, :-1], least) for each, least in zip(found, MIN_SPACING, strict=False)]
 
@@ -131,14 +130,16 @@ def _find_spacing(distances: Array, least: float) -> float:
 
 
 def _predict_all(distances: Sequence[Array], logs: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """Predicts the novel view by each of H choices: means (H, 3), variances (H,), and log marginal likelihoods (H,).
+    """Predicts the novel view by each of H choices: means (H, 3), variances (H,), and log posterior weights (H,).
 
     The likelihood is the mean over the channels: what they do is much alike.
     """
-    kernels = []
+    kernels, priors = [], []
     for reaches in itertools.product(REACHES, repeat=len(distances)):
         if not np.isfinite(reaches).any():
             continue
+        by_time = len(distances) > 2 and not np.isfinite(reaches[:2]).any()
+        priors.append(TIME_ALONE / (len(REACHES) - 1) if by_time else (1.0 - TIME_ALONE) / len(REACHES) ** 3)
         squared = sum((each / reach) ** 2 for each, reach in zip(distances, reaches, strict=True))
         scaled = np.sqrt(3.0 * squared)
         kernels.append((1.0 + scaled) * np.exp(-scaled))  # Matern, 3/2
@@ -155,4 +156,4 @@ def _predict_all(distances: Sequence[Array], logs: Array, sigma: Array) -> tuple
     variances = smooth[:, -1, -1] - np.einsum("hv,hv->h", beside, solved[:, :, 3]) + own
     fit = np.einsum("vc,hvc->h", logs, solved[:, :, :3]) / logs.shape[1]
     evidence = -0.5 * fit - np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
-    return means, np.maximum(variances, 0.0), evidence
+    return means, np.maximum(variances, 0.0), evidence + np.tile(np.log(priors), len(choices))

@@ -272,7 +272,13 @@ def _interpolate_exposure(
         return None, 0.0
     known = collect_view_gains(snapshot.cameras, snapshot.gains, snapshot.gain_sigmas)
     falloffs = [snapshot.falloffs.get(camera.name, 0.0) for camera in snapshot.cameras]
-    return interpolate_gains(known, T_world_camera, captured_at), float(np.median(falloffs))
+    time_s = None
+    if captured_at is not None and known.times_s is not None:
+        clock = snapshot.cameras[0].captured_at.clock if snapshot.cameras[0].captured_at else None
+        if captured_at.clock != clock:
+            raise ValueError(f"captured_at must be on the cameras' clock {clock}, got {captured_at.clock}")
+        time_s = captured_at.ns / 1e9
+    return interpolate_gains(known, T_world_camera, time_s), float(np.median(falloffs))
 
 
 def _matrix(name: str, given: npt.ArrayLike) -> npt.NDArray[np.float64]:

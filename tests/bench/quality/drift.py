@@ -4,7 +4,7 @@ All photographs of a set, training and held-out, get gains that change smoothly 
 from the first to the last in green, by its power of .9 in red and 1.1 in blue, about a mean of 1 (clipped to 8 bits, as
 a camera does). Sets whose own exposure drifts are taken as they are, too. Cameras and depth are found once, of the
 photographs as they were taken, and serve all runs. Each method makes a scene with exposure compensation, as is its
-default; `balanced` also with it off. Renders of held-out views are scored as the scene shows them (raw), with the gains
+default; `balanced-off` is `balanced` without. Renders of held-out views are scored as the scene shows them (raw), with the gains
 that the training views imply (interpolated), and with those that fit each photograph best. Of more than six held-out
 photographs every second one is scored. A file that is there is continued.
 """
@@ -12,6 +12,7 @@ photographs every second one is scored. A file that is there is continued.
 from __future__ import annotations
 
 import json
+import math
 import pickle
 import shlex
 import sys
@@ -36,11 +37,10 @@ from tests.bench.quality.real_sets import last, timed
 
 SETS = ("llff_fern:3", "llff_flower:3", "fountain_p11:6", "tum_fr3_office:6", "castle_p30:12")
 OWN = ("hard_bridge_drone:12", "fox:12")  # whose exposure drifts
-DRIFTS = (1.0, 1.02, 1.15, 1.4)
+DRIFTS, MILD = (1.0, 1.4), (1.02, 1.15)  # of all methods; and of the first alone
 TINTS = np.array([0.9, 1.0, 1.1])  # powers of the drift in red, green and blue
-OFF = "balanced, off"
+OFF = "balanced-off"
 METHODS = (REFERENCE, OFF, "mcmc+fill")
-RIVAL_DRIFTS = (1.0, 1.4)  # of methods but the first
 SETTINGS = Settings(alignment_steps=30)
 MAX_TESTS = 6  # held-out photographs that are scored: every second one of a set that has more
 
@@ -56,7 +56,8 @@ class Row:
     ssim: float | None
     lpips: float | None
     exposures: dict[str, ExposureScore]  # interpolated, best_gain
-    gain_range: float  # largest over smallest gain that was taken out of the training photographs
+    gain_range: float  # largest over smallest gain that was taken out of the training photographs; 1: none was
+    vignetting: float  # share of the light in the corners that their lens took; 0: none was found
     num_gaussians: int | None
     seconds: float  # of the processor, from depth on
 
@@ -117,6 +118,7 @@ def measure(case: Case, start: bytes, drift: float, method: str, chosen: int, sc
     return Row(
         *(case.scene.name, len(case.split.train), drift, method, row.verdict, row.psnr, row.ssim, row.lpips_alex),
         *(dict(row.exposures), round(float((gains.max(0) / gains.min(0)).max()), 3)),
+        round(1.0 - math.exp(-max(snapshot.falloffs.values(), default=0.0)), 3),
         *(row.num_gaussians, round(seconds, 1)),
     )
 
@@ -131,32 +133,40 @@ def in_words(row: Row) -> str:
 
 
 def planned(sets: list[str], methods: tuple[str, ...]) -> list[tuple[str, float, str]]:
-    """Set, drift and method of each run: all of the first method before those of the others."""
+    """Set, drift and method of each run; those of mild drifts come last."""
     found = []
-    for method in methods:
-        drifts = DRIFTS if method == REFERENCE else RIVAL_DRIFTS
-        found += [(each, drift, method) for each in sets for drift in ((1.0,) if each in OWN else drifts)]
+    for method, drifts in (*((method, DRIFTS) for method in methods), *((each, MILD) for each in methods[:1])):
+        for each in sets:
+            own = drifts if each not in OWN else drifts[:1] if drifts is DRIFTS else ()
+            found += [(each, drift, method) for drift in own]
     return found
 
 
 def main() -> None:
     parser = parser_of(__doc__, (*SETS, *OWN))
     parser.add_argument("--methods", type=names, default=METHODS)
+    parser.add_argument("--drifts", type=names, default=tuple(map(str, (*DRIFTS, *MILD))), help="of the runs")
     arguments, folders, scoring = parsed(parser)
     scoring = replace(scoring, settings=SETTINGS)
     known = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
     command = shlex.join(["python", "-m", "tests.bench", "drift", *sys.argv[1:]])
     for each, drift, method in planned(arguments.cases or [*SETS, *OWN], tuple(arguments.methods)):
+        if str(drift) not in arguments.drifts:
+            continue
         name, _, views = each.partition(":")
         same = [row for row in known if (row["scene"], row["views"], row["drift"]) == (name, int(views), drift)]
         if any(row["method"] == method for row in same):
             continue
         begun = time.monotonic()
         case = load_case(each, folders)
-        chosen = next((row["num_gaussians"] for row in same if row["method"] == REFERENCE), None)
-        row = measure(case, case.start(folders), drift, method, chosen or 1, scoring)
-        say(f"{in_words(row)} ({time.monotonic() - begun:.0f} s in all)")
-        known.append(asdict(row))
+        reference = next((row for row in same if row["method"] == REFERENCE), None)
+        if method == OFF and reference and reference["gain_range"] == 1.0 and not reference["vignetting"]:
+            known.append(reference | {"method": OFF})  # nothing was taken out
+        else:
+            chosen = reference["num_gaussians"] if reference else 1
+            row = measure(case, case.start(folders), drift, method, chosen, scoring)
+            say(f"{in_words(row)} ({time.monotonic() - begun:.0f} s in all)")
+            known.append(asdict(row))
         arguments.out.write_text(json.dumps({"command": command, "rows": known}, indent=1) + "\n")
 
 

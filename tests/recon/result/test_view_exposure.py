@@ -86,7 +86,7 @@ def test_time_tells_apart_what_poses_do_not():
     gains = {f"{time}": (float(np.exp(0.1 * time - 0.3)),) * 3 for time in times}
     sigmas = {name: (0.005,) * 3 for name in gains}
     known = collect_view_gains(cameras, gains, sigmas)
-    timed = interpolate_gains(known, pose(0.5), Stamp(round(4.5e9), Clock.UTC))
+    timed = interpolate_gains(known, pose(0.5), 4.5)
     untimed = interpolate_gains(known, pose(0.5))
     assert timed.logs == pytest.approx(0.15, abs=0.03) and (timed.sigmas < untimed.sigmas).all()
     unknown = collect_view_gains([*cameras, camera("8", 0.0, None)], gains, sigmas)
