@@ -290,7 +290,7 @@ def _measure_view_gain(
     height, width = photograph.shape[:2]
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     light = relative_illumination(falloff, width, height)[..., None]
-    render = 255.0 * light * appearance.render(camera.T_world_camera, K, width, height).cpu().numpy()
+    render = 255.0 * light * appearance.render(camera.T_world_camera, K, width, height).detach().cpu().numpy()
     used = resize_mask(mask, height, width) & keyframes.valid_masks([photograph])[0]
     return measure_log_gain(photograph, render, used)
 

@@ -4,9 +4,9 @@ All photographs of a set, training and held-out, get gains that change smoothly 
 from the first to the last in green, by its power of .9 in red and 1.1 in blue, about a mean of 1 (clipped to 8 bits, as
 a camera does). Sets whose own exposure drifts are taken as they are, too. Cameras and depth are found once, of the
 photographs as they were taken, and serve all runs. Each method makes a scene with exposure compensation, as is its
-default; `balanced-off` is `balanced` without. Renders of held-out views are scored as the scene shows them (raw), with the gains
-that the training views imply (interpolated), and with those that fit each photograph best. Of more than six held-out
-photographs every second one is scored. A file that is there is continued.
+default; `balanced-off` is `balanced` without. Renders of held-out views are scored as the scene shows them (raw), with
+the gains that the training views imply (interpolated), and with those that fit each photograph best. Of more than six
+held-out photographs every second one is scored. A file that is there is continued.
 """
 
 from __future__ import annotations
