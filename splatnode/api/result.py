@@ -274,9 +274,9 @@ def _interpolate_exposure(
     falloffs = [snapshot.falloffs.get(camera.name, 0.0) for camera in snapshot.cameras]
     time_s = None
     if captured_at is not None and known.times_s is not None:
-        clock = snapshot.cameras[0].captured_at.clock if snapshot.cameras[0].captured_at else None
+        clock = next(camera.captured_at.clock for camera in snapshot.cameras if camera.captured_at)
         if captured_at.clock != clock:
-            raise ValueError(f"captured_at must be on the cameras' clock {clock}, got {captured_at.clock}")
+            raise ValueError(f"captured_at must be on the cameras' clock {clock.name}, got {captured_at.clock.name}")
         time_s = captured_at.ns / 1e9
     return interpolate_gains(known, T_world_camera, time_s), float(np.median(falloffs))
 

@@ -10,9 +10,10 @@ import pytest
 
 import splatnode
 from splatnode.api.result import result_of
+from splatnode.capture.frame import Clock, Stamp
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.verdict import compute_axes
-from tests.support.exported import make_snapshot
+from tests.support.exported import make_snapshot, stamped
 
 
 def same_rgb(a: np.ndarray, b: np.ndarray) -> float:
@@ -77,6 +78,20 @@ def test_a_view_has_the_exposure_that_the_photographs_around_it_imply_or_that_of
         assert corners[1] == pytest.approx(0.7 * shown.gains.mean() * corners[0], rel=0.1)
     with pytest.raises(ValueError, match="exposure must be 'interpolated' or 'scene', got 'auto'"):
         exposed.render(*asked, exposure="auto")
+
+
+def test_the_exposure_of_a_view_is_interpolated_in_time_where_it_is_given():
+    snapshot = stamped(make_snapshot(), first_ns=10**9)
+    names = [camera.name for camera in snapshot.cameras]
+    gains = dict(zip(names, ((0.8,) * 3, (1.25,) * 3), strict=True))
+    shown = result_of(replace(snapshot, gains=gains), None)  # pyright: ignore
+    first = shown.cameras[0]
+    asked = first.T_world_camera, first.K, (64, 48)
+    assert shown.render(*asked, captured_at=Stamp(10**9, Clock.UTC)).gains == pytest.approx(0.8, rel=0.08)
+    later = shown.render(*asked, captured_at=Stamp(2 * 10**9, Clock.UTC))
+    assert (later.gains > 1.0).all() and later.gain_sigmas.min() > shown.render(*asked).gain_sigmas.max()
+    with pytest.raises(ValueError, match="captured_at must be on the cameras' clock UTC, got FILE"):
+        shown.render(*asked, captured_at=Stamp(10**9, Clock.FILE))
 
 
 def test_gains_that_cannot_be_are_told(result, tmp_path):
