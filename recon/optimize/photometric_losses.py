@@ -432,12 +432,15 @@ class _ExposureCompensatedLoss:
     loss: Callable[[Tensor], Tensor]
     target: Tensor  # (height, width, 3) the photograph
     told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
+    cap: (
+        Tensor | None
+    )  # (height, width, 3) of the render: the photograph where it is saturated, else infinite; None: all
     prior: Tensor | None  # (3,) as much as the weight of a gain of 1 of the photograph, squared; None: nothing is left
 
     def __call__(self, rgb: Tensor) -> Tensor:
         if self.prior is not None:
             rgb = rgb * self._gains(rgb.detach(), self.prior)
-        return self.loss(torch.where(self.told, rgb, torch.minimum(rgb, self.target)))
+        return self.loss(rgb if self.cap is None else torch.minimum(rgb, self.cap))
 
     def _gains(self, rgb: Tensor, prior: Tensor) -> Tensor:
         """(3,) in closed form; 1 for a channel of which the photograph tells nothing but black."""
@@ -479,9 +482,11 @@ def make_training_image(
     if view.exposure is None:
         return TrainingImage(K, width, height, loss, perceptual)
     told = torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)
+    cap = None
     if view.exposure.saturated is not None:
         share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         told = told & torch.from_numpy(share == 0).to(device)
+        cap = torch.where(told, torch.inf, target)
     taken_out = max(view.exposure.falloff / 2.0, *(abs(math.log(gain / headroom)) for gain in view.exposure.gains))
     if taken_out < _MIN_TONED and view.exposure.saturated is None:
         return TrainingImage(K, width, height, loss, perceptual)
@@ -489,7 +494,7 @@ def make_training_image(
     if taken_out >= _MIN_TONED:
         known = target * told
         prior = _PRIOR * (math.log(2.0) / taken_out) ** 2 * (known * known).sum((0, 1))
-    exposed = partial(_ExposureCompensatedLoss, target=target, told=told, prior=prior)
+    exposed = partial(_ExposureCompensatedLoss, target=target, told=told, cap=cap, prior=prior)
     return TrainingImage(K, width, height, exposed(loss), perceptual and exposed(perceptual))
 
 
