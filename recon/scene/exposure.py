@@ -52,7 +52,7 @@ def solve_robust(factors: Array, values: Array, sigmas: Array, priors: Array) ->
         misfit = np.abs(factors @ result - values) / sigmas
         weights = np.minimum(1.0, _HUBER / np.maximum(misfit, 1e-9))
     contradiction = ((weights * misfit**2).sum() + ((result / priors) ** 2).sum()) / max(len(values), 1)
-    return result, max(contradiction, 1.0) * np.linalg.inv(information)
+    return result, np.asarray(max(contradiction, 1.0) * np.linalg.inv(information), np.float64)
 
 
 # What photographs show alike: pixels of one surface in two of them, by depth that both agree on, and their colours.

@@ -352,6 +352,7 @@ def test_held_out_views_are_scored_with_the_gains_that_training_views_imply_and_
     published, measured = score(told, folder), score(perfect_snapshot(), folder)  # whose photographs nobody changed
     for row in (published, measured):
         interpolated, best = row.exposures["interpolated"], row.exposures["best_gain"]
+        assert row.psnr is not None and row.ssim is not None
         assert row.psnr < 30 and interpolated.psnr > row.psnr + 8 and best.psnr > interpolated.psnr - 0.1
         assert interpolated.gain_error_pct < 2.0 and best.gain_error_pct == 0.0
         assert interpolated.ssim > row.ssim
