@@ -440,7 +440,7 @@ class _ExposureCompensatedLoss:
     def __call__(self, rgb: Tensor) -> Tensor:
         if self.prior is not None:
             rgb = rgb * self._gains(rgb.detach(), self.prior)
-        return self.loss(rgb if self.cap is None else torch.minimum(rgb, self.cap))
+        return self.loss(rgb if self.cap is None else rgb.clamp(max=self.cap))
 
     def _gains(self, rgb: Tensor, prior: Tensor) -> Tensor:
         """(3,) in closed form; 1 for a channel of which the photograph tells nothing but black."""
