@@ -309,6 +309,7 @@ def snapshot(
         masked={name: view.masked for name, view in conclusion.views.items() if view.masked is not None},
         moving=_moving(conclusion, scene),
         gains=scene.gains() if scene else {},
+        gain_sigmas=scene.gain_sigmas() if scene else {},
         falloffs=_falloffs(scene) if scene else {},
     )
     return replace(made, verdict=append_consistent_depth(verdict, made.consistent_depth, config.consistent_depth))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -38,7 +38,14 @@ from splatnode.recon.keyframes import resize_image, resize_mask
 from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
-from splatnode.recon.scene.exposure import SATURATED, relative_illumination
+from splatnode.recon.result.view_exposure import (
+    InterpolatedGains,
+    ViewGains,
+    collect_view_gains,
+    interpolate_gains,
+    relative_illumination,
+)
+from splatnode.recon.scene.exposure import SATURATED, measure_log_gain
 
 Array = npt.NDArray[np.float64]
 
@@ -250,6 +257,44 @@ def fit_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
     return torch.where(squares > 0, fitting, 1.0).clamp_min(1e-3)
 
 
+# The gains of a scene's training views, which tell those of a held-out one: the same for all methods. Those that were
+# taken out of the photographs are published; of a method that was trained on photographs as they are, what is left
+# between each photograph and the scene from its camera is measured. Photographs are taken to be in the order in which
+# they were taken, so that a gain is interpolated in that, too.
+
+MIN_GAIN_SIGMAS = 4.0  # of a measured log gain: where none is above, all are 1
+
+
+def find_view_gains(
+    appearance: Appearance, snapshot: Snapshot, scene: EvaluationScene, falloff: float, longer_side: int
+) -> ViewGains:
+    """Finds the gains of the training views over the scene: as published, else measured."""
+    cameras = [camera for camera in snapshot.cameras if camera.name in scene.paths]
+    order = list(scene.paths)
+    times = np.array([order.index(camera.name) for camera in cameras], np.float64)
+    if snapshot.gains:
+        return replace(collect_view_gains(cameras, snapshot.gains, snapshot.gain_sigmas), times_s=times)
+    measured = [_measure_view_gain(appearance, camera, scene, falloff, longer_side) for camera in cameras]
+    logs, sigmas = (np.array(each).reshape(-1, 3) for each in zip(*measured, strict=True))
+    if not (np.abs(logs) > MIN_GAIN_SIGMAS * sigmas).any():
+        logs = np.zeros_like(logs)
+    return replace(collect_view_gains(cameras, {}, {}), logs=logs, sigmas=sigmas, times_s=times)
+
+
+def _measure_view_gain(
+    appearance: Appearance, camera: CameraEstimate, scene: EvaluationScene, falloff: float, longer_side: int
+) -> tuple[Array, Array]:
+    """Measures the log gain (3,) of a training photograph over what the scene shows from its camera; and its sigma."""
+    image, mask = undistort_view(camera.lens, *scene.load_masked_image(camera.name))
+    photograph = resize_image(image, longer_side)
+    height, width = photograph.shape[:2]
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    light = relative_illumination(falloff, width, height)[..., None]
+    render = 255.0 * light * appearance.render(camera.T_world_camera, K, width, height).detach().cpu().numpy()
+    used = resize_mask(mask, height, width) & keyframes.valid_masks([photograph])[0]
+    return measure_log_gain(photograph, render, used)
+
+
 # The networks that tell how alike two images look; without their weights nothing is measured.
 
 
@@ -423,6 +468,19 @@ class Run:
     peak_rss_mb: float | None
 
 
+EXPOSURES = ("interpolated", "best_gain")  # of renders, beside the scene's own
+
+
+@dataclass(frozen=True)
+class ExposureScore:
+    """Scores of renders with gains: those that the training views imply, or that fit each photograph best."""
+
+    psnr: float  # dB, mean over the test views, as are the next
+    ssim: float
+    lpips_alex: float | None
+    gain_error_pct: float  # root mean square of the gains' difference from the best, over views and channels
+
+
 @dataclass(frozen=True, kw_only=True)
 class Row:
     """One line of bench.json. What was not measured is None."""
@@ -453,6 +511,7 @@ class Row:
     num_cameras: int | None = None  # of the training views, those with an estimated pose
     scene_bytes: int | None = None
     regions: Mapping[str, RegionScore] = field(default_factory=dict)  # by regions.REGIONS; empty: not measured
+    exposures: Mapping[str, ExposureScore] = field(default_factory=dict)  # by EXPOSURES; empty: not measured
     verdict: str  # a verdict's code; FAILED where the run ended without a result
     error: str | None = None  # why it did
 
@@ -494,7 +553,10 @@ def evaluate(
     found = {} if found is None else found
     cameras = select_one_lens(snapshot.cameras)
     falloff = snapshot.falloffs.get(cameras[0].name, 0.0) if cameras else 0.0
-    seen = appearance, cameras, estimated, falloff
+    gains = None
+    if appearance is not None and len(estimated) >= 2:
+        gains = find_view_gains(appearance, snapshot, scene, falloff, settings.longer_side)
+    seen = appearance, cameras, estimated, falloff, gains
     views = _score_test_views(*seen, scene, split, networks, settings, show, found, shown or {})
     return Row(
         scene=scene.name,
@@ -520,6 +582,7 @@ def evaluate(
         num_cameras=len(snapshot.cameras),
         scene_bytes=0 if appearance is None else appearance.num_bytes,
         regions=compute_region_scores([view.maps for view in views if view.maps is not None]),
+        exposures={kind: _average_exposures([view.exposures[kind] for view in views]) for kind in EXPOSURES if views},
         verdict=snapshot.verdict.code.value,
     )
 
@@ -532,6 +595,7 @@ class _ViewScore:
     lpips_alex: float | None
     lpips_vgg: float | None
     maps: ErrorMaps | None  # None: nothing tells which training photographs show the pixels
+    exposures: Mapping[str, ExposureScore] = field(default_factory=dict)
 
 
 def _score_test_views(
@@ -539,6 +603,7 @@ def _score_test_views(
     cameras: Sequence[CameraEstimate],
     estimated: Sequence[CameraEstimate],
     falloff: float,
+    gains: ViewGains | None,
     scene: EvaluationScene,
     split: Split,
     networks: PerceptualNetworks,
@@ -557,13 +622,13 @@ def _score_test_views(
     photographs is taken out of these, too. Where their vignetting was taken out, renders get it. A view of which masks
     leave nothing is left out.
     """
-    if appearance is None or len(estimated) < 2:
+    if appearance is None or gains is None or len(estimated) < 2:
         return []
     true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
     true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
-    scores = []
+    scores, order = [], list(scene.paths)
     for view in load_held_out_views(scene, split, cameras[0].lens, settings.longer_side):
-        name, whole, used = view.name, view.photograph, view.used
+        name, whole, used, place = view.name, view.photograph, view.used, float(order.index(view.name))
         rows, columns = view.shown
         height, width = whole.shape[:2]
         whole_K = average_intrinsics(cameras, width, height)
@@ -581,18 +646,43 @@ def _score_test_views(
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
             target = target / fit_gains(target, begun, used[rows, columns])
+        elif gains.logs.any():  # what is darker in the photograph is so in the render
+            target = target / torch.from_numpy(interpolate_gains(gains, start, place).gains).float()
         T_world_camera = find_test_pose(
             appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.comparison_mask
         ).T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
+        exposures = _score_exposures(with_rim, view, networks, interpolate_gains(gains, T_world_camera, place))
         if settings.best_gain:
             with_rim = with_rim * fit_gains(truth, with_rim[rows, columns], used[rows, columns])
         with_rim = with_rim.clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
         known = undistort_counts(cameras[0].lens, counts[name]) if name in counts else None
-        scores.append(_score_view(with_rim, whole, used, view.shown, networks, known))
+        own = _score_view(with_rim, whole, used, view.shown, networks, known)
+        scores.append(replace(own, exposures=exposures))
     return scores
+
+
+def _score_exposures(
+    render: Tensor, view: HeldOutView, networks: PerceptualNetworks, interpolated: InterpolatedGains
+) -> dict[str, ExposureScore]:
+    """Scores a render (H, W, 3) in the scene's exposure with each of EXPOSURES."""
+    quick = PerceptualNetworks(networks.alex, None)
+    best = fit_gains(view.photograph[view.shown], render[view.shown], view.used[view.shown])
+    scores = {}
+    for kind, gains in zip(EXPOSURES, (torch.from_numpy(interpolated.gains).to(best), best), strict=True):
+        own = _score_view((gains * render).clamp(0.0, 1.0), view.photograph, view.used, view.shown, quick, None)
+        error = 100.0 * float((gains / best - 1.0).square().mean().sqrt())
+        scores[kind] = ExposureScore(own.psnr, own.ssim, own.lpips_alex, error)
+    return scores
+
+
+def _average_exposures(scores: Sequence[ExposureScore]) -> ExposureScore:
+    perceptual = compute_mean([score.lpips_alex for score in scores])
+    error = math.sqrt(float(np.mean([score.gain_error_pct**2 for score in scores])))
+    psnrs, ssims = ([getattr(score, name) for score in scores] for name in ("psnr", "ssim"))
+    return ExposureScore(float(np.mean(psnrs)), float(np.mean(ssims)), perceptual, error)
 
 
 def _score_view(

@@ -27,7 +27,7 @@ from splatnode.capture.process.text import cell, escape_text
 from splatnode.extras.evaluate import methods as evaluate_methods
 from splatnode.extras.evaluate.dataset import Split, read_json
 from splatnode.extras.evaluate.methods import is_variant
-from splatnode.extras.evaluate.protocol import FAILED, Row, Settings, compute_mean
+from splatnode.extras.evaluate.protocol import EXPOSURES, FAILED, Row, Settings, compute_mean
 from splatnode.extras.jobs import ALONE, Moment, now, others_share
 from splatnode.recon.config import PRESETS
 from splatnode.recon.core import instruction_sets
@@ -211,6 +211,7 @@ def make_tables(rows: Sequence[Row]) -> list[Table]:
         *(Table(f"{n} views", _HEAD, tuple(_format_table_cells(p) for p in overview if p.views == n)) for n in counts),
         *([make_views_table(select_shared_runs(compared))] if compared else []),
         *(make_scene_table([row for row in compared if row.views == n], n) for n in counts),
+        *([make_exposure_table(compared)] if any(row.exposures for row in compared) else []),
         *([make_ablation_table(ends)] if len(compared) < len(ends) else []),
         Table("Runs", _RUN_HEAD, tuple(_format_run_cells(row) for row in ends)),
     ]
@@ -242,6 +243,24 @@ def make_scene_table(ends: Sequence[Row], views: int) -> Table:
             )
             body.append((measure.name, method, *cells))
     return Table(f"Scene by scene, {views} views", ("measure", "method", *scenes), tuple(body))
+
+
+def make_exposure_table(ends: Sequence[Row]) -> Table:
+    """Means as the scenes show held-out views, with the gains that training views imply, and with the best gains."""
+    shared = [row for row in select_shared_runs(ends) if row.exposures]
+    body = []
+    for views, method in sorted({(row.views, row.method) for row in shared}):
+        rows = [row for row in shared if (row.views, row.method) == (views, method)]
+        cells = [str(views), method]
+        for name, digits in (("psnr", 2), ("ssim", 4)):
+            means = [compute_mean([getattr(row, name) for row in rows])]
+            means += [compute_mean([getattr(row.exposures[kind], name) for row in rows]) for kind in EXPOSURES]
+            cells += [format_number(mean, digits) for mean in means]
+        errors = [row.exposures["interpolated"].gain_error_pct for row in rows]
+        body.append((*cells, format_number(compute_mean(errors), 1)))
+    kinds = ("raw", "interpolated gains", "best gains")
+    head = ("views", "method", *(f"{name}, {kind}" for name in ("PSNR", "SSIM") for kind in kinds), "gains off by, %")
+    return Table("Exposure of held-out views", head, tuple(body))
 
 
 def make_ablation_table(ends: Sequence[Row]) -> Table:
@@ -596,7 +615,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def _format_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
-    """The rows with their seconds and regions as columns of their own; empty where not measured."""
+    """The rows with their seconds, regions and exposures as columns of their own; empty where not measured."""
     flat = []
     for record in records:
         seconds = {f"seconds_{stage}": value for stage, value in record["seconds"].items()}
@@ -605,8 +624,13 @@ def _format_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
             for region, scores in record["regions"].items()
             for measure, value in scores.items()
         }
-        plain = {name: value for name, value in record.items() if name not in ("seconds", "regions")}
-        flat.append(plain | seconds | regions)
+        exposures = {
+            f"{exposure}_{measure}": value
+            for exposure, scores in record["exposures"].items()
+            for measure, value in scores.items()
+        }
+        plain = {name: value for name, value in record.items() if name not in ("seconds", "regions", "exposures")}
+        flat.append(plain | seconds | regions | exposures)
     text = io.StringIO()
     columns = dict.fromkeys(name for row in flat for name in row)
     writer = csv.DictWriter(text, list(columns), lineterminator="\n")

@@ -424,6 +424,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     falloffs: list[float] = []  # of each view's lens; empty: none dims its corners
     headroom: float = 1.0
     consistent_depth: list[float | None] = []  # share of each view's pixels; empty: not known of any
+    gain_sigmas: list[tuple[float, float, float] | None] = []  # of the logarithms of `gains`; empty: not known of any
 
 
 def make_graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
@@ -468,7 +469,8 @@ def make_scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt
     gains = [view.exposure and view.exposure.gains for view in scene.views]
     falloffs = [view.exposure.falloff if view.exposure else 0.0 for view in scene.views]
     shares = [view.consistent_depth for view in scene.views]
-    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs, scene.headroom, shares)
+    sigmas = [view.exposure and view.exposure.sigmas for view in scene.views]
+    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs, scene.headroom, shares, sigmas)
     return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
@@ -483,12 +485,13 @@ def parse_scene(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]
     lenses = header.lenses or [None] * len(header.views)
     gains = header.gains or [None] * len(header.views)
     falloffs = header.falloffs or [0.0] * len(header.views)
+    sigmas = header.gain_sigmas or [None] * len(header.views)
     views = tuple(
         _make_view(
             keyframes[name] if lens is None else undistort_keyframe(keyframes[name], lens), own, T_world_camera, K
         )
         for name, lens, own, T_world_camera, K in zip(
-            header.views, lenses, zip(gains, falloffs, strict=True), Ts_world_camera, Ks, strict=True
+            header.views, lenses, zip(gains, falloffs, sigmas, strict=True), Ts_world_camera, Ks, strict=True
         )
     )
     shares = header.consistent_depth or [None] * len(views)
@@ -498,11 +501,11 @@ def parse_scene(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]
 
 def _make_view(
     keyframe: Keyframe,
-    told: tuple[tuple[float, float, float] | None, float],
+    told: tuple[tuple[float, float, float] | None, float, tuple[float, float, float] | None],
     T_world_camera: torch.Tensor,
     K: torch.Tensor,
 ) -> TrainingView:
-    """`told`: the photograph's gains, and its lens's falloff."""
+    """`told`: the photograph's gains, its lens's falloff, and the sigmas of the gains' logarithms."""
     image, exposure = scene_exposure.compensate_image(keyframe.image, *told)
     shown = keyframe.name, keyframe.frame.frame_id, image
     return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, exposure=exposure, lens=keyframe.lens)

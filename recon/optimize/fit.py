@@ -345,7 +345,7 @@ class Trainer:
         measures = (*(self._measure for _ in scene.views), *(None for _ in beside))
         self._images = {
             half: [
-                make_training_image(view, mask, scale, config.ssim_lambda, device, keep=few, measure=measure)
+                make_training_image(view, mask, scale, config.ssim_lambda, device, few, measure, scene.headroom)
                 for view, mask, measure in zip(views, shown, measures, strict=True)
             ]
             for half, scale in _SCALES.items()

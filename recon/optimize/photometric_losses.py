@@ -6,6 +6,7 @@ Both compare a render with a TrainingImage, the photograph at the resolution of 
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -402,7 +403,11 @@ def perceptual_loss(
 # TrainingImage: the photograph of a view at the resolution at which its render is compared with it.
 
 _PROCESSOR = torch.device("cpu")
-_PRIOR = 0.1  # weight of a gain of 1 against what a render and its photograph say, of what exposure is left
+# Weight of a gain of 1 against what a render and its photograph say, of what is left of an exposure by a factor of 2
+# that was taken out. What is left is much the same share of any exposure, so the weight is its square's reciprocal. Of
+# a small one nothing is: a gain that was free there would only follow what the render lacks, and takes time.
+_PRIOR = 0.1
+_MIN_TONED = math.log(1.3)  # logarithm of an exposure from which on something is left
 _WHOLLY_SHOWN = 1e-3  # tolerance on the share of a pixel that shows the scene, above the rounding of the resize
 
 
@@ -427,18 +432,22 @@ class _ExposureCompensatedLoss:
     loss: Callable[[Tensor], Tensor]
     target: Tensor  # (height, width, 3) the photograph
     told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
-    prior: Tensor  # (3,) as much as _PRIOR of the photograph, squared
+    cap: (
+        Tensor | None
+    )  # (height, width, 3) of the render: the photograph where it is saturated, else infinite; None: all
+    prior: Tensor | None  # (3,) as much as the weight of a gain of 1 of the photograph, squared; None: nothing is left
 
     def __call__(self, rgb: Tensor) -> Tensor:
-        rgb = rgb * self._gains(rgb.detach())
-        return self.loss(torch.where(self.told, rgb, torch.minimum(rgb, self.target)))
+        if self.prior is not None:
+            rgb = rgb * self._gains(rgb.detach(), self.prior)
+        return self.loss(rgb if self.cap is None else rgb.clamp(max=self.cap))
 
-    def _gains(self, rgb: Tensor) -> Tensor:
+    def _gains(self, rgb: Tensor, prior: Tensor) -> Tensor:
         """(3,) in closed form; 1 for a channel of which the photograph tells nothing but black."""
         seen = rgb * self.told
-        known = (seen * self.target).sum((0, 1)) + self.prior
-        gains = known / ((seen * seen).sum((0, 1)) + self.prior).clamp_min(1e-12)
-        return torch.where(self.prior > 0, gains, 1.0)
+        known = (seen * self.target).sum((0, 1)) + prior
+        gains = known / ((seen * seen).sum((0, 1)) + prior).clamp_min(1e-12)
+        return torch.where(prior > 0, gains, 1.0)
 
 
 def make_training_image(
@@ -449,12 +458,13 @@ def make_training_image(
     device: torch.device = _PROCESSOR,
     keep: bool = True,
     measure: LpipsDistance | None = None,
+    headroom: float = 1.0,
 ) -> TrainingImage:
     """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its photometric loss.
 
     The photograph lies, and the losses are computed, on `device`: that of the Gaussians which are rendered, where the
     network of `measure`, for the perceptual loss, has to be, too. `keep`: whether what the losses compute of the
-    photograph is kept.
+    photograph is kept. `headroom` is the part of the exposure that all views of the scene have in common.
 
     `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
     smaller image is compared only if all pixels that it covers are shown.
@@ -472,12 +482,19 @@ def make_training_image(
     if view.exposure is None:
         return TrainingImage(K, width, height, loss, perceptual)
     told = torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)
+    cap = None
     if view.exposure.saturated is not None:
         share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         told = told & torch.from_numpy(share == 0).to(device)
-    known = target * told
-    prior = _PRIOR * (known * known).sum((0, 1))
-    exposed = partial(_ExposureCompensatedLoss, target=target, told=told, prior=prior)
+        cap = torch.where(told, torch.inf, target)
+    taken_out = max(view.exposure.falloff / 2.0, *(abs(math.log(gain / headroom)) for gain in view.exposure.gains))
+    if taken_out < _MIN_TONED and view.exposure.saturated is None:
+        return TrainingImage(K, width, height, loss, perceptual)
+    prior = None
+    if taken_out >= _MIN_TONED:
+        known = target * told
+        prior = _PRIOR * (math.log(2.0) / taken_out) ** 2 * (known * known).sum((0, 1))
+    exposed = partial(_ExposureCompensatedLoss, target=target, told=told, cap=cap, prior=prior)
     return TrainingImage(K, width, height, exposed(loss), perceptual and exposed(perceptual))
 
 

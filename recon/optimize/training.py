@@ -278,7 +278,7 @@ def compute_photometric_misfit(scene: Scene) -> float:
 
 
 def _misfit(scene: Scene, view: TrainingView, valid: npt.NDArray[np.bool_]) -> float:
-    image = make_training_image(view, valid, _SCALE, _DSSIM, scene.gaussians.means.device)
+    image = make_training_image(view, valid, _SCALE, _DSSIM, scene.gaussians.means.device, headroom=scene.headroom)
     camera = Camera(view.T_world_camera, image.K, image.width, image.height)
     rgb = render_gaussians(scene.gaussians, camera).rgb
     assert rgb is not None  # it was asked for

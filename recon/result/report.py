@@ -76,6 +76,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
         "moving": {name: round(share, 4) for name, share in snapshot.moving.items()},
         "gains": {name: [round(gain, 4) for gain in gains] for name, gains in snapshot.gains.items()},
+        "gain_sigmas": {name: [round(each, 4) for each in sigmas] for name, sigmas in snapshot.gain_sigmas.items()},
         "vignetting": {name: round(1.0 - math.exp(-falloff), 4) for name, falloff in snapshot.falloffs.items()},
         **({"depth": [check.record() for check in snapshot.depth_checks]} if snapshot.depth_checks else {}),
         "seed": seed,

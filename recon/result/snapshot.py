@@ -292,6 +292,7 @@ class Snapshot:
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by photograph that has one
     moving: Mapping[str, float] = field(default_factory=dict)  # share left out because it moved, by photograph
     gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue
+    gain_sigmas: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # of their logarithms, where known
     falloffs: Mapping[str, float] = field(default_factory=dict)  # of lenses that dim their corners, by photograph
     depth_checks: tuple[
         DepthCheck, ...

@@ -346,6 +346,9 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
         up=report.up,
         depth_checks=tuple(each.restore() for each in report.depth),
         scenes=tuple(each.scene for each in report.scenes),
+        gains=report.gains,
+        gain_sigmas=report.gain_sigmas,
+        falloffs={name: -math.log1p(-loss) for name, loss in report.vignetting.items()},
     )
     return snapshot, _list_folders(folder, report)
 
@@ -378,6 +381,10 @@ class _Scene(msgspec.Struct, frozen=True):
     scene: str
 
 
+_Gain = Annotated[float, msgspec.Meta(ge=1e-4, le=1e4)]
+_Sigma = Annotated[float, msgspec.Meta(ge=0, le=1e3)]  # of the logarithm of a gain
+
+
 class _Report(msgspec.Struct, frozen=True):
     """The part of report.json that is shown."""
 
@@ -389,6 +396,9 @@ class _Report(msgspec.Struct, frozen=True):
     up: Up | None = None
     scenes: tuple[_Scene, ...] = ()
     depth: Annotated[tuple[StoredDepthCheck, ...], msgspec.Meta(max_length=10_000)] = ()
+    gains: dict[str, tuple[_Gain, _Gain, _Gain]] = {}
+    gain_sigmas: dict[str, tuple[_Sigma, _Sigma, _Sigma]] = {}
+    vignetting: dict[str, Annotated[float, msgspec.Meta(ge=0, lt=1)]] = {}
 
     def collect_texts(self) -> list[str]:
         """All that it says, which is shown; where its photographs lie is not."""
@@ -400,6 +410,9 @@ class _Report(msgspec.Struct, frozen=True):
             *verdict.frames,
             *dropped,
             *self.seconds,
+            *self.gains,
+            *self.gain_sigmas,
+            *self.vignetting,
             *(each.scene for each in self.scenes),
             self.up.source if self.up else "",
             *(text for each in self.depth for text in (each.message, each.camera)),

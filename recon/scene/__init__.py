@@ -99,6 +99,7 @@ class Exposure:
     gains: tuple[float, float, float]  # red, green, blue: of the photograph over the image, in its middle
     falloff: float  # the light at its corners is exp(-falloff) of that in its middle
     saturated: npt.NDArray[np.bool_] | None  # (h, w, 3), True: what it shows is at least so bright; None: nowhere
+    sigmas: tuple[float, float, float] | None = None  # standard deviations of the gains' logarithms; None: not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +180,11 @@ class Scene:
         lit = {view.name: view.exposure.gains for view in self.views if view.exposure is not None}
         published = {name: (r / self.headroom, g / self.headroom, b / self.headroom) for name, (r, g, b) in lit.items()}
         return published if any(gains != (1.0, 1.0, 1.0) for gains in published.values()) else {}
+
+    def gain_sigmas(self) -> dict[str, tuple[float, float, float]]:
+        """Returns standard deviations of the logarithms of `gains`, by name, where they are known."""
+        lit = {view.name: view.exposure.sigmas for view in self.views if view.exposure is not None}
+        return {name: sigmas for name, sigmas in lit.items() if sigmas is not None} if self.gains() else {}
 
     def arrays(self) -> GaussianArrays:
         """The Gaussians as they are published: activated copies, with quaternions of unit length.

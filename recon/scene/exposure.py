@@ -3,16 +3,15 @@
 A camera that opens its iris, or takes another white for white, between two photographs makes one surface two colours.
 Depth that two photographs agree on tells which pixels show one surface; the median ratio of their colours is the ratio
 of their gains, per channel, and all ratios together give each photograph's gains in closed form (least squares of
-their logarithms). What cameras say of their exposure is a prior: it decides where photographs share
-too little, and counts for little where they share much. What is found is used only where it is more than light that
-differs by where it is seen from, and more than an automatic exposure that drifts along the way: photographs that were
-taken near each other share it, and new views between them have it too. A lens that dims its corners much is undimmed
-first.
+their logarithms), with their standard deviations. What cameras say of their exposure is a prior: it decides where
+photographs share too little, and counts for little where they share much. What is found is used only where it is more
+than its own uncertainty, so that what is noise stays out; then the scene has one light, and
+recon/result/view_exposure.py tells that of a novel view. A lens that dims its corners is undimmed first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Annotated
@@ -26,6 +25,7 @@ from msgspec import Meta
 from splatnode.capture.process.config import Internal
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.priors import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS, Pointmap, find_overlapping
+from splatnode.recon.result.view_exposure import compute_squared_radius, relative_illumination
 from splatnode.recon.scene import Exposure
 from splatnode.recon.threads import map_parallel
 from splatnode.recon.verification.evidence import BRIGHT, DARK
@@ -37,24 +37,29 @@ Array = npt.NDArray[np.float64]
 _ROUNDS, _HUBER = 10, 2.0  # of reweighting; in standard deviations
 
 
-def solve_robust(factors: Array, values: Array, sigmas: Array, priors: Array) -> Array:
-    """(K,) the unknowns for which `factors` (N, K) times them are `values` (N,), by Huber's loss.
+def solve_robust(factors: Array, values: Array, sigmas: Array, priors: Array) -> tuple[Array, Array]:
+    """(K,) the unknowns for which `factors` (N, K) times them are `values` (N,), by Huber's loss; and their covariance.
 
-    `sigmas` (N,) are of the equations, `priors` (K,) of the unknowns around 0.
+    `sigmas` (N,) are of the equations, `priors` (K,) of the unknowns around 0. Equations that contradict each other by
+    more than their sigmas make the covariance (K, K) larger.
     """
-    result, weights = np.zeros(len(priors)), np.ones(len(values))
+    result, weights, information = np.zeros(len(priors)), np.ones(len(values)), np.diag(priors**-2)
+    misfit = np.zeros(len(values))
     for _ in range(_ROUNDS):
         weighted = factors * (weights / sigmas**2)[:, None]
-        result = np.linalg.solve(factors.T @ weighted + np.diag(priors**-2), weighted.T @ values)
+        information = factors.T @ weighted + np.diag(priors**-2)
+        result = np.linalg.solve(information, weighted.T @ values)
         misfit = np.abs(factors @ result - values) / sigmas
         weights = np.minimum(1.0, _HUBER / np.maximum(misfit, 1e-9))
-    return result
+    contradiction = ((weights * misfit**2).sum() + ((result / priors) ** 2).sum()) / max(len(values), 1)
+    return result, np.asarray(max(contradiction, 1.0) * np.linalg.inv(information), np.float64)
 
 
 # What photographs show alike: pixels of one surface in two of them, by depth that both agree on, and their colours.
 
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
+Flags = npt.NDArray[np.bool_]
 
 STEP = 3  # pixels between those that are compared
 MIN_SAMPLES = 200  # pixels that two photographs must share
@@ -69,12 +74,6 @@ class SharedPixels:
     pair: tuple[int, int]  # the photographs' numbers
     logs: Array  # (M, 3) logarithms of the colours in the first over those in the second
     radii: Array  # (M, 2) squared, of the pixels in the first and in the second
-
-
-def compute_squared_radius(x: npt.ArrayLike, y: npt.ArrayLike, width: int, height: int) -> Array:
-    """Returns the squared distance of pixels at x and y from an image's middle: 1 at its corners."""
-    across, along = np.asarray(x) + 0.5 - width / 2.0, np.asarray(y) + 0.5 - height / 2.0
-    return (across**2 + along**2) / ((width**2 + height**2) / 4.0)
 
 
 def find_shared_pixels(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> list[SharedPixels]:
@@ -92,6 +91,20 @@ def median_log(logs: Array) -> tuple[Array, Array]:
     median = np.median(logs, axis=0)
     spread = 1.4826 * np.median(np.abs(logs - median), axis=0)
     return median, np.hypot(spread / np.sqrt(len(logs) / INDEPENDENT), LEAST_SIGMA)
+
+
+def measure_log_gain(image: Image, render: Float32, used: npt.NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Measures the log gain (3,) of `image` (h, w, 3) over `render`, in grey levels too, where it is `used`; its sigma.
+
+    Where too few pixels tell it, it is 0 and its sigma PRIOR_SIGMA.
+    """
+    one, other = (np.asarray(cv2.blur(np.asarray(each, np.float32), (3, 3))) for each in (image, render))
+    usable = used & ((np.minimum(one, other) > DARK) & (np.maximum(one, other) < BRIGHT)).all(axis=2)
+    usable = usable[::STEP, ::STEP]
+    if usable.sum() < MIN_SAMPLES:
+        return np.zeros(3), np.full(3, PRIOR_SIGMA)
+    ratios = one[::STEP, ::STEP][usable] / other[::STEP, ::STEP][usable]
+    return median_log(np.log(ratios.astype(np.float64)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,21 +161,10 @@ MIN_PHOTOGRAPHS = 3  # fewer cannot contradict each other
 SIGMAS = 2.0  # standard deviations that a falloff must be above the least that is taken out
 
 
-def relative_illumination(falloff: float, width: int, height: int) -> Float32:
-    """(h, w) the share of the middle's light that reaches each pixel."""
-    across, along = np.meshgrid(np.arange(width), np.arange(height))
-    return np.exp(-falloff * compute_squared_radius(across, along, width, height)).astype(np.float32)
-
-
 def estimate_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int], least: float) -> Array:
     """(V,) of each photograph's lens, which `lens_of` numbers; 0 where it may be less than `least`."""
     result = np.zeros(len(lens_of))
-    for lens in sorted(set(lens_of)):
-        members = [view for view, own in enumerate(lens_of) if own == lens]
-        if len(members) < MIN_PHOTOGRAPHS:
-            continue
-        bins = [each for pair in shared if set(pair.pair) <= set(members) for each in _bins(pair)]
-        found = _estimate_falloff(bins, members)
+    for members, bins, found in _measure_lenses(shared, lens_of):
         if found < least:
             continue
         without = [_estimate_falloff([each for each in bins if view not in each.pair], members) for view in members]
@@ -170,6 +172,25 @@ def estimate_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int], le
         if found - SIGMAS * sigma >= least:
             result[members] = found
     return result
+
+
+def measure_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int]) -> Array:
+    """(V,) of each photograph's lens, as far as it is known: small ones may be noise, but no gain explains them."""
+    result = np.zeros(len(lens_of))
+    for members, _, found in _measure_lenses(shared, lens_of):
+        result[members] = max(found, 0.0)
+    return result
+
+
+def _measure_lenses(
+    shared: Sequence[SharedPixels], lens_of: Sequence[int]
+) -> Iterator[tuple[list[int], list[_Bin], float]]:
+    """Yields the photographs of each lens that has enough of them, what they share, and its falloff."""
+    for lens in sorted(set(lens_of)):
+        members = [view for view, own in enumerate(lens_of) if own == lens]
+        if len(members) >= MIN_PHOTOGRAPHS:
+            bins = [each for pair in shared if set(pair.pair) <= set(members) for each in _bins(pair)]
+            yield members, bins, _estimate_falloff(bins, members)
 
 
 def remove_falloff(shared: Sequence[SharedPixels], falloff: Array) -> Sequence[SharedPixels]:
@@ -211,7 +232,7 @@ def _estimate_falloff(bins: Collection[_Bin], members: Sequence[int]) -> float:
         row[column[each.pair[0]]], row[column[each.pair[1]]], row[-1] = 1.0, -1.0, -each.farther
     values, sigmas = (np.array([getattr(each, name) for each in bins]) for name in ("log", "sigma"))
     priors = np.array([GAIN_SIGMA] * len(members) + [FALLOFF_SIGMA])
-    return float(solve_robust(factors, values, sigmas, priors)[-1])
+    return float(solve_robust(factors, values, sigmas, priors)[0][-1])
 
 
 SATURATED = 250  # grey level from which a pixel does not tell how bright it was
@@ -229,13 +250,14 @@ class ExposureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Exposure compensation: a gain for each image, so that all have the brightness of the others."""
 
     enabled: bool = True  # bring photographs of different exposure or white balance to one light
-    # Gains that differ by less, as a share, in each channel, from the median of all, or from those of the photograph
-    # taken nearest, are left as they are
-    least: Internal[Annotated[float, Meta(ge=0)]] = 0.3
-    # Share of the median above which they are not left, however they drift
-    most: Internal[Annotated[float, Meta(ge=0)]] = 1.0
+    # Gains that all differ by less from their median, as a share, are left as they are
+    least: Internal[Annotated[float, Meta(ge=0)]] = 0.02
+    # Likewise, in standard deviations of their logarithms
+    min_sigmas: Internal[Annotated[float, Meta(ge=0)]] = 4.0
+    # Share from which on they are not left, however unsure they are
+    most: Internal[Annotated[float, Meta(ge=0)]] = 0.3
     # A lens whose corners get more than exp(-least_falloff) of the light in the middle keeps its vignetting
-    least_falloff: Internal[Annotated[float, Meta(ge=0)]] = 0.5
+    least_falloff: Internal[Annotated[float, Meta(ge=0)]] = 0.1
 
 
 def estimate_exposures(
@@ -250,21 +272,18 @@ def estimate_exposures(
     """
     if not config.enabled or len(pointmaps) < 2:
         return {}
-    shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
-    falloff = estimate_falloffs(shared, _lens_of(pointmaps), config.least_falloff)
+    shared, lens_of = find_shared_pixels(pointmaps, [images[each.name] for each in pointmaps]), _lens_of(pointmaps)
+    falloff, measured = estimate_falloffs(shared, lens_of, config.least_falloff), measure_falloffs(shared, lens_of)
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
-    logs = _subtract_median(
-        _solve_log_gains(remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, told))
-    )
-    sudden = logs - _nearest(logs, np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps]))
-    differ, differ_nearby = np.expm1(np.abs(logs).max()), np.expm1(np.abs(sudden).max())
-    if differ < config.most and min(differ, differ_nearby) < config.least:
-        logs = np.zeros_like(logs)
-    if not logs.any() and not falloff.any():
+    solved = _solve_log_gains(remove_falloff(shared, measured), priors, _select_metadata_logs(pointmaps, told))
+    found = solved.subtract_median()
+    if not found.exceed(config).any():
+        found = replace(found, logs=np.zeros_like(found.logs))
+    if not found.logs.any() and not falloff.any():
         return {}
     return {
-        pointmap.name: make_exposure(images[pointmap.name], gains, of_lens)
-        for pointmap, gains, of_lens in zip(pointmaps, np.exp(logs), falloff.tolist(), strict=True)
+        pointmap.name: make_exposure(images[pointmap.name], np.exp(own), of_lens, sigmas)
+        for pointmap, own, of_lens, sigmas in zip(pointmaps, found.logs, falloff.tolist(), found.sigmas, strict=True)
     }
 
 
@@ -279,8 +298,8 @@ def estimate_further_exposures(
     """The exposures of the photographs `further`, which join others that have one light already; none needs to differ.
 
     `further` has the falloff of each one's lens, by name, and `known` what was taken out of the others: if that of any
-    was changed, each further one's light is. Otherwise it is where it differs by `config.least` from theirs. `told` is
-    as for `estimate_exposures`, of the photographs as they were taken.
+    was changed, each further one's light is. Otherwise it is where it differs from theirs by more than `config` says.
+    `told` is as for `estimate_exposures`, of the photographs as they were taken.
     """
     if not config.enabled:
         return {}
@@ -288,20 +307,24 @@ def estimate_further_exposures(
     priors = np.array([PRIOR_SIGMA if pointmap.name in further else KNOWN_SIGMA for pointmap in pointmaps])
     shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
     taken_out = {name: np.log(exposure.gains) for name, exposure in known.items()}
-    logs = _solve_log_gains(remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, told, taken_out))
-    differ = np.expm1(np.abs(logs).max(axis=1))
+    found = _solve_log_gains(remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, told, taken_out))
+    each = zip(pointmaps, found.logs, found.sigmas, found.exceed(config), falloff.tolist(), strict=True)
     return {
-        pointmap.name: make_exposure(images[pointmap.name], np.exp(own), of_lens)
-        for pointmap, own, by, of_lens in zip(pointmaps, logs, differ, falloff.tolist(), strict=True)
-        if pointmap.name in further and (known or by >= config.least)
+        pointmap.name: make_exposure(images[pointmap.name], np.exp(own), of_lens, sigmas)
+        for pointmap, own, sigmas, differs, of_lens in each
+        if pointmap.name in further and (known or differs)
     }
 
 
-def make_exposure(image: Image, gains: Array, falloff: float = 0.0) -> Exposure:
-    """The exposure of a photograph `image` (h, w, 3) whose `gains` (3,), and its lens's `falloff`, are known."""
+def make_exposure(image: Image, gains: Array, falloff: float = 0.0, sigmas: Array | None = None) -> Exposure:
+    """The exposure of a photograph `image` (h, w, 3) whose `gains` (3,), and its lens's `falloff`, are known.
+
+    `sigmas` (3,) are of the logarithms of the gains; None: they are not known.
+    """
     red, green, blue = gains.tolist()
     saturated = (image >= SATURATED) & (_relative_light(image, gains, falloff) > 1.0)
-    return Exposure((red, green, blue), falloff, saturated if saturated.any() else None)
+    known = None if sigmas is None else (float(sigmas[0]), float(sigmas[1]), float(sigmas[2]))
+    return Exposure((red, green, blue), falloff, saturated if saturated.any() else None, known)
 
 
 def apply_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> tuple[dict[str, Exposure], float]:
@@ -322,7 +345,9 @@ def apply_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure
     if headroom == 1.0:
         return dict(exposures), 1.0
     darker = {
-        name: make_exposure(images[name], headroom * np.array(exposure.gains), exposure.falloff)
+        name: replace(
+            make_exposure(images[name], headroom * np.array(exposure.gains), exposure.falloff), sigmas=exposure.sigmas
+        )
         for name, exposure in exposures.items()
     }
     return darker, headroom
@@ -336,12 +361,12 @@ def compensate_images(images: Mapping[str, Image], exposures: Mapping[str, Expos
 
 
 def compensate_image(
-    image: Image, gains: Sequence[float] | None, falloff: float = 0.0
+    image: Image, gains: Sequence[float] | None, falloff: float = 0.0, sigmas: Sequence[float] | None = None
 ) -> tuple[Image, Exposure | None]:
     """The photograph `image` in the light of its scene, and the exposure taken out; as it is without gains."""
     if gains is None:
         return image, None
-    exposure = make_exposure(image, np.array(gains), falloff)
+    exposure = make_exposure(image, np.array(gains), falloff, None if sigmas is None else np.array(sigmas))
     return apply_exposure(image, exposure), exposure
 
 
@@ -356,13 +381,6 @@ def _relative_light(image: Image, gains: Array, falloff: float) -> Array:
     return relative_illumination(falloff, image.shape[1], image.shape[0])[..., None] * gains if falloff else gains
 
 
-def _nearest(logs: Array, centres: Array) -> Array:
-    """(V, 3) the logarithms of the photograph taken nearest to each, at `centres` (V, 3)."""
-    distances = np.linalg.norm(centres[:, None] - centres, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    return logs[distances.argmin(axis=1)]
-
-
 def estimate_log_gains(
     pointmaps: Sequence[Pointmap], pictures: Sequence[Image], told: Mapping[str, float] = _NOTHING
 ) -> Array:
@@ -371,13 +389,8 @@ def estimate_log_gains(
     `told` is as for `estimate_exposures`.
     """
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
-    return _subtract_median(
-        _solve_log_gains(find_shared_pixels(pointmaps, pictures), priors, _select_metadata_logs(pointmaps, told))
-    )
-
-
-def _subtract_median(logs: Array) -> Array:
-    return logs - np.median(logs, axis=0)
+    shared = find_shared_pixels(pointmaps, pictures)
+    return _solve_log_gains(shared, priors, _select_metadata_logs(pointmaps, told)).subtract_median().logs
 
 
 def _select_metadata_logs(
@@ -396,8 +409,32 @@ def _select_metadata_logs(
     return logs
 
 
-def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, told: Array) -> Array:
-    """(V, 3) logarithms of the photographs' gains, each with its standard deviation around 0 in `priors` (V,).
+@dataclass(frozen=True, eq=False)
+class _LogGains:
+    """Logarithms of the gains of V photographs."""
+
+    logs: Array  # (V, 3)
+    covariances: Array  # (3, V, V), a channel each
+
+    @property
+    def sigmas(self) -> Array:
+        """Returns the standard deviations (V, 3)."""
+        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2).T)
+
+    def subtract_median(self) -> _LogGains:
+        """Returns the same about the median of each channel: what all have in common is not known, and no matter."""
+        about_mean = np.eye(len(self.logs)) - 1.0 / len(self.logs)
+        return _LogGains(self.logs - np.median(self.logs, axis=0), about_mean @ self.covariances @ about_mean)
+
+    def exceed(self, config: ExposureConfig) -> Flags:
+        """(V,) which of them are no noise, and large enough to matter."""
+        sure = (np.abs(self.logs) > config.min_sigmas * self.sigmas).any(axis=1)
+        share = np.expm1(np.abs(self.logs).max(axis=1))
+        return (share >= config.most) | (sure & (share >= config.least))
+
+
+def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, told: Array) -> _LogGains:
+    """The logarithms of V photographs' gains, each with its standard deviation around 0 in `priors` (V,).
 
     `told` (V, 3) is what cameras say of them, up to one offset; NaN: nothing. What is far from all the rest counts for
     little more than what is a few sigmas away.
@@ -414,7 +451,8 @@ def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, told: Array)
     if len(tellers):
         priors = np.append(priors, OFFSET_SIGMA)
     found = [solve_robust(factors, *channel, priors) for channel in zip(values.T, sigmas.T, strict=True)]
-    return np.column_stack(found)[:count]
+    logs, covariances = (np.array(each) for each in zip(*found, strict=True))
+    return _LogGains(logs.T[:count], covariances[:, :count, :count])
 
 
 def _lens_of(pointmaps: Sequence[Pointmap]) -> list[int]:

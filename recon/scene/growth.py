@@ -202,7 +202,7 @@ def replace_images(scene: Scene, graph: ViewGraph) -> Scene | None:
         if keyframe.lens is not None:
             lit = view.exposure
             image, exposure = scene_exposure.compensate_image(
-                keyframe.image, lit and lit.gains, lit.falloff if lit else 0.0
+                keyframe.image, lit and lit.gains, lit.falloff if lit else 0.0, lit and lit.sigmas
             )
             view = replace(view, image=image, exposure=exposure, mask=keyframe.mask, lens=keyframe.lens)
         views.append(view)

@@ -38,6 +38,12 @@ from splatnode.recon.result.snapshot import (
 from splatnode.recon.result.stored_snapshot import LANDMARKS, read_depths, read_landmarks, read_result
 from splatnode.recon.result.submap_index import is_map_set
 from splatnode.recon.result.verdict import Bounds, ReferenceFrame, Verdict, compute_covariance
+from splatnode.recon.result.view_exposure import (
+    InterpolatedGains,
+    collect_view_gains,
+    interpolate_gains,
+    relative_illumination,
+)
 from splatnode.viewer.probe import open3d_installed, probe_window
 
 if TYPE_CHECKING:
@@ -224,6 +230,8 @@ class View:
     rgb: npt.NDArray[np.uint8]  # (H, W, 3) RGB; black where there is nothing
     depth: npt.NDArray[np.float32]  # (H, W) along the camera's z axis, in the world's unit; 0 where there is nothing
     seen: npt.NDArray[np.bool_]  # (H, W) whether most of a pixel's light is of surfaces that two photographs confirm
+    gains: npt.NDArray[np.float64]  # (3,) red, green, blue of `rgb` over the scene's own exposure
+    gain_sigmas: npt.NDArray[np.float64]  # (3,) standard deviations of their logarithms; 0 in the scene's exposure
 
 
 def view(
@@ -232,8 +240,13 @@ def view(
     K: npt.ArrayLike,
     size: tuple[int, int],
     threads: int | None,
+    exposure: InterpolatedGains | None = None,
+    falloff: float = 0.0,
 ) -> View:
-    """The Gaussians from a camera of `size` (width, height). Raises ValueError where it is none."""
+    """The Gaussians from a camera of `size` (width, height), in the scene's exposure where `exposure` is None.
+
+    `falloff` is the lens's vignetting, which a view in another exposure gets. Raises ValueError where it is no camera.
+    """
     (width, height), pose, lens = _size(size), _matrix("T_world_camera", T_world_camera), _matrix("K", K)
     problem = find_camera_problem(pose, lens, width, height)
     if problem:
@@ -243,8 +256,29 @@ def view(
         confirmed = find_confirmed(gaussians.source_frame).astype(np.float32)
         white = replace(gaussians, sh=make_flat_sh(np.repeat(confirmed[:, None], 3, 1)))  # and all else black
         light = render_arrays(white, pose, lens, width, height).rgb[..., 0]
-    rgb = np.rint(255 * np.clip(shown.rgb, 0.0, 1.0)).astype(np.uint8)
-    return View(rgb, shown.depth, light > MOSTLY)
+    exposed, gains, sigmas = shown.rgb, np.ones(3), np.zeros(3)
+    if exposure is not None:
+        gains, sigmas = exposure.gains, exposure.sigmas
+        exposed = exposed * relative_illumination(falloff, width, height)[..., None] * gains
+    rgb = np.rint(255 * np.clip(exposed, 0.0, 1.0)).astype(np.uint8)
+    return View(rgb, shown.depth, light > MOSTLY, gains, sigmas)
+
+
+def _interpolate_exposure(
+    snapshot: Snapshot, T_world_camera: Array, captured_at: Stamp | None
+) -> tuple[InterpolatedGains | None, float]:
+    """Interpolates the gains of a view, and finds its lens's falloff; None where nothing was taken out."""
+    if not snapshot.cameras or not (snapshot.gains or snapshot.falloffs):
+        return None, 0.0
+    known = collect_view_gains(snapshot.cameras, snapshot.gains, snapshot.gain_sigmas)
+    falloffs = [snapshot.falloffs.get(camera.name, 0.0) for camera in snapshot.cameras]
+    time_s = None
+    if captured_at is not None and known.times_s is not None:
+        clock = next(camera.captured_at.clock for camera in snapshot.cameras if camera.captured_at)
+        if captured_at.clock != clock:
+            raise ValueError(f"captured_at must be on the cameras' clock {clock.name}, got {captured_at.clock.name}")
+        time_s = captured_at.ns / 1e9
+    return interpolate_gains(known, T_world_camera, time_s), float(np.median(falloffs))
 
 
 def _matrix(name: str, given: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -358,16 +392,35 @@ class Result:
 
     @enter_api()
     def render(
-        self, T_world_camera: npt.ArrayLike, K: npt.ArrayLike, size: tuple[int, int], *, threads: int | None = None
+        self,
+        T_world_camera: npt.ArrayLike,
+        K: npt.ArrayLike,
+        size: tuple[int, int],
+        *,
+        exposure: Literal["interpolated", "scene"] = "interpolated",
+        captured_at: Stamp | None = None,
+        threads: int | None = None,
     ) -> View:
         """Renders the camera at `T_world_camera` (4, 4) with pinhole `K` (3, 3); `size` is (width, height) in pixels.
 
-        Axes and pixels are those of `Camera`. The work takes at most `threads` threads; None: as many as there are
-        processors. Raises ValueError where there is no scene, or these are no camera, and TypeError for other types.
+        Axes and pixels are those of `Camera`. Raises ValueError where there is no scene, or these are no camera, and
+        TypeError for other types.
+
+        - `exposure`: "interpolated": as the camera would have exposed it, by the gains of the photographs around it and
+          the vignetting of their lens; `View.gains` and `View.gain_sigmas` tell it. "scene": one for all views, as in
+          the viewer and in exports. Photographs of one exposure make no difference.
+        - `captured_at`: when, if the photographs tell when they were taken; gains are then interpolated in time, too.
+        - `threads`: the most that the work takes; None: as many as there are processors.
         """
         if not self.verdict.publishable:
             raise ValueError(f"there is no scene to render: {self.verdict.code.value}. Ask verdict.publishable first")
-        return view(self._snapshot.gaussians, T_world_camera, K, size, threads)
+        if exposure not in ("interpolated", "scene"):
+            raise ValueError(f"exposure must be 'interpolated' or 'scene', got {exposure!r}")
+        pose = _matrix("T_world_camera", T_world_camera)
+        interpolated, falloff = None, 0.0
+        if exposure == "interpolated" and pose.shape == (4, 4):
+            interpolated, falloff = _interpolate_exposure(self._snapshot, pose, captured_at)
+        return view(self._snapshot.gaussians, pose, K, size, threads, interpolated, falloff)
 
     @enter_api()
     def localise(

@@ -10,9 +10,10 @@ import pytest
 
 import splatnode
 from splatnode.api.result import result_of
+from splatnode.capture.frame import Clock, Stamp
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.verdict import compute_axes
-from tests.support.exported import make_snapshot
+from tests.support.exported import make_snapshot, stamped
 
 
 def same_rgb(a: np.ndarray, b: np.ndarray) -> float:
@@ -54,6 +55,51 @@ def test_a_render_from_a_camera_is_its_photograph(result, arrays):
     means = result.gaussians["means"]
     inside = (means - camera.centre) @ camera.T_world_camera[:3, 2]
     assert np.median(view.depth[view.depth > 0]) == pytest.approx(np.median(inside), rel=0.5)
+
+
+def test_a_view_has_the_exposure_that_the_photographs_around_it_imply_or_that_of_the_scene(result, tmp_path):
+    saved = result.save(tmp_path / "a")
+    report = json.loads((saved / "report.json").read_text())
+    assert report["gains"] == {} and report["gain_sigmas"] == {}
+    gains = {camera.name: [0.6 + 0.1 * index, 0.7, 0.8] for index, camera in enumerate(result.cameras)}
+    report |= {"gains": gains, "gain_sigmas": {name: [0.004] * 3 for name in gains}}
+    report["vignetting"] = dict.fromkeys(gains, 0.3)
+    alike = splatnode.load(saved)
+    (saved / "report.json").write_text(json.dumps(report))
+    exposed = splatnode.load(saved)
+    for camera in result.cameras:
+        asked = camera.T_world_camera, camera.K, (camera.width, camera.height)
+        plain, fixed, shown = alike.render(*asked), exposed.render(*asked, exposure="scene"), exposed.render(*asked)
+        assert np.array_equal(plain.rgb, fixed.rgb) and not fixed.gain_sigmas.any() and (fixed.gains == 1).all()
+        assert shown.gains == pytest.approx(gains[camera.name], rel=0.02) and (shown.gain_sigmas > 0).all()
+        middle = plain.rgb[110:130, 150:170].mean((0, 1))
+        assert shown.rgb[110:130, 150:170].mean((0, 1)) == pytest.approx(shown.gains * middle, abs=1.0)
+        corners = [np.abs(view.rgb[:8, :8].astype(float)).mean() for view in (plain, shown)]
+        assert corners[1] == pytest.approx(0.7 * shown.gains.mean() * corners[0], rel=0.1)
+    with pytest.raises(ValueError, match="exposure must be 'interpolated' or 'scene', got 'auto'"):
+        exposed.render(*asked, exposure="auto")
+
+
+def test_the_exposure_of_a_view_is_interpolated_in_time_where_it_is_given():
+    snapshot = stamped(make_snapshot(), first_ns=10**9)
+    names = [camera.name for camera in snapshot.cameras]
+    gains = dict(zip(names, ((0.8,) * 3, (1.25,) * 3), strict=True))
+    shown = result_of(replace(snapshot, gains=gains), None)  # pyright: ignore
+    first = shown.cameras[0]
+    asked = first.T_world_camera, first.K, (64, 48)
+    assert shown.render(*asked, captured_at=Stamp(10**9, Clock.UTC)).gains == pytest.approx(0.8, rel=0.08)
+    later = shown.render(*asked, captured_at=Stamp(2 * 10**9, Clock.UTC))
+    assert (later.gains > 1.0).all() and later.gain_sigmas.min() > shown.render(*asked).gain_sigmas.max()
+    with pytest.raises(ValueError, match="captured_at must be on the cameras' clock UTC, got FILE"):
+        shown.render(*asked, captured_at=Stamp(10**9, Clock.FILE))
+
+
+def test_gains_that_cannot_be_are_told(result, tmp_path):
+    saved = result.save(tmp_path / "a")
+    report = json.loads((saved / "report.json").read_text())
+    (saved / "report.json").write_text(json.dumps(report | {"gains": {"a.png": [0.0, 1.0, 1.0]}}))
+    with pytest.raises(ValueError, match="report.json is not a report of splatnode, or is damaged"):
+        splatnode.load(saved)
 
 
 def test_seen_is_what_two_photographs_confirm(result):

@@ -47,6 +47,7 @@ BENCHMARKS = {
         "movers",
         "fisheyes",
         "light",
+        "drift",
         "told_lenses",
         "told_light",
         "vignetting",

@@ -17,7 +17,7 @@ from splatnode.recon.pipeline import run
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.exposure import relative_illumination
+from splatnode.recon.result.view_exposure import collect_view_gains, interpolate_gains, relative_illumination
 from tests.support.synthetic import SMALL, photographs
 
 CONFIG = apply_changes(preset("preview"), {"size": 320})
@@ -88,6 +88,44 @@ def test_photographs_of_one_exposure_are_untouched():
     assert snapshot.gains == {} and all(
         np.array_equal(snapshot.images[frame.name], frame.image) for frame in photographs()
     )
+
+
+DRIFT = 1.25  # of the last photograph's gain over the first's, as of an automatic exposure
+
+
+def drifting(frame: Frame) -> Frame:
+    gain = DRIFT ** (frame.frame_id / (SMALL.views - 1) - 1.0)
+    return replace(frame, image=np.rint(frame.image * gain).astype(np.uint8), encoded=None)
+
+
+def drifting_psnr(snapshot: Snapshot, interpolate: bool) -> float:
+    """dB of held-out photographs with the gains of their places between the others."""
+    true = synthetic.scene_cameras(SMALL)
+    known = np.stack([true[camera.frame_id][0] for camera in snapshot.cameras])
+    similarity = align_cameras(known, np.stack([camera.T_world_camera for camera in snapshot.cameras]))
+    K, errors = snapshot.cameras[0].K, []
+    gains = collect_view_gains(snapshot.cameras, snapshot.gains, snapshot.gain_sigmas)
+    for index, (T, _) in enumerate(synthetic.evaluation_cameras(SMALL)):
+        gain = DRIFT ** ((index + 0.5) / (SMALL.views - 1) - 1.0)
+        photograph = gain * synthetic.render_image(SMALL, (T, K), 99) / 255.0
+        shown = render_arrays(snapshot.gaussians, similarity.camera(T), K, SMALL.width, SMALL.height).rgb
+        implied = interpolate_gains(gains, similarity.camera(T)).gains if interpolate else np.ones(3)
+        errors.append(((np.clip(implied * shown, 0, 1) - photograph) ** 2).mean())
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_held_out_views_of_a_drifting_exposure_are_shown_in_the_exposure_of_their_place():
+    frames = [drifting(each) for each in photographs()]
+    snapshot = run(frames, CONFIG)
+    expected = DRIFT ** (np.arange(SMALL.views) / (SMALL.views - 1))
+    found = np.array([snapshot.gains[camera.name] for camera in snapshot.cameras])
+    assert found / found[0] == pytest.approx(np.repeat(expected[:, None], 3, 1), rel=0.03)
+    sigmas = np.array([snapshot.gain_sigmas[camera.name] for camera in snapshot.cameras])
+    assert (sigmas > 0).all() and (sigmas < 0.03).all()
+    interpolated = drifting_psnr(snapshot, interpolate=True)
+    assert interpolated > drifting_psnr(snapshot, interpolate=False) + 1.0
+    off = run(frames, apply_changes(CONFIG, {"exposure_compensation": {"enabled": False}}))
+    assert interpolated > drifting_psnr(off, interpolate=True) - 0.1
 
 
 FALLOFF = 0.9  # two fifths of the light reach the corners

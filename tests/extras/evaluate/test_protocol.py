@@ -334,6 +334,32 @@ def test_renders_get_the_light_that_was_taken_out_of_photographs(scene_folder, t
     assert with_light.psnr > 45 and with_light.psnr > without.psnr + 10
 
 
+def darken(folder: Path, drift: float) -> dict[str, float]:
+    """Writes the scene's photographs with gains that grow along their order, by name."""
+    names = list(load_scene(folder).paths)
+    gains = dict(zip(names, np.exp(np.linspace(-drift, 0.0, len(names))), strict=True))
+    for name, gain in gains.items():
+        path = folder / "images" / name
+        cv2.imwrite(str(path), np.rint(cv2.imread(str(path)) * gain).astype(np.uint8))
+    return gains
+
+
+def test_held_out_views_are_scored_with_the_gains_that_training_views_imply_and_with_the_best(scene_folder, tmp_path):
+    folder = tmp_path / "blobs"
+    write_scene(folder)
+    gains = darken(folder, 0.3)
+    told = replace(perfect_snapshot(), gains={name: (gains[name],) * 3 for name in SPLIT.train})
+    published, measured = score(told, folder), score(perfect_snapshot(), folder)  # whose photographs nobody changed
+    for row in (published, measured):
+        interpolated, best = row.exposures["interpolated"], row.exposures["best_gain"]
+        assert row.psnr is not None and row.ssim is not None
+        assert row.psnr < 30 and interpolated.psnr > row.psnr + 8 and best.psnr > interpolated.psnr - 0.1
+        assert interpolated.gain_error_pct < 2.0 and best.gain_error_pct == 0.0
+        assert interpolated.ssim > row.ssim
+    alike = score(perfect_snapshot(), scene_folder)
+    assert alike.exposures["interpolated"].psnr == alike.psnr  # what is noise changes nothing
+
+
 def test_the_search_starts_from_the_true_pose_or_from_between_its_neighbours(scene_folder, monkeypatch):
     starts = []
 

@@ -8,8 +8,8 @@ from urllib.parse import unquote_to_bytes
 
 import pytest
 
-from splatnode.extras.evaluate.protocol import Row, Settings
-from splatnode.extras.evaluate.report import FOLDER, PHOTOGRAPH, Bench, make_report_files
+from splatnode.extras.evaluate.protocol import ExposureScore, Row, Settings
+from splatnode.extras.evaluate.report import FOLDER, PHOTOGRAPH, Bench, make_bench_files, make_report_files
 from tests.support.hostile import TEXTS, unprintable
 
 NAMES = {what: text.replace("\x00", "").replace("/", "_")[:100] for what, text in TEXTS.items()}
@@ -36,6 +36,19 @@ def row(scene: str, method: str) -> Row:
         scene=scene, views=3, method=method, seed=0, checkpoint=None, final=True, psnr=30.0, ssim=0.9, verdict=scene,
         seconds={"total": 1.0}, peak_rss_mb=1.0,
     )  # fmt: skip
+
+
+def test_scores_in_other_exposures_have_a_table_and_columns_of_their_own(tmp_path):
+    scores = {"interpolated": ExposureScore(31.5, 0.91, 0.1, 1.5), "best_gain": ExposureScore(32.25, 0.92, 0.1, 0.0)}
+    bench = Bench((replace(row("place", "ours"), exposures=scores), row("place", "old")), Settings(), {}, "bench")
+    text = make_report_files(bench, tmp_path)["report.md"].decode()
+    assert "| 3 | ours | 30.00 | 31.50 | 32.25 | 0.9000 | 0.9100 | 0.9200 | 1.5 |" in text
+    table = make_bench_files(bench)["bench.csv"].decode().splitlines()
+    assert "interpolated_psnr" in table[0] and "31.5" in table[1] and "31.5" not in table[2]
+    assert (
+        "Exposure"
+        not in make_report_files(Bench(bench.rows[1:], Settings(), {}, "bench"), tmp_path)["report.md"].decode()
+    )
 
 
 @pytest.mark.parametrize("name", NAMES.values(), ids=NAMES)

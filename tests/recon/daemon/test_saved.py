@@ -115,13 +115,16 @@ def test_what_another_version_wrote_is_told(graph, scene):
 
 def test_the_gains_of_a_scenes_photographs_come_back(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
-    image, exposure = scene_exposure.compensate_image(graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7)
+    image, exposure = scene_exposure.compensate_image(
+        graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7, (0.01, 0.02, 0.03)
+    )
     first, second, third = scene.views
     lit = replace(scene, views=(first, replace(second, image=image, exposure=exposure), third))
     header, arrays = make_scene_message(lit, final=False)
     found = parse_scene(over_the_disk(header, arrays), keyframes)
     assert [view.exposure and view.exposure.gains for view in found.views] == [None, (2.0, 1.5, 0.5), None]
     assert [view.exposure and view.exposure.falloff for view in found.views] == [None, 0.7, None]
+    assert [view.exposure and view.exposure.sigmas for view in found.views] == [None, (0.01, 0.02, 0.03), None]
     assert np.array_equal(found.views[1].image, image) and found.headroom == 1.0
     darker = parse_scene(over_the_disk(*make_scene_message(replace(lit, headroom=1.25), final=False)), keyframes)
     assert darker.headroom == 1.25

@@ -1,5 +1,7 @@
 """A photograph is compared at its size or a smaller one, where it shows the scene."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -64,6 +66,22 @@ def test_what_is_left_of_the_exposure_is_a_gain_that_fits_the_render():
     )
     assert float(exposed.loss(render)) < 0.2 * float(as_it_is.loss(render))
     assert float(exposed.loss(2 * render)) > float(exposed.loss(render))  # the prior: not any gain will do
+
+
+@pytest.mark.parametrize(("gain", "headroom"), [(1.2, 1.0), (1.7, 1.6)])
+def test_of_a_small_exposure_nothing_is_left(gain, headroom):
+    image = np.random.default_rng(0).integers(40, 200, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+    shown = np.ones((HEIGHT, WIDTH), bool)
+    render = 1.1 * torch.from_numpy(image).float() / 255
+    plain = TrainingView("a", 0, image, torch.eye(4), K)
+    saturated = np.zeros((HEIGHT, WIDTH, 3), bool)
+    saturated[0] = True
+    for known in (None, saturated):
+        view = replace(plain, exposure=Exposure((gain,) * 3, 0.1, known))
+        exposed = make_training_image(view, shown, 1.0, 0.0, headroom=headroom).loss(render)
+        as_it_is = make_training_image(plain, shown, 1.0, 0.0).loss(render)
+        assert float(exposed) == pytest.approx(float(as_it_is), rel=0.0 if known is None else 0.1)
 
 
 def test_a_colour_that_an_exposed_photograph_has_nowhere_is_wrong_in_a_render():

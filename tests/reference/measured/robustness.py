@@ -42,6 +42,24 @@ def told_exposure() -> str:
     return table(("set, views", "no metadata", "true", "× 1.5", "one wrong by 5", "reversed"), rows)
 
 
+def drift() -> str:
+    """Exposures that drift along the way: three scores of each method."""
+    found = {(row["scene"], row["views"], row["drift"], row["method"]): row for row in raw("drift")["rows"]}
+    methods = [each for each in ("balanced", "balanced-off", "mcmc+fill") if any(key[3] == each for key in found)]
+    rows = []
+    for scene, views, factor in dict.fromkeys(key[:3] for key in found if key[2] in (1.0, 1.4)):
+        cells = []
+        for method in methods:
+            row = found.get((scene, views, factor, method))
+            exposures = (
+                [] if row is None else [row["exposures"][kind]["psnr"] for kind in ("interpolated", "best_gain")]
+            )
+            cells.append("–" if row is None else " / ".join(f"{each:.2f}" for each in (row["psnr"], *exposures)))
+        rows.append((f"{scene}, {views}", "as taken" if factor == 1.0 else f"{factor:g}", *cells))
+    names = {"balanced-off": "`balanced`, compensation off"}
+    return table(("set, views", "drift", *(names.get(method, f"`{method}`") for method in methods)), rows)
+
+
 def vignetting() -> str:
     """Lenses that dim their corners."""
     found, rows, left = raw("vignetting")["rows"], [], []
@@ -164,4 +182,4 @@ def mutants() -> str:
     return bullets(f"Found: {sum(each['killed'] for each in found)} of {len(found)}: {counts}.{rest}")
 
 
-BLOCKS = (exposure, told_exposure, vignetting, movers, stability, free_space, free_space_notes, mutants)
+BLOCKS = (exposure, told_exposure, drift, vignetting, movers, stability, free_space, free_space_notes, mutants)
