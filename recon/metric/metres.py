@@ -159,7 +159,7 @@ def estimate_scale_from_depth(
     )
     of_scene = compute_scale_sigma(list(views.values()))
     agreed = combine_measurements(others) if others else None
-    told = [_measure(fit, of_scene, agreed if isinstance(agreed, Measurement) else None) for fit in fits]
+    told = [measure_by_depth(fit, of_scene, agreed if isinstance(agreed, Measurement) else None) for fit in fits]
     return [said for said, _ in told], tuple(check for _, check in told)
 
 
@@ -171,7 +171,13 @@ def _make_depth_view(name: str, view: MetricView, landmarks: Landmarks, own: Cam
     return DepthView(name, own.camera_id, in_camera, own.depth, lens)
 
 
-def _measure(fit: DepthFit, of_scene: float, agreed: Measurement | None) -> tuple[Measurement | str, DepthCheck]:
+def measure_by_depth(
+    fit: DepthFit, of_scene: float, agreed: Measurement | None
+) -> tuple[Measurement | str, DepthCheck]:
+    """The unit by the depth images of one camera, or why there is none, and the judgement on them.
+
+    `of_scene` is the standard deviation of the logarithm of the scene's lengths, `agreed` what other sources measured.
+    """
     check = fit.check
     if not fit.is_usable:
         return check.message, check
