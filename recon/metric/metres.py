@@ -205,8 +205,7 @@ def measure_by_depth(
 Array = npt.NDArray[np.float64]
 
 MOST_DEG = 10.0  # standard deviation of up by gravity, beyond which it tells no upright frame
-# Standard deviation of a floor's normal against gravity: how level floors are, and how well their plane is found
-FLOOR_SIGMA_DEG = 1.0
+FLOOR_SIGMA_DEG = 1.0  # how level floors are; to this comes how well their plane is found
 BASE_SIGMA_DEG = 5.0  # of a base's z axis against gravity where nothing tells it: how level robots stand
 FARTHEST_MOUNT_M = 20.0  # of a camera from its base; beyond, the mount is probably in millimetres, which is told
 CONTRADICTED_DEG = 20.0  # between gravity and the floor, from which on this is told: a sign is wrong, or it is no floor
@@ -420,7 +419,7 @@ def _find_floor_up(snapshot: Snapshot) -> Up | None:
         return None
     x, y, z = (floor.normal / np.linalg.norm(floor.normal)).tolist()
     known = f"the floor, a plane through {100 * floor.share:.0f} % of the surface, with cameras taken as held upright"
-    return Up((x, y, z), FLOOR_SIGMA_DEG, known)
+    return Up((x, y, z), math.hypot(FLOOR_SIGMA_DEG, floor.tilt_deg), known)
 
 
 def make_upright_frame(T_world_camera: Array, up: Array) -> Array:

@@ -300,6 +300,7 @@ class Floor:
     normal: Array  # (3,)
     offset: float
     share: float  # of the surface that was seen
+    tilt_deg: float = math.inf  # standard deviation of the normal, by how far its points spread and how thick they lie
 
     def height(self, point: Array, up: Array) -> float:
         """How far above the floor a point (3,) is, along `up` (3,)."""
@@ -330,7 +331,24 @@ def _refine_floor(best: Floor, sample: Array, centres: Array, unit: float) -> Fl
         normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ best.normal)
         best = _validate_floor(normal, float(middle @ normal), sample, centres, unit) or best
-    return best
+    return replace(best, tilt_deg=_measure_tilt_deg(best, sample, unit))
+
+
+def _measure_tilt_deg(floor: Floor, sample: Array, unit: float) -> float:
+    """How thick the floor's points lie over how far they reach where they reach least, as an angle.
+
+    However many they are, they count as one: depths beside each other are wrong alike, and bend a floor. A few far
+    aside, as where the plane cuts a wall, do not make a strip wide.
+    """
+    near = sample[np.abs(sample @ floor.normal - floor.offset) < THICKNESS * unit]
+    if len(near) < 3:
+        return math.inf
+    off, axes = near - np.median(near, axis=0), np.linalg.svd(near - near.mean(0), full_matrices=False)[2]
+    along = np.linspace(0.0, np.pi, 12, endpoint=False)  # in the plane: where it is narrowest
+    ways = np.cos(along)[:, None] * axes[0] + np.sin(along)[:, None] * axes[1]
+    low, high = np.percentile(off @ ways.T, (16.0, 84.0), axis=0)
+    thick = float(np.std(off @ axes[2]))
+    return float(np.degrees(np.arctan2(thick, (high - low).min() / 2.0)))
 
 
 def _planes(points: Array, rng: np.random.Generator, up: Array, cosine: float) -> list[tuple[Array, float]]:
