@@ -11,6 +11,7 @@ import itertools
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -59,15 +60,23 @@ _SHARP_SIGMAS = 1.05  # rms distance from a plane, over that of _FLATTEST
 _FLATTEST = 15.0  # percentile of windows by their rms distance from a plane: those show the noise alone
 _LEAST_NOISE = 0.5  # of the noise that is told, which noise that neighbours share falls below
 _LEAST_FULL = 0.7  # share of such a window that has a depth
+_REMEMBERED = 12  # depth images without their noise: more than one is compared with at a time
 _OWN_SIGMAS = 2.0  # of a pixel from a plane that is taken for it
 
 
 def smooth_within_outlines(depth: DepthImage) -> tuple[Map, Map]:
-    """(H, W) z and its standard deviation, metres, as `smooth_depth`, but what is less than its noise high stays.
+    """Smooths as `smooth_depth`, to (H, W) z and its sigma, metres, but what is less than its noise high stays.
 
     Windows may lie beside their pixel, as at an outline, and are planes where they are about as flat as the flattest
     ones of the image, whose noise may be less than what is told. Where there is none, planes count as there.
     """
+    z, sigma = _smooth_within_outlines(depth)
+    return z.astype(np.float64), sigma.astype(np.float64)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _smooth_within_outlines(depth: DepthImage) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Smooths a depth image once: while a scene grows, each further image is compared with the same ones."""
     z = depth.metres.astype(np.float64)
     nearness, noise, known = compute_nearness(depth, z)
     best, sigma, open_yet = nearness.copy(), noise.copy(), known.copy()
@@ -76,7 +85,7 @@ def smooth_within_outlines(depth: DepthImage) -> tuple[Map, Map]:
     for radius in RADII:
         _take_planes(nearness, noise, known, open_yet, (best, sigma), radius, PLANE_SIGMAS)
     smooth = np.where(best > 0, 1.0 / np.maximum(best, 1e-9), 0.0)
-    return smooth, sigma * smooth**2
+    return smooth.astype(np.float32), (sigma * smooth**2).astype(np.float32)
 
 
 def _take_planes(
@@ -115,7 +124,7 @@ def _take_planes(
 
 
 def _look_aside(values: Map, down: int, across: int) -> Map:
-    """(H, W) the values so many pixels down and across from each pixel; 0 outside."""
+    """Returns (H, W) the values so many pixels down and across from each pixel; 0 outside."""
     height, width = values.shape
     found = np.zeros_like(values)
     rows, columns = height - abs(down), width - abs(across)
@@ -144,20 +153,20 @@ _COARSE = 8  # pixels of an image for one of the map by which it is found what s
 
 @dataclass(frozen=True, eq=False)
 class MeasuredView:
-    """What a depth camera measured for one image, in the scene's unit."""
+    """The surface that a depth camera measured for one image, in the scene's unit."""
 
     surface: Pointmap  # its depth, and the camera
     sigma: Map  # (h, w) standard deviation of it
 
     @property
-    def measured(self) -> MeasuredDepth:
+    def pixels(self) -> MeasuredDepth:
         return MeasuredDepth(self.surface.depth.astype(np.float64), self.sigma)
 
 
 def fill_measured_depth(
     pointmaps: Sequence[Pointmap], graph: ViewGraph, registration: Registration
 ) -> tuple[Pointmap, ...]:
-    """The point maps, with measured depth where it tells more than stereo; the same ones where none was measured.
+    """Returns the point maps with measured depth weighed in; the same ones where none was measured.
 
     Depth images that the points of the images contradict, or cannot judge, add nothing, which the log tells: without
     numbers, for those of the result are of all points that matches and cameras agree on in the end. `graph`
@@ -186,7 +195,7 @@ def fill_measured_depth(
         own = measured.get(pointmap.name)
         if own is None and not others:
             return pointmap
-        shown = own.measured if own is not None else _measure_nothing(pointmap)
+        shown = own.pixels if own is not None else _measure_nothing(pointmap)
         return snap_to_outlines(fuse_depth(pointmap, shown, others), images[pointmap.name])
 
     return tuple(map_parallel(fuse, pointmaps))
@@ -218,7 +227,7 @@ def _find_partners(
     graph: ViewGraph,
     registration: Registration,
 ) -> dict[str, tuple[str, ...]]:
-    """For each wanted image the others whose measured depth shares most with it, or with what it sees by its place."""
+    """Finds for each wanted image the others whose measured depth shares most with it."""
     cameras = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
     by_name = {view.name: view for view in views}
     names = sorted(wanted.union(by_name), key=lambda name: cameras[name].index)
@@ -240,7 +249,7 @@ def _find_partners(
 
 
 def _find_image(graph: ViewGraph, camera: RegisteredCamera) -> tuple[Map, tuple[int, int]]:
-    """K (3, 3) and (h, w) of a camera's image at modelled size."""
+    """Finds K (3, 3) and (h, w) of a camera's image at modelled size."""
     height, width = graph.keyframes[camera.index].image.shape[:2]
     return compute_modelled_K(graph, camera), (height, width)
 
@@ -339,7 +348,7 @@ def _list_candidates(z: Map, sigma: Map) -> list[Map]:
 def _support(
     candidate: Map, z: Map, sigma: Map, stereo_votes: Map, pointmap: Pointmap, others: Sequence[MeasuredView]
 ) -> _Candidate:
-    """The mean of all that is of the candidate's surface, and what speaks for it."""
+    """Averages all that is of the candidate's surface, and counts what speaks for it."""
     own = _CANDIDATE_SHARE * candidate
     alike = (z > 0) & (candidate > 0) & (np.abs(z - candidate) < _ALIKE_SIGMAS * np.hypot(sigma, own))
     weight = np.where(alike, np.maximum(sigma, 1e-9) ** -2.0, 0.0)
@@ -363,7 +372,7 @@ def _support(
 
 
 def _project(view: MeasuredView, pointmap: Pointmap) -> MeasuredDepth:
-    """What the view measured, as the point map's camera sees it."""
+    """Projects what the view measured into the point map's camera."""
     depth, _ = project_nearest(view.surface, pointmap)
     z, known = np.where(np.isfinite(depth), depth, 0.0).astype(np.float64), view.surface.depth > 0
     share = float(np.median(view.sigma[known] / view.surface.depth[known] ** 2.0)) if known.any() else 0.0
@@ -371,7 +380,7 @@ def _project(view: MeasuredView, pointmap: Pointmap) -> MeasuredDepth:
 
 
 def _look_up(depth: Map, pointmap: Pointmap, other: MeasuredView) -> tuple[Map, Map, Map]:
-    """(h, w) z of the points in the other's camera, and what that one measured there, with its noise; 0: nothing."""
+    """Looks up (h, w) z of the points in the other's camera, what it measured there, and its noise; 0: nothing."""
     T = np.linalg.inv(other.surface.T_world_camera) @ pointmap.T_world_camera
     A, t = other.surface.K @ T[:3, :3] @ np.linalg.inv(pointmap.K), other.surface.K @ T[:3, 3]
     height, width = depth.shape
@@ -441,7 +450,7 @@ def snap_to_outlines(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> Pointm
 def _find_modes(
     at: tuple[Index, Index], log_z: Map, weights: Map, colours: npt.NDArray[np.float32], step: int
 ) -> tuple[Map, Map]:
-    """(M,) the depth of which most neighbours of each pixel are, and their share; 0 where there is none."""
+    """Finds (M,) the depth of which most neighbours of each pixel are, and their share; 0 where there is none."""
     height, width = log_z.shape
     reach = np.arange(-_REACH, _REACH + 1)
     down, across = (each.ravel() for each in np.meshgrid(reach, reach, indexing="ij"))

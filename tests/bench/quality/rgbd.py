@@ -150,11 +150,12 @@ def judge(estimate: Reconstruction, place: synthetic.Config, kind: str, seed: in
     true = find_unit(estimate, know(place))
     error = MARKER_SIGMA * float(np.random.default_rng([seed, 8]).normal())
     marker = Measurement(true * float(np.exp(error)), MARKER_SIGMA, "a marker")
-    _, check = measure_by_depth(fit, compute_scale_sigma(_list_views(estimate)), marker)
+    _, check = measure_by_depth(fit, compute_scale_sigma(list_metric_views(estimate)), marker)
     return Judgement(place.seed, kind, fit.check.code.value, check.code.value, *_compute_errors(fit, true))
 
 
-def _list_views(estimate: Reconstruction) -> list[MetricView]:
+def list_metric_views(estimate: Reconstruction) -> list[MetricView]:
+    """The cameras of an estimate with their bounds; lenses are of no account for them."""
     assert estimate.registration is not None
     found, nothing = [], np.zeros(2)
     for camera in estimate.registration.cameras:
