@@ -19,7 +19,8 @@ from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_by_depth
-from splatnode.recon.metric.depth_fit import fill_measured_depth, fit_depth_images, make_depth_views
+from splatnode.recon.metric.depth_fit import fit_depth_images, make_depth_views
+from splatnode.recon.metric.depth_fusion import fill_measured_depth
 from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
 from splatnode.recon.rasterize import choose_device, format_device
 from splatnode.recon.registration import registration as registration_registration

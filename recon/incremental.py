@@ -29,7 +29,7 @@ from splatnode.recon.estimation import (
 from splatnode.recon.fallbacks import make_fallback_key, run_fallbacks
 from splatnode.recon.keyframes import Keyframe, Rejected, ScreeningState
 from splatnode.recon.matching.view_graph import ViewGraph, mask_moving_objects, match_newest, match_pending
-from splatnode.recon.metric.depth_fit import fill_measured_depth
+from splatnode.recon.metric.depth_fusion import fill_measured_depth
 from splatnode.recon.modelling import (
     SceneWithVerdict,
     create_initial_scene,

@@ -7,7 +7,6 @@ better at another pixel: the images test it.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,7 +21,6 @@ from splatnode.capture.lenses import project, unproject
 from splatnode.capture.process.text import sanitize_name
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors import LEAST_CONFIDENCE, Pointmap, compute_depth_normals
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
 from splatnode.recon.result.snapshot import DepthCheck, DepthCode
 from splatnode.recon.threads import map_parallel
@@ -32,11 +30,11 @@ from splatnode.recon.threads import map_parallel
 Map = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-_RADII = (8, 4, 2)  # of the windows in which a plane is looked for, pixels of 640 across, the largest first
-_PLANE_SIGMAS = 1.5  # rms distance from a plane, over the noise
+RADII = (8, 4, 2)  # of the windows in which a plane is looked for, pixels of 640 across, the largest first
+PLANE_SIGMAS = 1.5  # rms distance from a plane, over the noise
 _OUTLIER_SIGMAS = 3.0  # of a pixel from the plane of its neighbours
-_LEAST_WINDOW = 0.35  # share of a window's pixels that have a depth
-_PIXELS_AS_ONE = 25.0  # neighbours are wrong alike: stereo compares windows
+LEAST_WINDOW = 0.35  # share of a window's pixels that have a depth
+PIXELS_AS_ONE = 25.0  # neighbours are wrong alike: stereo compares windows
 
 
 def smooth_depth(depth: DepthImage) -> tuple[Map, Map]:
@@ -46,20 +44,16 @@ def smooth_depth(depth: DepthImage) -> tuple[Map, Map]:
     Pixels that are far from the plane of their neighbours are left out.
     """
     z = depth.metres.astype(np.float64)
-    known = z > 0
-    nearness = np.where(known, 1.0 / np.maximum(z, 1e-9), 0.0)
-    noise = np.where(known, depth.noise.compute_sigma(z) * nearness**2, 0.0)  # of the nearness
-    if depth.confidence is not None:  # what is half believed is twice as unsure
-        noise *= 255.0 / np.maximum(depth.confidence, 1)
+    nearness, noise, known = compute_nearness(depth, z)
     best, sigma, open_yet = nearness.copy(), noise.copy(), known.copy()
-    for radius in _RADII:
+    for radius in RADII:
         side = 2 * max(1, round(radius * max(z.shape) / 640)) + 1
         planes = fit_planes(nearness, known, side)
         value, rms, count = planes.value, planes.rms, planes.count
-        plane = (count >= _LEAST_WINDOW * side**2) & (rms < _PLANE_SIGMAS * noise) & open_yet & (value > 0)
+        plane = (count >= LEAST_WINDOW * side**2) & (rms < PLANE_SIGMAS * noise) & open_yet & (value > 0)
         outlier = plane & (np.abs(nearness - value) > _OUTLIER_SIGMAS * noise)
         best[plane], best[outlier] = value[plane], 0.0
-        sigma[plane] = noise[plane] / np.sqrt(np.maximum(count[plane] / _PIXELS_AS_ONE, 1.0))
+        sigma[plane] = noise[plane] / np.sqrt(np.maximum(count[plane] / PIXELS_AS_ONE, 1.0))
         open_yet &= ~plane
     smooth = np.where(best > 0, 1.0 / np.maximum(best, 1e-9), 0.0)
     return smooth, sigma * smooth**2
@@ -100,6 +94,16 @@ def fit_planes(values: Map, known: Mask, side: int) -> Planes:
     value = mean + slope_x * (x - mean_x) + slope_y * (y - mean_y)
     rms = np.sqrt(np.maximum(vv - slope_x * xv - slope_y * yv, 0.0))
     return Planes(value, slope_x, slope_y, np.where(sound, rms, np.inf), count)
+
+
+def compute_nearness(depth: DepthImage, z: Map) -> tuple[Map, Map, Mask]:
+    """1 / z, its noise, both 0 where unknown, and where it is known."""
+    known = z > 0
+    nearness = np.where(known, 1.0 / np.maximum(z, 1e-9), 0.0)
+    noise = np.where(known, depth.noise.compute_sigma(z) * nearness**2, 0.0)
+    if depth.confidence is not None:  # what is half believed is twice as unsure
+        noise *= 255.0 / np.maximum(depth.confidence, 1)
+    return nearness, noise, known
 
 
 # How depth images go with what the images themselves tell: the unit that they give, and what speaks against them.
@@ -346,75 +350,17 @@ def describe_doubtful_units(frames: Iterable[Frame | DroppedFrame]) -> str:
     return f"the depth image of {sanitize_name(name)}: {doubt} ({len(doubts)} of {len(depths)} depth images)"
 
 
-# Point maps with the depth that depth images measured, where the images themselves cannot tell it.
-#
-# Stereo needs something to see: a plain wall has no depth by it. A depth image is smoothed where it is a plane within
-# its noise, taken into the image, and weighed against stereo by the sigmas of both.
+# Depth images as the camera of their photograph sees them.
 
-log = logging.getLogger(__name__)
-
-
-STEREO_SIGMA = 0.004  # of a depth by stereo whose confidence is 1, as a share of it
-MOST_SIGMA = 0.04  # of a measured depth that is taken, as a share of it
-_CONFIDENT_SIGMA = 0.005  # at which a measured depth has the confidence 1
-_MOST_CONFIDENCE = 0.9
-_APART_SIGMAS = 3.0  # by which stereo and measured depth may differ and be averaged
-_SURE = 0.9  # confidence of stereo from which on it is kept where both differ by more; below, it widens outlines
 _JUMP = 0.03  # relative step of depth across which nothing is interpolated
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredDepth:
-    """z and its standard deviation at each pixel of an image, metres; 0 where none was measured."""
+    """z and its standard deviation at each pixel of an image, metres or the scene's unit; 0 where none was measured."""
 
     z: Map  # (h, w)
     sigma: Map  # (h, w)
-
-
-def fill_measured_depth(
-    pointmaps: Sequence[Pointmap], graph: ViewGraph, registration: Registration
-) -> tuple[Pointmap, ...]:
-    """The point maps, with measured depth where it tells more than stereo; the same ones where none was measured.
-
-    Depth images that the points of the images contradict, or cannot judge, add nothing, which the log tells: without
-    numbers, for those of the result are of all points that matches and cameras agree on in the end. `graph`
-    and `registration` are those that the point maps were made of.
-    """
-    views = make_depth_views(graph, registration)
-    if not views:
-        return tuple(pointmaps)
-    fits = fit_depth_images(views)
-    for fit in fits:
-        is_used = all(_find_unit(name, fits, registration) is not None for name in fit.names)
-        log.log(logging.INFO if is_used else logging.WARNING, "%s", _describe_use(fit, is_used))
-    by_name = {view.name: view for view in views}
-    found = []
-    for pointmap in pointmaps:
-        unit = _find_unit(pointmap.name, fits, registration)
-        if unit is not None:
-            measured = warp_depth(by_name[pointmap.name], pointmap.K, pointmap.depth.shape)
-            pointmap = fuse_depth(pointmap, MeasuredDepth(measured.z / unit, measured.sigma / unit))
-        found.append(pointmap)
-    return tuple(found)
-
-
-def _find_unit(name: str, fits: Sequence[DepthFit], registration: Registration) -> float | None:
-    """Metres of the scene's unit by which a depth image is taken; None where it is not."""
-    fit = next((each for each in fits if name in each.names), None)
-    if fit is None or fit.is_usable:
-        return None if fit is None else fit.metres_per_unit
-    given = registration.given  # the cameras stand where depth images placed them, in their unit
-    by_depth = given is not None and given.from_depth and fit.check.code is DepthCode.UNTESTED
-    return given.scale if given is not None and by_depth else None
-
-
-def _describe_use(fit: DepthFit, is_used: bool) -> str:
-    who = f"depth images of {len(fit.names)} photographs" + (f" of {fit.camera_id}" if fit.camera_id else "")
-    if is_used and not fit.is_usable:
-        return f"{who} place the cameras and fill what the images cannot tell"
-    if is_used:
-        return f"{who} fit the images and fill what these cannot tell"
-    return f"{who} fill nothing: {fit.check.code.value}; the result tells why (depth_checks, report.json's depth)"
 
 
 def make_depth_views(graph: ViewGraph, registration: Registration) -> list[DepthView]:
@@ -437,9 +383,14 @@ def make_depth_view(keyframe: Keyframe, registration: Registration, camera: Regi
     return DepthView(keyframe.name, frame.camera_id, points, frame.depth, lens)
 
 
-def warp_depth(view: DepthView, K: Map, shape: tuple[int, int]) -> MeasuredDepth:
-    """The depth image as the pinhole K (3, 3) of its camera sees it, in `shape` (h, w)."""
-    z, sigma = view.surface
+def warp_depth(
+    view: DepthView, K: Map, shape: tuple[int, int], surface: tuple[Map, Map] | None = None
+) -> MeasuredDepth:
+    """The depth image, or the `surface` that was made of it, as the pinhole K (3, 3) of its camera sees it.
+
+    `shape` is (h, w).
+    """
+    z, sigma = surface or view.surface
     own = find_depth_lens(view.depth, view.lens)
     T_camera_depth = view.depth.matrix
     height, width = shape
@@ -485,29 +436,3 @@ def _splat(z: Map, sigma: Map, own: Intrinsics, T_camera_depth: Map, K: Map, sha
         for side, most in zip(shape, (height, width), strict=True)
     ]
     return MeasuredDepth(grid[np.ix_(*at)], its_sigma.reshape(height, width)[np.ix_(*at)])
-
-
-def fuse_depth(pointmap: Pointmap, measured: MeasuredDepth) -> Pointmap:
-    """The point map with measured depth (the scene's unit) where stereo tells none, and the mean where both agree.
-
-    Where both differ, what stereo is sure of stays: the images judge.
-    """
-    stereo = pointmap.depth.astype(np.float64)
-    share = np.where(measured.z > 0, measured.sigma / np.maximum(measured.z, 1e-12), np.inf)
-    there = (measured.z > 0) & (share < MOST_SIGMA)
-    by_stereo = (stereo > 0) & (pointmap.confidence >= LEAST_CONFIDENCE)
-    stereo_share = STEREO_SIGMA / np.sqrt(np.maximum(pointmap.confidence, 1e-3))
-    off = np.abs(np.log(np.where(there & by_stereo, measured.z / np.maximum(stereo, 1e-12), 1.0)))
-    near = off < _APART_SIGMAS * np.hypot(share, stereo_share)
-    both = there & by_stereo & near
-    instead = there & (~by_stereo | (~near & (pointmap.confidence < _SURE)))
-    weight = np.where(both, share**-2 / (share**-2 + stereo_share**-2), np.where(instead, 1.0, 0.0))
-    weight = np.nan_to_num(weight)
-    depth = np.where(weight > 0, (1.0 - weight) * stereo + weight * measured.z, stereo).astype(np.float32)
-    believed = np.clip(_CONFIDENT_SIGMA / np.maximum(share, 1e-6), LEAST_CONFIDENCE, _MOST_CONFIDENCE)
-    confidence = np.where(instead, believed, pointmap.confidence).astype(np.float32)
-    normal = np.where(instead[..., None], compute_depth_normals(depth, pointmap.K), pointmap.normal)
-    unchecked = pointmap.unchecked
-    if unchecked is not None:
-        unchecked = np.where(instead & (unchecked == 0), depth, unchecked).astype(np.float16)
-    return replace(pointmap, depth=depth, confidence=confidence, normal=normal.astype(np.float32), unchecked=unchecked)

@@ -159,7 +159,7 @@ def estimate_scale_from_depth(
     )
     of_scene = compute_scale_sigma(list(views.values()))
     agreed = combine_measurements(others) if others else None
-    told = [_measure(fit, of_scene, agreed if isinstance(agreed, Measurement) else None) for fit in fits]
+    told = [measure_by_depth(fit, of_scene, agreed if isinstance(agreed, Measurement) else None) for fit in fits]
     return [said for said, _ in told], tuple(check for _, check in told)
 
 
@@ -171,7 +171,13 @@ def _make_depth_view(name: str, view: MetricView, landmarks: Landmarks, own: Cam
     return DepthView(name, own.camera_id, in_camera, own.depth, lens)
 
 
-def _measure(fit: DepthFit, of_scene: float, agreed: Measurement | None) -> tuple[Measurement | str, DepthCheck]:
+def measure_by_depth(
+    fit: DepthFit, of_scene: float, agreed: Measurement | None
+) -> tuple[Measurement | str, DepthCheck]:
+    """The unit by the depth images of one camera, or why there is none, and the judgement on them.
+
+    `of_scene` is the standard deviation of the logarithm of the scene's lengths, `agreed` what other sources measured.
+    """
     check = fit.check
     if not fit.is_usable:
         return check.message, check
@@ -199,8 +205,7 @@ def _measure(fit: DepthFit, of_scene: float, agreed: Measurement | None) -> tupl
 Array = npt.NDArray[np.float64]
 
 MOST_DEG = 10.0  # standard deviation of up by gravity, beyond which it tells no upright frame
-# Standard deviation of a floor's normal against gravity: how level floors are, and how well their plane is found
-FLOOR_SIGMA_DEG = 1.0
+FLOOR_SIGMA_DEG = 1.0  # how level floors are; to this comes how well their plane is found
 BASE_SIGMA_DEG = 5.0  # of a base's z axis against gravity where nothing tells it: how level robots stand
 FARTHEST_MOUNT_M = 20.0  # of a camera from its base; beyond, the mount is probably in millimetres, which is told
 CONTRADICTED_DEG = 20.0  # between gravity and the floor, from which on this is told: a sign is wrong, or it is no floor
@@ -414,7 +419,7 @@ def _find_floor_up(snapshot: Snapshot) -> Up | None:
         return None
     x, y, z = (floor.normal / np.linalg.norm(floor.normal)).tolist()
     known = f"the floor, a plane through {100 * floor.share:.0f} % of the surface, with cameras taken as held upright"
-    return Up((x, y, z), FLOOR_SIGMA_DEG, known)
+    return Up((x, y, z), math.hypot(FLOOR_SIGMA_DEG, floor.tilt_deg), known)
 
 
 def make_upright_frame(T_world_camera: Array, up: Array) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from os import PathLike
 from pathlib import Path
@@ -107,6 +107,7 @@ class DepthObservation:
     K: npt.NDArray[np.float64]  # (3, 3) of the depth's pixels
     depth: Float32  # (h, w) z in the camera's frame, 0 where nobody confirms one
     error: float = DEPTH_ERROR  # of a depth, relative: its own, and what the camera's bounds let it be off
+    told: npt.NDArray[np.bool_] | None = None  # (h, w) where it tells free space (`find_telling`); None: everywhere
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
@@ -139,6 +140,60 @@ def _make_depth_observation(camera: CameraEstimate, depth: npt.NDArray[np.float1
     return DepthObservation(camera.T_world_camera, K, depth.astype(np.float32), DEPTH_ERROR + off)
 
 
+# Which depths tell free space: stereo of two images from nearly the same place is wrong in both alike.
+
+LEAST_PARALLAX_PX = 0.5  # of the photograph, by which DEPTH_ERROR of a depth moves a point in an image that confirms it
+_SIZE = 2.0  # pixels of a photograph for one of its depths
+_NEAREST = 24  # other cameras that a depth is compared with
+
+
+def find_telling(seen: Sequence[DepthObservation]) -> list[DepthObservation]:
+    """The observations with the depths that tell free space: those that two others confirm, or one from far aside."""
+    centres = np.stack([sight.T_world_camera[:3, 3] for sight in seen])
+    found = []
+    for sight, centre in zip(seen, centres, strict=True):
+        apart = np.linalg.norm(centres - centre, axis=1)
+        near = np.argsort(apart, kind="stable")[1 : _NEAREST + 1]
+        found.append(replace(sight, told=_find_told(sight, [seen[i] for i in near[::-1]])))  # far aside first
+    return found
+
+
+def _find_told(sight: DepthObservation, others: Sequence[DepthObservation]) -> npt.NDArray[np.bool_]:
+    rows, columns = np.nonzero(sight.depth)
+    points, told = sight.points, np.zeros(len(rows), bool)
+    count, open_yet = np.zeros(len(rows), np.int64), np.arange(len(rows))
+    reach = DEPTH_ERROR * max(sight.K[0, 0], sight.K[1, 1]) * _SIZE
+    for other in others:
+        if not len(open_yet):
+            break
+        agrees = _is_confirmed(points[open_yet], other)
+        own = open_yet[agrees]
+        count[own] += 1
+        told[own] |= count[own] > 1
+        rays = [points[own] - each.T_world_camera[:3, 3] for each in (sight, other)]
+        lengths = np.prod([np.linalg.norm(ray, axis=1) for ray in rays], axis=0)
+        sine = np.linalg.norm(np.cross(*rays), axis=1) / np.maximum(lengths, 1e-12)
+        told[own] |= reach * sine >= LEAST_PARALLAX_PX
+        open_yet = open_yet[~told[open_yet]]
+    found = np.zeros(sight.depth.shape, bool)
+    found[rows, columns] = told
+    return found
+
+
+def _is_confirmed(points: npt.NDArray[np.float64], other: DepthObservation) -> npt.NDArray[np.bool_]:
+    """(M,) whether the other camera has the depth of the world points (M, 3) where it sees them."""
+    T = np.linalg.inv(other.T_world_camera)
+    x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+    ahead = np.maximum(z, 1e-9)
+    column, row = other.K[0, 0] * x / ahead + other.K[0, 2], other.K[1, 1] * y / ahead + other.K[1, 2]
+    height, width = other.depth.shape
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    found = np.zeros(len(points), bool)
+    there = other.depth[row[inside].astype(np.intp), column[inside].astype(np.intp)]
+    found[inside] = np.abs(there - z[inside]) < DEPTH_ERROR * z[inside]
+    return found
+
+
 # Carving: which voxels rays of confirmed depth pass, whole, and well before they end.
 
 Mask = npt.NDArray[np.bool_]
@@ -162,7 +217,7 @@ def carve_free_space(
     """(X, Y, Z) the voxels that the camera looks through; `pause` is called in between, and may raise.
 
     A voxel is covered by the pixels around its centre that its bounding sphere reaches. Each of them must end beyond
-    the sphere, by the depth's uncertainty and a voxel; KNOWN_SHARE of them must have a depth.
+    the sphere, by the depth's uncertainty and a voxel; KNOWN_SHARE of them must have a depth that tells free space.
     """
     limits = _limits(sight, STOP_SHORT * layout.voxel)
     reach = np.float32(np.sqrt(3.0) / 2.0 * layout.voxel)
@@ -213,13 +268,14 @@ def _carve_block(
 def _limits(sight: DepthObservation, stop_short: float) -> Float32:
     """(radii, h, w) how far all rays of the square around a pixel pass; 0 where too few of them are known."""
     known = sight.depth > 0
+    told = known if sight.told is None else sight.told
     far = np.float32(np.finfo(np.float32).max)
     ends = np.where(known, (1.0 - sight.error) * sight.depth - stop_short, far).astype(np.float32)
     limits = []
     for radius in _RADII:
         window = np.ones((2 * radius + 1,) * 2, np.uint8)
         nearest = cv2.erode(ends, window, borderType=cv2.BORDER_CONSTANT, borderValue=(float(far),))
-        share = cv2.blur(known.astype(np.float32), window.shape, borderType=cv2.BORDER_CONSTANT)
+        share = cv2.blur(told.astype(np.float32), window.shape, borderType=cv2.BORDER_CONSTANT)
         limits.append(np.where((share >= KNOWN_SHARE - 1e-4) & (nearest < far), nearest, 0.0))
     return np.stack(limits).astype(np.float32)
 
@@ -244,6 +300,7 @@ class Floor:
     normal: Array  # (3,)
     offset: float
     share: float  # of the surface that was seen
+    tilt_deg: float = math.inf  # standard deviation of the normal, by how far its points spread and how thick they lie
 
     def height(self, point: Array, up: Array) -> float:
         """How far above the floor a point (3,) is, along `up` (3,)."""
@@ -274,7 +331,24 @@ def _refine_floor(best: Floor, sample: Array, centres: Array, unit: float) -> Fl
         normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
         normal = normal * np.sign(normal @ best.normal)
         best = _validate_floor(normal, float(middle @ normal), sample, centres, unit) or best
-    return best
+    return replace(best, tilt_deg=_measure_tilt_deg(best, sample, unit))
+
+
+def _measure_tilt_deg(floor: Floor, sample: Array, unit: float) -> float:
+    """How thick the floor's points lie over how far they reach where they reach least, as an angle.
+
+    However many they are, they count as one: depths beside each other are wrong alike, and bend a floor. A few far
+    aside, as where the plane cuts a wall, do not make a strip wide.
+    """
+    near = sample[np.abs(sample @ floor.normal - floor.offset) < THICKNESS * unit]
+    if len(near) < 3:
+        return math.inf
+    off, axes = near - np.median(near, axis=0), np.linalg.svd(near - near.mean(0), full_matrices=False)[2]
+    along = np.linspace(0.0, np.pi, 12, endpoint=False)  # in the plane: where it is narrowest
+    ways = np.cos(along)[:, None] * axes[0] + np.sin(along)[:, None] * axes[1]
+    low, high = np.percentile(off @ ways.T, (16.0, 84.0), axis=0)
+    thick = float(np.std(off @ axes[2]))
+    return float(np.degrees(np.arctan2(thick, (high - low).min() / 2.0)))
 
 
 def _planes(points: Array, rng: np.random.Generator, up: Array, cosine: float) -> list[tuple[Array, float]]:
@@ -463,6 +537,7 @@ class OccupancyMap:
 # Surfaces: which voxels a surface is in that two photographs confirm.
 
 BLUR = 0.008  # of a depth, by which it may well be wrong: nine of ten are better
+_FEW = 4_000_000  # voxels, which are counted all at once: faster, and takes 8 bytes each
 LEAST_POINTS = 2  # pixels of confirmed depth in a voxel: a single one may be a blend of what is before and behind
 
 
@@ -471,12 +546,17 @@ def find_surface_voxels(parts: Iterable[npt.NDArray[np.float64]], layout: Layout
 
     They come in parts, as of one camera each, so that a map of many cameras takes no more memory than one of a few.
     """
-    counts = np.zeros(int(np.prod(layout.shape)), np.int32)
+    counts, (_, width, depth) = np.zeros(int(np.prod(layout.shape)), np.int32), layout.shape
     for points in parts:
         index = np.floor(points / layout.voxel).astype(np.int64) - layout.first
         inside = ((index >= 0) & (index < layout.shape)).all(1)
-        voxels, times = np.unique(np.ravel_multi_index(tuple(index[inside].T), layout.shape), return_counts=True)
-        counts[voxels] += times.astype(np.int32)
+        i, j, k = index[inside].T
+        number = (i * width + j) * depth + k
+        if len(counts) <= _FEW:
+            counts += np.bincount(number, minlength=len(counts)).astype(np.int32)
+        else:
+            voxels, times = np.unique(number, return_counts=True)
+            counts[voxels] += times.astype(np.int32)
     return (counts >= LEAST_POINTS).reshape(layout.shape)
 
 
@@ -525,7 +605,7 @@ def occupancy_map(
         _transform_to_map(points, T), _transform_to_map(centres, T), unit, snapshot.scale.metric, voxel
     )
     states = np.zeros(layout.shape, np.uint8)
-    for sight in seen:
+    for sight in find_telling(seen):
         states[carve_free_space(sight, layout, T, pause)] = VoxelState.FREE
     pause()
     states[find_surface_voxels((_transform_to_map(thicken_points(sight), T) for sight in seen), layout)] = (

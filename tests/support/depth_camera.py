@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.depth_image import DepthImage, make_depth_image
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import Frame, Intrinsics
 
 _FOCAL_BASELINE = 450 * 0.075  # pixels metres of an OAK at 640 pixels across
 _STEP_PX = 1 / 8  # of disparity
@@ -26,6 +26,8 @@ class DepthCamera:
     holes: float = 0.12  # share of pixels without a depth, in blobs
     scale: float = 1.0  # by which every depth is too large
     shift_px: tuple[float, float] = (0.0, 0.0)  # by which the depth image lies beside its photograph, at 640 across
+    aside_m: float = 0.0  # by which it stands to the right of its photograph's camera
+    is_aside_told: bool = False  # whether the depth image says so
     seed: int = 0
 
 
@@ -50,7 +52,22 @@ def measure(z: npt.NDArray[np.float32], camera: DepthCamera, number: int = 0) ->
 def add_depths(frames: Sequence[Frame], config: synthetic.Config, camera: DepthCamera | None = None) -> list[Frame]:
     """The photographs of the built-in capture, each with what the depth camera measured."""
     camera = camera or DepthCamera()
-    return [replace(each, depth=measure(synthetic.depth(config, i), camera, i)) for i, each in enumerate(frames)]
+    return [replace(each, depth=photograph_depth(config, camera, i)) for i, each in enumerate(frames)]
+
+
+def photograph_depth(
+    config: synthetic.Config, camera: DepthCamera, index: int, number: int | None = None
+) -> DepthImage:
+    """What the camera tells beside a photograph of the built-in capture; `number` chooses its noise, else `index`."""
+    T, K = synthetic.scene_cameras(config)[index]
+    T_camera_depth = np.eye(4)
+    T_camera_depth[0, 3] = camera.aside_m
+    z = synthetic.depth_map(config, (T @ T_camera_depth, K))
+    found = measure(z, camera, index)
+    if not camera.is_aside_told:
+        return found
+    lens = Intrinsics(config.width, config.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given")
+    return replace(found, intrinsics=lens, T_camera_depth=tuple(T_camera_depth.ravel().tolist()))
 
 
 def whitewash(frames: Sequence[Frame], config: synthetic.Config) -> list[Frame]:

@@ -17,10 +17,10 @@ from splatnode.recon.metric.depth_fit import (
     MeasuredDepth,
     describe_doubtful_units,
     fit_depth_images,
-    fuse_depth,
     smooth_depth,
     warp_depth,
 )
+from splatnode.recon.metric.depth_fusion import fuse_depth
 from splatnode.recon.metric.measurement import Measurement, MetricConfig
 from splatnode.recon.metric.metres import (
     CameraDepth,

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.metric.metres import transform_rigidly
-from splatnode.recon.occupancy import NoMap, OccupancyMap, VoxelState, occupancy_map
+from splatnode.recon.occupancy import DepthObservation, NoMap, OccupancyMap, VoxelState, find_telling, occupancy_map
 from splatnode.recon.occupancy.files import encode_nav2
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale
@@ -160,3 +160,20 @@ def test_poses_in_a_world_whose_z_is_not_up_give_a_map_no_axes(room):
     first = occupancy_map(replace(room, scale=Scale(True, "a marker")))
     assert not first.upright.is_of_result  # the first camera's frame has none
     assert b"x is forward of the first camera" in encode_nav2(first, (0.3, 0.6))["map.yaml"]
+
+
+def _observe(depth: float, at: float) -> DepthObservation:
+    """A wall that a camera `at` metres aside sees, 150 pixels of focal length at half the photograph's size."""
+    K, T = np.array([[150.0, 0, 60], [0, 150.0, 45], [0, 0, 1]]), np.eye(4)
+    T[0, 3] = at
+    return DepthObservation(T, K, np.full((90, 120), depth, np.float32))
+
+
+def test_stereo_from_nearly_one_place_tells_no_free_space_until_a_third_image_confirms_it():
+    """2 % of the depth are half a pixel of the photograph at 4.8 degrees: 0.25 m aside of 3 m."""
+    near, far = _observe(3.0, 0.1), _observe(3.0, 0.4)
+    alone = _observe(3.0, 0.0)
+    assert not find_telling([alone, near])[0].told.any()
+    assert find_telling([alone, far])[0].told[:, 30:].all()
+    assert find_telling([alone, near, _observe(3.0, -0.1)])[0].told[10:-10, 10:-10].all()
+    assert not find_telling([alone, _observe(3.2, 0.4)])[0].told.any(), "it sees something else"

@@ -35,6 +35,25 @@ def test_the_floor_is_found_below_a_table_that_more_pixels_show():
     )
 
 
+def test_a_strip_of_floor_tells_up_less_surely_than_a_whole_one():
+    """And by as much as strips are really off: depths beside each other are wrong alike, as of a bent floor."""
+    centres, sigmas = np.stack(cameras(1.5, 1.6, 1.4))[:, :3, 3], []
+    for wide in (2.0, 0.15):
+        off = []
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            points = room(rng, 3000, 0, 9000)
+            points[:3000, 1] *= wide / 2.0
+            bend = rng.normal(0.0, 0.01, 2)  # at its ends
+            points[:3000, 2] += bend[0] * points[:3000, 0] / 3.0 + bend[1] * (points[:3000, 1] / wide) ** 3
+            floor = find_floor(points, centres, UP, 3.0)
+            assert floor is not None
+            off.append(np.degrees(np.arccos(min(1.0, floor.normal @ UP))))
+            sigmas.append(floor.tilt_deg)
+        assert np.mean(np.array(off) < 1.96 * np.hypot(1.0, sigmas[-12:])) > 0.9
+    assert np.median(sigmas[:12]) < 1.0 and np.median(sigmas[12:]) > 3.0 * np.median(sigmas[:12])
+
+
 @pytest.mark.parametrize(("floor", "table"), [(0, 0), (0, 6000), (200, 200)])
 def test_without_a_floor_none_is_found(floor, table):
     """A table that hides what is below it is no floor: the wall goes on below it."""
