@@ -148,8 +148,10 @@ def main() -> None:
     parser.add_argument("--drifts", type=names, default=tuple(map(str, (*DRIFTS, *MILD))), help="of the runs")
     arguments, folders, scoring = parsed(parser)
     scoring = replace(scoring, settings=SETTINGS)
-    known = json.loads(arguments.out.read_text())["rows"] if arguments.out.exists() else []
+    before = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"command": "", "rows": []}
+    known = before["rows"]
     command = shlex.join(["python", "-m", "tests.bench", "drift", *sys.argv[1:]])
+    command = "; ".join(dict.fromkeys((*filter(None, before["command"].split("; ")), command)))
     for each, drift, method in planned(arguments.cases or [*SETS, *OWN], tuple(arguments.methods)):
         if str(drift) not in arguments.drifts:
             continue
