@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -222,7 +222,7 @@ def _describe_use(fit: DepthFit, is_used: bool) -> str:
 
 def _find_partners(
     views: Sequence[DepthView],
-    wanted: Collection[str],
+    wanted: Set[str],
     units: Mapping[str, float | None],
     graph: ViewGraph,
     registration: Registration,
@@ -230,7 +230,7 @@ def _find_partners(
     """Finds for each wanted image the others whose measured depth shares most with it."""
     cameras = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
     by_name = {view.name: view for view in views}
-    names = sorted(wanted.union(by_name), key=lambda name: cameras[name].index)
+    names = sorted(wanted | by_name.keys(), key=lambda name: cameras[name].index)
     if len(names) <= MOST_PARTNERS + 1:
         return {name: tuple(each for each in names if each != name and each in by_name) for name in names}
     coarse = []
@@ -271,7 +271,7 @@ def _make_measured_view(view: DepthView, unit: float, graph: ViewGraph, registra
 
 
 def _measure_nothing(pointmap: Pointmap) -> MeasuredDepth:
-    return MeasuredDepth(*np.zeros((2, *pointmap.depth.shape)))
+    return MeasuredDepth(np.zeros(pointmap.depth.shape), np.zeros(pointmap.depth.shape))
 
 
 # Every pixel has a few candidates: what stereo tells, what its own depth camera measured, and what the depth cameras of

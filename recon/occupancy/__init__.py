@@ -170,9 +170,9 @@ def _find_told(sight: DepthObservation, others: Sequence[DepthObservation]) -> n
         own = open_yet[agrees]
         count[own] += 1
         told[own] |= count[own] > 1
-        rays = [points[own] - each.T_world_camera[:3, 3] for each in (sight, other)]
-        lengths = np.prod([np.linalg.norm(ray, axis=1) for ray in rays], axis=0)
-        sine = np.linalg.norm(np.cross(*rays), axis=1) / np.maximum(lengths, 1e-12)
+        here, there = (points[own] - each.T_world_camera[:3, 3] for each in (sight, other))
+        lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1)
+        sine = np.linalg.norm(np.cross(here, there), axis=1) / np.maximum(lengths, 1e-12)
         told[own] |= reach * sine >= LEAST_PARALLAX_PX
         open_yet = open_yet[~told[open_yet]]
     found = np.zeros(sight.depth.shape, bool)
