@@ -39,7 +39,6 @@ from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.optimize import photometric_losses
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.view_exposure import (
-    InterpolatedGains,
     ViewGains,
     collect_view_gains,
     interpolate_gains,
@@ -468,12 +467,12 @@ class Run:
     peak_rss_mb: float | None
 
 
-EXPOSURES = ("interpolated", "best_gain")  # of renders, beside the scene's own
+EXPOSURES = "raw", "interpolated", "best_gain"  # of renders: the scene's, that of the training views around, and best
 
 
 @dataclass(frozen=True)
 class ExposureScore:
-    """Scores of renders with gains: those that the training views imply, or that fit each photograph best."""
+    """Scores of renders with gains: none, those that the training views imply, or that fit each photograph best."""
 
     psnr: float  # dB, mean over the test views, as are the next
     ssim: float
@@ -492,7 +491,9 @@ class Row:
     checkpoint: int | None  # the iterations at which this row was asked for; None: the end of the run
     final: bool
     iterations: int | None = None
-    psnr: float | None = None  # dB, mean over the test views, as are the next four
+    # dB, mean over the test views, as are the next four: of renders as users get them, with the gains that the training
+    # views imply, or with the best ones, where the settings say so
+    psnr: float | None = None
     psnr_with_rim: float | None = None  # over whole photographs, with the black rims that undistortion left
     ssim: float | None = None
     lpips_alex: float | None = None
@@ -653,10 +654,11 @@ def _score_test_views(
         ).T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
-        exposures = _score_exposures(with_rim, view, networks, interpolate_gains(gains, T_world_camera, place))
+        implied = torch.from_numpy(interpolate_gains(gains, T_world_camera, place).gains).float()
+        exposures = _score_exposures(with_rim, view, networks, implied)
         if settings.best_gain:
-            with_rim = with_rim * fit_gains(truth, with_rim[rows, columns], used[rows, columns])
-        with_rim = with_rim.clamp(0.0, 1.0)
+            implied = fit_gains(truth, with_rim[rows, columns], used[rows, columns])
+        with_rim = (with_rim * implied).clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
         known = undistort_counts(cameras[0].lens, counts[name]) if name in counts else None
         own = _score_view(with_rim, whole, used, view.shown, networks, known)
@@ -665,13 +667,13 @@ def _score_test_views(
 
 
 def _score_exposures(
-    render: Tensor, view: HeldOutView, networks: PerceptualNetworks, interpolated: InterpolatedGains
+    render: Tensor, view: HeldOutView, networks: PerceptualNetworks, implied: Tensor
 ) -> dict[str, ExposureScore]:
-    """Scores a render (H, W, 3) in the scene's exposure with each of EXPOSURES."""
+    """Scores a render (H, W, 3) in the exposure of the scene with each of EXPOSURES; `implied` (3,) are its gains."""
     quick = PerceptualNetworks(networks.alex, None)
     best = fit_gains(view.photograph[view.shown], render[view.shown], view.used[view.shown])
     scores = {}
-    for kind, gains in zip(EXPOSURES, (torch.from_numpy(interpolated.gains).to(best), best), strict=True):
+    for kind, gains in zip(EXPOSURES, (torch.ones(3), implied, best), strict=True):
         own = _score_view((gains * render).clamp(0.0, 1.0), view.photograph, view.used, view.shown, quick, None)
         error = 100.0 * float((gains / best - 1.0).square().mean().sqrt())
         scores[kind] = ExposureScore(own.psnr, own.ssim, own.lpips_alex, error)

@@ -253,8 +253,7 @@ def make_exposure_table(ends: Sequence[Row]) -> Table:
         rows = [row for row in shared if (row.views, row.method) == (views, method)]
         cells = [str(views), method]
         for name, digits in (("psnr", 2), ("ssim", 4)):
-            means = [compute_mean([getattr(row, name) for row in rows])]
-            means += [compute_mean([getattr(row.exposures[kind], name) for row in rows]) for kind in EXPOSURES]
+            means = [compute_mean([getattr(row.exposures[kind], name) for row in rows]) for kind in EXPOSURES]
             cells += [format_number(mean, digits) for mean in means]
         errors = [row.exposures["interpolated"].gain_error_pct for row in rows]
         body.append((*cells, format_number(compute_mean(errors), 1)))
@@ -642,7 +641,10 @@ def _format_csv(records: Sequence[Mapping[str, Any]]) -> bytes:
 logger = logging.getLogger(__name__)
 
 _STARTS = {"true": "the true pose", "interpolated": "between the neighbouring cameras"}
-_GAINS = {False: "", True: ", in the exposure and white balance of each held-out photograph"}
+_GAINS = {
+    False: ", in the exposure that the training views around imply there",
+    True: ", in the exposure and white balance of each held-out photograph",
+}
 _STYLE = (
     "body{font:15px/1.45 sans-serif;margin:2em auto;max-width:1500px;padding:0 1em;color:#222}"
     "table{border-collapse:collapse;margin:1em 0;display:block;overflow-x:auto}td,th{border-bottom:1px solid #ddd;"

@@ -115,9 +115,12 @@ def measure(case: Case, start: bytes, drift: float, method: str, chosen: int, sc
         lambda: last(begun, config), shown.scene, shown.split, scoring.networks, scoring.settings
     )
     gains = np.array(list(snapshot.gains.values()) or [[1.0]])
+    exposures = dict(row.exposures)
+    raw = exposures.pop("raw", None)
     return Row(
-        *(case.scene.name, len(case.split.train), drift, method, row.verdict, row.psnr, row.ssim, row.lpips_alex),
-        *(dict(row.exposures), round(float((gains.max(0) / gains.min(0)).max()), 3)),
+        *(case.scene.name, len(case.split.train), drift, method, row.verdict),
+        *((raw.psnr, raw.ssim, raw.lpips_alex) if raw else (None, None, None)),
+        *(exposures, round(float((gains.max(0) / gains.min(0)).max()), 3)),
         round(1.0 - math.exp(-max(snapshot.falloffs.values(), default=0.0)), 3),
         *(row.num_gaussians, round(seconds, 1)),
     )

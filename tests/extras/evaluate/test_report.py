@@ -39,7 +39,11 @@ def row(scene: str, method: str) -> Row:
 
 
 def test_scores_in_other_exposures_have_a_table_and_columns_of_their_own(tmp_path):
-    scores = {"interpolated": ExposureScore(31.5, 0.91, 0.1, 1.5), "best_gain": ExposureScore(32.25, 0.92, 0.1, 0.0)}
+    scores = {
+        "raw": ExposureScore(30.0, 0.9, 0.1, 9.0),
+        "interpolated": ExposureScore(31.5, 0.91, 0.1, 1.5),
+        "best_gain": ExposureScore(32.25, 0.92, 0.1, 0.0),
+    }
     bench = Bench((replace(row("place", "ours"), exposures=scores), row("place", "old")), Settings(), {}, "bench")
     text = make_report_files(bench, tmp_path)["report.md"].decode()
     assert "| 3 | ours | 30.00 | 31.50 | 32.25 | 0.9000 | 0.9100 | 0.9200 | 1.5 |" in text
