@@ -123,6 +123,9 @@ _LEAST_GAIN = 4.0  # standard deviations by which depths fit better at another p
 _LEAST_SHARE = 0.7  # of the points that have a depth somewhere: a shift must keep so many
 _LEAST_AGREEING = 0.5  # share of the points whose depths agree: of fewer, the depth camera saw something else
 _AGREEING_SIGMAS = 4.0
+# How much of its logarithm a depth may be off by where cameras are rough: a focal length that nothing tells bends the
+# scene. Beyond, it is not the cameras: disparity in place of depth has 2
+_MOST_BENDING = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +153,11 @@ class DepthFit:
     metres_per_unit: float
     sigma: float  # standard deviation of its logarithm, without what all images know of the scene together
     check: DepthCheck
+
+    @property
+    def has_too_few_points(self) -> bool:
+        """Whether nothing was compared."""
+        return self.check.code is DepthCode.UNTESTED and self.check.num_points < LEAST_POINTS
 
     @property
     def is_usable(self) -> bool:
@@ -237,8 +245,47 @@ def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
     agreeing = float((np.abs(ratio[known] - mean) < _AGREEING_SIGMAS * sigma[known]).mean())
     shift, gain = _find_shift(samples, scale)
     check = _judge(camera_id, len(names), int(known.sum()), agreeing, shift, gain)
+    if check.code is not DepthCode.FITS and (bending := _find_bending(samples, scale)):
+        return _blame_cameras(check, names, bending)
     noise = max(view.depth.noise.scale_sigma for view in views)
     return DepthFit(camera_id, names, unit * float(np.exp(mean)), float(np.hypot(mean_sigma, noise)), check)
+
+
+def _find_bending(samples: _Samples, scale: float) -> float:
+    """Finds by how much of its logarithm a depth is off, if depth images fit but for that; 0 where they do not.
+
+    A wrong focal length has far things too near, or too far, for all images alike.
+    """
+    ratio, sigma = samples.look((0.0, 0.0), scale)
+    known = np.isfinite(ratio)
+    log_z = samples.log_z - float(np.median(samples.log_z[known]))
+    factors = np.column_stack([np.ones(int(known.sum())), log_z[known]])
+    found, weights = np.zeros(2), np.ones(int(known.sum()))
+    for _ in range(_ROUNDS):
+        weighted = factors * (weights / sigma[known] ** 2)[:, None]
+        found = np.linalg.lstsq(factors.T @ weighted, weighted.T @ ratio[known], rcond=None)[0]
+        off = np.abs(ratio[known] - factors @ found) / sigma[known]
+        weights = np.where(off > _CUT, 0.0, np.clip(_HUBER / np.maximum(off, 1e-12), 0.0, 1.0))
+    bending = float(found[1])
+    if not weights.any() or abs(bending) > _MOST_BENDING:
+        return 0.0
+    straight = replace(samples, log_z=samples.log_z + bending * log_z)
+    shift, gain = _find_shift(straight, scale)
+    agreeing = float((off < _AGREEING_SIGMAS).mean())
+    fits = agreeing >= _LEAST_AGREEING and (gain <= _LEAST_GAIN or float(np.hypot(*shift)) < _LEAST_SHIFT_PX)
+    return bending if fits else 0.0
+
+
+def _blame_cameras(check: DepthCheck, names: tuple[str, ...], bending: float) -> DepthFit:
+    """The fit of depth images that the cameras, which are rough, cannot be compared with."""
+    who = f"depth images of {len(names)} photographs" + (f" of {check.camera_id}" if check.camera_id else "")
+    message = (
+        f"{who} were left out: they fit the images only if the estimated cameras, not the depths, have things twice as "
+        f"far {100 * abs(np.expm1(-bending * np.log(2.0))):.0f} % too {'far' if bending < 0 else 'near'}, as a wrong "
+        "focal length makes it. Give the lens (--intrinsics FILE; Python: intrinsics=)"
+    )
+    untested = DepthCheck(DepthCode.UNTESTED, message, check.camera_id, check.num_points)
+    return DepthFit(check.camera_id, names, 1.0, float("inf"), untested)
 
 
 def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Samples:

@@ -44,7 +44,6 @@ from splatnode.recon.priors import (
     project_nearest,
 )
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.result.snapshot import DepthCode
 from splatnode.recon.threads import map_parallel
 
 log = logging.getLogger(__name__)
@@ -207,7 +206,7 @@ def _find_unit(name: str, fits: Sequence[DepthFit], registration: Registration) 
     if fit is None or fit.is_usable:
         return None if fit is None else fit.metres_per_unit
     given = registration.given  # the cameras stand where depth images placed them, in their unit
-    by_depth = given is not None and given.from_depth and fit.check.code is DepthCode.UNTESTED
+    by_depth = given is not None and given.from_depth and fit.has_too_few_points
     return given.scale if given is not None and by_depth else None
 
 

@@ -15,7 +15,7 @@ from splatnode.capture.lenses import straighten_depth
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity, invert_pose
-from splatnode.recon.metric.depth_fit import DepthFit, DepthView, fit_depth_images, merge_lens
+from splatnode.recon.metric.depth_fit import LEAST_POINTS, DepthFit, DepthView, fit_depth_images, merge_lens
 from splatnode.recon.metric.measurement import (
     MAX_DEVIATION,
     MarkerDetection,
@@ -576,7 +576,7 @@ def _collect_measurements(
 
 def _describe_placing(check: DepthCheck) -> DepthCheck:
     """The check of depth images that place the cameras: that points of the photographs are too few leaves them in."""
-    if check.code is not DepthCode.UNTESTED:
+    if check.code is not DepthCode.UNTESTED or check.num_points >= LEAST_POINTS:
         return check
     message = (
         f"depth images place the cameras; {check.num_points} points of the images have a depth, too few for a test"

@@ -26,7 +26,7 @@ class DepthCode(Enum):
     """FITS alone lets depth images count for depth; their unit counts where no other source contradicts it."""
 
     FITS = "FITS"
-    UNTESTED = "DEPTH_UNTESTED"  # too few points of the images have a depth
+    UNTESTED = "DEPTH_UNTESTED"  # too few points of the images have a depth, or the cameras are too rough
     SHIFTED = "DEPTH_SHIFTED"  # not aligned with the images
     CONTRADICTS = "DEPTH_CONTRADICTS"  # other depths than the images tell
     SCALE = "DEPTH_SCALE"  # another unit than all other sources of metres give

@@ -51,7 +51,7 @@ class Row:
     found_alone: float | None
     found: float | None
     cameras: int  # of each kind
-    good_named: int  # by the points, or beside the marker
+    good_named: int  # by the points, or beside the marker; not those that rough cameras leave untested
     shifted_named: int
     scale_named: int
     worst_unit_percent: float | None  # of the good ones, after those that are wrong by what stereo knows
@@ -100,7 +100,8 @@ def measure_case(name: str, folders: Folders, cameras: int) -> Row:
         for seed in range(cameras):
             codes, error = judge(alone, frames, true, unit, kind, seed)
             wanted = {"good": DepthCode.FITS, "shifted": DepthCode.SHIFTED, "3 % too large": DepthCode.SCALE}[kind]
-            named[kind] += (codes[-1] is not DepthCode.FITS) if kind == "good" else wanted in codes
+            accused = codes[-1] not in (DepthCode.FITS, DepthCode.UNTESTED)
+            named[kind] += accused if kind == "good" else wanted in codes
             errors += [abs(error)] if kind == "good" and error is not None else []
     worst = 100 * max(errors) if errors else None
     return Row(name, known, code, found.verdict.code.value, *shares, cameras, *named.values(), worst)

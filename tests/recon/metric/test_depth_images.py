@@ -82,6 +82,31 @@ def test_a_shift_of_four_pixels_is_named_and_its_depth_left_out(shift):
     assert "not aligned" in found.check.message and "Align depth to colour" in found.check.message
 
 
+def bend(by: float, camera: DepthCamera = GOOD) -> DepthFit:
+    """The fit beside a scene whose focal length is wrong: far things are too far, and near ones too near."""
+    bent = [replace(each, points=each.points * (each.points[:, 2:] * UNIT / 2.0) ** by) for each in views(camera)]
+    (found,) = fit_depth_images(bent)
+    return found
+
+
+@pytest.mark.parametrize("by", [0.12, -0.12])
+def test_a_scene_that_is_bent_is_no_fault_of_the_depth_camera(by):
+    found = bend(by)
+    assert found.check.code is DepthCode.UNTESTED and not found.is_usable and not found.has_too_few_points
+    told = "too far" if by > 0 else "too near"
+    assert "only if the estimated cameras, not the depths" in found.check.message and told in found.check.message
+    assert "--intrinsics" in found.check.message
+
+
+@pytest.mark.parametrize("shift", [(6.0, 0.0), (0.0, -6.0)])
+def test_beside_a_bent_scene_a_shift_is_still_named(shift):
+    assert bend(0.05, DepthCamera(shift_px=shift)).check.code is DepthCode.SHIFTED
+
+
+def test_what_no_cameras_bend_so_much_is_no_fault_of_theirs():
+    assert bend(-0.3).check.code in (DepthCode.SHIFTED, DepthCode.CONTRADICTS)
+
+
 def test_a_shift_at_the_end_of_the_search_is_called_the_least():
     found = fit(DepthCamera(shift_px=(14.0, 0.0))).check
     assert found.code is DepthCode.SHIFTED and found.shift_is_least and found.record()["shift_is_least"] is True
