@@ -260,7 +260,7 @@ def _find_bending(samples: _Samples, scale: float) -> float:
     known = np.isfinite(ratio)
     log_z = samples.log_z - float(np.median(samples.log_z[known]))
     factors = np.column_stack([np.ones(int(known.sum())), log_z[known]])
-    found, weights = np.zeros(2), np.ones(int(known.sum()))
+    found, weights, off = np.zeros(2), np.ones(len(factors)), np.zeros(len(factors))
     for _ in range(_ROUNDS):
         weighted = factors * (weights / sigma[known] ** 2)[:, None]
         found = np.linalg.lstsq(factors.T @ weighted, weighted.T @ ratio[known], rcond=None)[0]
