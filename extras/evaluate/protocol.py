@@ -655,29 +655,27 @@ def _score_test_views(
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
         implied = torch.from_numpy(interpolate_gains(gains, T_world_camera, place).gains).float()
-        exposures = _score_exposures(with_rim, view, networks, implied)
-        if settings.best_gain:
-            implied = fit_gains(truth, with_rim[rows, columns], used[rows, columns])
-        with_rim = (with_rim * implied).clamp(0.0, 1.0)
-        show(name, truth, with_rim[rows, columns])
+        best = fit_gains(truth, with_rim[rows, columns], used[rows, columns])
+        gains_of = dict(zip(EXPOSURES, (torch.ones(3), implied, best), strict=True))
+        main = "best_gain" if settings.best_gain else "interpolated"
+        shown = (with_rim * gains_of[main]).clamp(0.0, 1.0)
+        show(name, truth, shown[rows, columns])
         known = undistort_counts(cameras[0].lens, counts[name]) if name in counts else None
-        own = _score_view(with_rim, whole, used, view.shown, networks, known)
+        own = _score_view(shown, whole, used, view.shown, networks, known)
+        exposures = {main: _describe_exposure(own, gains_of[main], best)}
+        for kind in EXPOSURES:
+            if kind != main:
+                other = (with_rim * gains_of[kind]).clamp(0.0, 1.0)
+                scored = _score_view(other, whole, used, view.shown, PerceptualNetworks(networks.alex, None), None)
+                exposures[kind] = _describe_exposure(scored, gains_of[kind], best)
         scores.append(replace(own, exposures=exposures))
     return scores
 
 
-def _score_exposures(
-    render: Tensor, view: HeldOutView, networks: PerceptualNetworks, implied: Tensor
-) -> dict[str, ExposureScore]:
-    """Scores a render (H, W, 3) in the exposure of the scene with each of EXPOSURES; `implied` (3,) are its gains."""
-    quick = PerceptualNetworks(networks.alex, None)
-    best = fit_gains(view.photograph[view.shown], render[view.shown], view.used[view.shown])
-    scores = {}
-    for kind, gains in zip(EXPOSURES, (torch.ones(3), implied, best), strict=True):
-        own = _score_view((gains * render).clamp(0.0, 1.0), view.photograph, view.used, view.shown, quick, None)
-        error = 100.0 * float((gains / best - 1.0).square().mean().sqrt())
-        scores[kind] = ExposureScore(own.psnr, own.ssim, own.lpips_alex, error)
-    return scores
+def _describe_exposure(score: _ViewScore, gains: Tensor, best: Tensor) -> ExposureScore:
+    """The score of a render with `gains` (3,), beside those that fit the photograph best."""
+    error = 100.0 * float((gains / best - 1.0).square().mean().sqrt())
+    return ExposureScore(score.psnr, score.ssim, score.lpips_alex, error)
 
 
 def _average_exposures(scores: Sequence[ExposureScore]) -> ExposureScore:

@@ -144,6 +144,11 @@ class DepthView:
         return smooth_depth(self.depth)
 
 
+def has_too_few_points(check: DepthCheck) -> bool:
+    """Whether depth images are untested because nothing was compared, and not because the cameras are rough."""
+    return check.code is DepthCode.UNTESTED and check.num_points < LEAST_POINTS
+
+
 @dataclass(frozen=True, eq=False)
 class DepthFit:
     """The depth images of one camera, as the scene's points judge them."""
@@ -153,11 +158,6 @@ class DepthFit:
     metres_per_unit: float
     sigma: float  # standard deviation of its logarithm, without what all images know of the scene together
     check: DepthCheck
-
-    @property
-    def has_too_few_points(self) -> bool:
-        """Whether nothing was compared."""
-        return self.check.code is DepthCode.UNTESTED and self.check.num_points < LEAST_POINTS
 
     @property
     def is_usable(self) -> bool:
@@ -278,7 +278,7 @@ def _find_bending(samples: _Samples, scale: float) -> float:
 
 def _blame_cameras(check: DepthCheck, names: tuple[str, ...], bending: float) -> DepthFit:
     """The fit of depth images that the cameras, which are rough, cannot be compared with."""
-    who = f"depth images of {len(names)} photographs" + (f" of {check.camera_id}" if check.camera_id else "")
+    who = name_depth_images(len(names), check.camera_id)
     message = (
         f"{who} were left out: they fit the images only if the estimated cameras, not the depths, have things twice as "
         f"far {100 * abs(np.expm1(-bending * np.log(2.0))):.0f} % too {'far' if bending < 0 else 'near'}, as a wrong "
@@ -346,10 +346,15 @@ def _compute_costs(samples: _Samples, shift: tuple[float, float], scale: float) 
     return np.minimum(((ratio - np.median(ratio[known])) / sigma) ** 2, _CUT**2)
 
 
+def name_depth_images(count: int, camera_id: str) -> str:
+    """Names so many depth images of one camera in a message; without an id there is one camera."""
+    return f"depth images of {count} photographs" + (f" of {camera_id}" if camera_id else "")
+
+
 def _judge(
     camera_id: str, num_images: int, num_points: int, agreeing: float, shift: tuple[float, float], gain: float
 ) -> DepthCheck:
-    who = f"depth images of {num_images} photographs" + (f" of {camera_id}" if camera_id else "")
+    who = name_depth_images(num_images, camera_id)
     size = float(np.hypot(*shift))
     made = DepthCheck(DepthCode.FITS, f"{who} fit {num_points} points of the images", camera_id, num_points)
     if gain > _LEAST_GAIN and size >= _LEAST_SHIFT_PX:
@@ -380,7 +385,7 @@ def _judge(
 def _explain_few(views: Sequence[DepthView], count: int) -> DepthFit:
     camera_id, names = views[0].camera_id, tuple(view.name for view in views)
     doubts = (doubt for view in views if (doubt := describe_doubtful_unit(view.depth)))
-    who = f"depth images of {len(names)} photographs" + (f" of {camera_id}" if camera_id else "")
+    who = name_depth_images(len(names), camera_id)
     message = f"{who} have a depth at {count} points of the images; {LEAST_POINTS} are needed to use them"
     if (doubt := next(doubts, None)) is not None:
         message += f": {doubt}"

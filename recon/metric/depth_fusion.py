@@ -31,7 +31,9 @@ from splatnode.recon.metric.depth_fit import (
     compute_nearness,
     fit_depth_images,
     fit_planes,
+    has_too_few_points,
     make_depth_views,
+    name_depth_images,
     warp_depth,
 )
 from splatnode.recon.priors import (
@@ -175,10 +177,10 @@ def fill_measured_depth(
     if not views:
         return tuple(pointmaps)
     fits = fit_depth_images(views)
-    for fit in fits:
-        is_used = all(_find_unit(name, fits, registration) is not None for name in fit.names)
-        log.log(logging.INFO if is_used else logging.WARNING, "%s", _describe_use(fit, is_used))
     units = {view.name: _find_unit(view.name, fits, registration) for view in views}
+    for fit in fits:
+        is_used = all(units[name] is not None for name in fit.names)
+        log.log(logging.INFO if is_used else logging.WARNING, "%s", _describe_use(fit, is_used))
     used = [view for view in views if units[view.name] is not None]
     if not used:
         return tuple(pointmaps)
@@ -206,12 +208,12 @@ def _find_unit(name: str, fits: Sequence[DepthFit], registration: Registration) 
     if fit is None or fit.is_usable:
         return None if fit is None else fit.metres_per_unit
     given = registration.given  # the cameras stand where depth images placed them, in their unit
-    by_depth = given is not None and given.from_depth and fit.has_too_few_points
+    by_depth = given is not None and given.from_depth and has_too_few_points(fit.check)
     return given.scale if given is not None and by_depth else None
 
 
 def _describe_use(fit: DepthFit, is_used: bool) -> str:
-    who = f"depth images of {len(fit.names)} photographs" + (f" of {fit.camera_id}" if fit.camera_id else "")
+    who = name_depth_images(len(fit.names), fit.camera_id)
     if is_used and not fit.is_usable:
         return f"{who} place the cameras and fill what the images cannot tell"
     if is_used:

@@ -15,7 +15,14 @@ from splatnode.capture.lenses import straighten_depth
 from splatnode.capture.process.terminal import ProgressStep, Tell, ignore_progress
 from splatnode.capture.process.text import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity, invert_pose
-from splatnode.recon.metric.depth_fit import LEAST_POINTS, DepthFit, DepthView, fit_depth_images, merge_lens
+from splatnode.recon.metric.depth_fit import (
+    DepthFit,
+    DepthView,
+    fit_depth_images,
+    has_too_few_points,
+    merge_lens,
+    name_depth_images,
+)
 from splatnode.recon.metric.measurement import (
     MAX_DEVIATION,
     MarkerDetection,
@@ -181,7 +188,7 @@ def measure_by_depth(
     check = fit.check
     if not fit.is_usable:
         return check.message, check
-    who = f"depth images of {len(fit.names)} photographs" + (f" of {fit.camera_id}" if fit.camera_id else "")
+    who = name_depth_images(len(fit.names), fit.camera_id)
     measured = Measurement(fit.metres_per_unit, math.hypot(fit.sigma, of_scene), who)
     if agreed is None:
         return measured, check
@@ -576,7 +583,7 @@ def _collect_measurements(
 
 def _describe_placing(check: DepthCheck) -> DepthCheck:
     """The check of depth images that place the cameras: that points of the photographs are too few leaves them in."""
-    if check.code is not DepthCode.UNTESTED or check.num_points >= LEAST_POINTS:
+    if not has_too_few_points(check):
         return check
     message = (
         f"depth images place the cameras; {check.num_points} points of the images have a depth, too few for a test"

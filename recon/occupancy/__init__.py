@@ -107,7 +107,9 @@ class DepthObservation:
     K: npt.NDArray[np.float64]  # (3, 3) of the depth's pixels
     depth: Float32  # (h, w) z in the camera's frame, 0 where nobody confirms one
     error: float = DEPTH_ERROR  # of a depth, relative: its own, and what the camera's bounds let it be off
-    told: npt.NDArray[np.bool_] | None = None  # (h, w) where it tells free space (`find_telling`); None: everywhere
+    carves: npt.NDArray[np.bool_] | None = (
+        None  # (h, w) where it tells free space (`mask_narrow_parallax`); None: everywhere
+    )
 
     @property
     def points(self) -> npt.NDArray[np.float64]:
@@ -147,20 +149,22 @@ _SIZE = 2.0  # pixels of a photograph for one of its depths
 _NEAREST = 24  # other cameras that a depth is compared with
 
 
-def find_telling(seen: Sequence[DepthObservation]) -> list[DepthObservation]:
+def mask_narrow_parallax(seen: Sequence[DepthObservation]) -> list[DepthObservation]:
     """The observations with the depths that tell free space: those that two others confirm, or one from far aside."""
     centres = np.stack([sight.T_world_camera[:3, 3] for sight in seen])
     found = []
     for sight, centre in zip(seen, centres, strict=True):
         apart = np.linalg.norm(centres - centre, axis=1)
         near = np.argsort(apart, kind="stable")[1 : _NEAREST + 1]
-        found.append(replace(sight, told=_find_told(sight, [seen[i] for i in near[::-1]])))  # far aside first
+        found.append(
+            replace(sight, carves=_find_carving_pixels(sight, [seen[i] for i in near[::-1]]))
+        )  # far aside first
     return found
 
 
-def _find_told(sight: DepthObservation, others: Sequence[DepthObservation]) -> npt.NDArray[np.bool_]:
+def _find_carving_pixels(sight: DepthObservation, others: Sequence[DepthObservation]) -> npt.NDArray[np.bool_]:
     rows, columns = np.nonzero(sight.depth)
-    points, told = sight.points, np.zeros(len(rows), bool)
+    points, carves = sight.points, np.zeros(len(rows), bool)
     count, open_yet = np.zeros(len(rows), np.int64), np.arange(len(rows))
     reach = DEPTH_ERROR * max(sight.K[0, 0], sight.K[1, 1]) * _SIZE
     for other in others:
@@ -169,14 +173,14 @@ def _find_told(sight: DepthObservation, others: Sequence[DepthObservation]) -> n
         agrees = _is_confirmed(points[open_yet], other)
         own = open_yet[agrees]
         count[own] += 1
-        told[own] |= count[own] > 1
+        carves[own] |= count[own] > 1
         here, there = (points[own] - each.T_world_camera[:3, 3] for each in (sight, other))
         lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1)
         sine = np.linalg.norm(np.cross(here, there), axis=1) / np.maximum(lengths, 1e-12)
-        told[own] |= reach * sine >= LEAST_PARALLAX_PX
-        open_yet = open_yet[~told[open_yet]]
+        carves[own] |= reach * sine >= LEAST_PARALLAX_PX
+        open_yet = open_yet[~carves[open_yet]]
     found = np.zeros(sight.depth.shape, bool)
-    found[rows, columns] = told
+    found[rows, columns] = carves
     return found
 
 
@@ -268,14 +272,14 @@ def _carve_block(
 def _limits(sight: DepthObservation, stop_short: float) -> Float32:
     """(radii, h, w) how far all rays of the square around a pixel pass; 0 where too few of them are known."""
     known = sight.depth > 0
-    told = known if sight.told is None else sight.told
+    carves = known if sight.carves is None else sight.carves
     far = np.float32(np.finfo(np.float32).max)
     ends = np.where(known, (1.0 - sight.error) * sight.depth - stop_short, far).astype(np.float32)
     limits = []
     for radius in _RADII:
         window = np.ones((2 * radius + 1,) * 2, np.uint8)
         nearest = cv2.erode(ends, window, borderType=cv2.BORDER_CONSTANT, borderValue=(float(far),))
-        share = cv2.blur(told.astype(np.float32), window.shape, borderType=cv2.BORDER_CONSTANT)
+        share = cv2.blur(carves.astype(np.float32), window.shape, borderType=cv2.BORDER_CONSTANT)
         limits.append(np.where((share >= KNOWN_SHARE - 1e-4) & (nearest < far), nearest, 0.0))
     return np.stack(limits).astype(np.float32)
 
@@ -605,7 +609,7 @@ def occupancy_map(
         _transform_to_map(points, T), _transform_to_map(centres, T), unit, snapshot.scale.metric, voxel
     )
     states = np.zeros(layout.shape, np.uint8)
-    for sight in find_telling(seen):
+    for sight in mask_narrow_parallax(seen):
         states[carve_free_space(sight, layout, T, pause)] = VoxelState.FREE
     pause()
     states[find_surface_voxels((_transform_to_map(thicken_points(sight), T) for sight in seen), layout)] = (

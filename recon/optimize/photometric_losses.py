@@ -432,9 +432,8 @@ class _ExposureCompensatedLoss:
     loss: Callable[[Tensor], Tensor]
     target: Tensor  # (height, width, 3) the photograph
     told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
-    cap: (
-        Tensor | None
-    )  # (height, width, 3) of the render: the photograph where it is saturated, else infinite; None: all
+    # (height, width, 3) of the render: the photograph where it is saturated, else infinite. None: nothing is saturated
+    cap: Tensor | None
     prior: Tensor | None  # (3,) as much as the weight of a gain of 1 of the photograph, squared; None: nothing is left
 
     def __call__(self, rgb: Tensor) -> Tensor:

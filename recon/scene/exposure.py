@@ -11,7 +11,7 @@ recon/result/view_exposure.py tells that of a novel view. A lens that dims its c
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Annotated
@@ -161,36 +161,26 @@ MIN_PHOTOGRAPHS = 3  # fewer cannot contradict each other
 SIGMAS = 2.0  # standard deviations that a falloff must be above the least that is taken out
 
 
-def estimate_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int], least: float) -> Array:
-    """(V,) of each photograph's lens, which `lens_of` numbers; 0 where it may be less than `least`."""
-    result = np.zeros(len(lens_of))
-    for members, bins, found in _measure_lenses(shared, lens_of):
+def estimate_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int], least: float) -> tuple[Array, Array]:
+    """(V,) of each photograph's lens, which `lens_of` numbers: what is to be taken out, and what was measured.
+
+    The first is 0 where it may be less than `least`. Small ones of the second may be noise, but no gain explains them.
+    """
+    sure, measured = np.zeros((2, len(lens_of)))
+    for lens in sorted(set(lens_of)):
+        members = [view for view, own in enumerate(lens_of) if own == lens]
+        if len(members) < MIN_PHOTOGRAPHS:
+            continue
+        bins = [each for pair in shared if set(pair.pair) <= set(members) for each in _bins(pair)]
+        found = _estimate_falloff(bins, members)
+        measured[members] = max(found, 0.0)
         if found < least:
             continue
         without = [_estimate_falloff([each for each in bins if view not in each.pair], members) for view in members]
         sigma = np.sqrt((len(members) - 1) * np.var(without))  # the jackknife's
         if found - SIGMAS * sigma >= least:
-            result[members] = found
-    return result
-
-
-def measure_falloffs(shared: Sequence[SharedPixels], lens_of: Sequence[int]) -> Array:
-    """(V,) of each photograph's lens, as far as it is known: small ones may be noise, but no gain explains them."""
-    result = np.zeros(len(lens_of))
-    for members, _, found in _measure_lenses(shared, lens_of):
-        result[members] = max(found, 0.0)
-    return result
-
-
-def _measure_lenses(
-    shared: Sequence[SharedPixels], lens_of: Sequence[int]
-) -> Iterator[tuple[list[int], list[_Bin], float]]:
-    """Yields the photographs of each lens that has enough of them, what they share, and its falloff."""
-    for lens in sorted(set(lens_of)):
-        members = [view for view, own in enumerate(lens_of) if own == lens]
-        if len(members) >= MIN_PHOTOGRAPHS:
-            bins = [each for pair in shared if set(pair.pair) <= set(members) for each in _bins(pair)]
-            yield members, bins, _estimate_falloff(bins, members)
+            sure[members] = found
+    return sure, measured
 
 
 def remove_falloff(shared: Sequence[SharedPixels], falloff: Array) -> Sequence[SharedPixels]:
@@ -272,8 +262,8 @@ def estimate_exposures(
     """
     if not config.enabled or len(pointmaps) < 2:
         return {}
-    shared, lens_of = find_shared_pixels(pointmaps, [images[each.name] for each in pointmaps]), _lens_of(pointmaps)
-    falloff, measured = estimate_falloffs(shared, lens_of, config.least_falloff), measure_falloffs(shared, lens_of)
+    shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
+    falloff, measured = estimate_falloffs(shared, _lens_of(pointmaps), config.least_falloff)
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
     solved = _solve_log_gains(remove_falloff(shared, measured), priors, _select_metadata_logs(pointmaps, told))
     found = solved.subtract_median()

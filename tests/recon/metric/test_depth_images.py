@@ -17,6 +17,7 @@ from splatnode.recon.metric.depth_fit import (
     MeasuredDepth,
     describe_doubtful_units,
     fit_depth_images,
+    has_too_few_points,
     smooth_depth,
     warp_depth,
 )
@@ -92,7 +93,7 @@ def bend(by: float, camera: DepthCamera = GOOD) -> DepthFit:
 @pytest.mark.parametrize("by", [0.12, -0.12])
 def test_a_scene_that_is_bent_is_no_fault_of_the_depth_camera(by):
     found = bend(by)
-    assert found.check.code is DepthCode.UNTESTED and not found.is_usable and not found.has_too_few_points
+    assert found.check.code is DepthCode.UNTESTED and not found.is_usable and not has_too_few_points(found.check)
     told = "too far" if by > 0 else "too near"
     assert "only if the estimated cameras, not the depths" in found.check.message and told in found.check.message
     assert "--intrinsics" in found.check.message

@@ -9,7 +9,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.metric.metres import transform_rigidly
-from splatnode.recon.occupancy import DepthObservation, NoMap, OccupancyMap, VoxelState, find_telling, occupancy_map
+from splatnode.recon.occupancy import (
+    DepthObservation,
+    NoMap,
+    OccupancyMap,
+    VoxelState,
+    mask_narrow_parallax,
+    occupancy_map,
+)
 from splatnode.recon.occupancy.files import encode_nav2
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, FrameName, ReferenceFrame, Scale
@@ -173,7 +180,7 @@ def test_stereo_from_nearly_one_place_tells_no_free_space_until_a_third_image_co
     """2 % of the depth are half a pixel of the photograph at 4.8 degrees: 0.25 m aside of 3 m."""
     near, far = _observe(3.0, 0.1), _observe(3.0, 0.4)
     alone = _observe(3.0, 0.0)
-    assert not find_telling([alone, near])[0].told.any()
-    assert find_telling([alone, far])[0].told[:, 30:].all()
-    assert find_telling([alone, near, _observe(3.0, -0.1)])[0].told[10:-10, 10:-10].all()
-    assert not find_telling([alone, _observe(3.2, 0.4)])[0].told.any(), "it sees something else"
+    assert not mask_narrow_parallax([alone, near])[0].carves.any()
+    assert mask_narrow_parallax([alone, far])[0].carves[:, 30:].all()
+    assert mask_narrow_parallax([alone, near, _observe(3.0, -0.1)])[0].carves[10:-10, 10:-10].all()
+    assert not mask_narrow_parallax([alone, _observe(3.2, 0.4)])[0].carves.any(), "it sees something else"

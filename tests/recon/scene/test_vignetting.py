@@ -30,7 +30,7 @@ def dimmed(images: list[np.ndarray], falloff: float = FALLOFF) -> list[np.ndarra
 
 
 def found_in(maps: list[Pointmap], images: list[np.ndarray], lens_of: list[int] | None = None, least: float = 0.5):
-    return estimate_falloffs(find_shared_pixels(maps, images), lens_of or [0] * len(maps), least)
+    return estimate_falloffs(find_shared_pixels(maps, images), lens_of or [0] * len(maps), least)[0]
 
 
 def test_light_falls_off_to_what_reaches_the_corners():
