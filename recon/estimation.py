@@ -14,7 +14,15 @@ from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.keyframes import LIBRARY_ERRORS, Features, Keyframe, Rejected, resize_image
+from splatnode.recon.keyframes import (
+    LIBRARY_ERRORS,
+    Features,
+    Keyframe,
+    Rejected,
+    find_picture,
+    mask_bars,
+    resize_image,
+)
 from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
@@ -81,7 +89,7 @@ def prepare(frame: Frame, config: ReconstructionConfig, found: Features | None =
     No other frame is needed. Raises UnusableFrame where the given intrinsics cannot be used, or a library fails.
     """
     try:
-        straight = undistort_frame(frame)
+        straight = undistort_frame(mask_bars(frame))
     except ValueError as error:  # it names the frame
         raise UnusableFrame(str(error)) from error
     except LIBRARY_ERRORS as error:
@@ -121,6 +129,9 @@ def prepare_all(frames: Iterable[Frame], config: ReconstructionConfig) -> tuple[
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
 LEAST_FITTING = 0.5  # share of all matches that fit given poses, below which these may be wrong together
+_WHOLE = (0.0, 1.0, 0.0, 1.0)  # a picture without bars, as shares of the sides
+_SAME_PICTURE = 0.02  # of a side, within which bars are alike
+LENS_INSIDE_BARS = "black bars surround the picture, so that the lens that is told for it was not used."
 _NOTHING = 1e-6  # share of a keyframe that rounding leaves
 PROVISIONAL = "Provisional: checked again with all evidence when the camera rests."
 
@@ -279,12 +290,39 @@ def _estimate_from_images(
     graph: ViewGraph, rejected: Sequence[Rejected], config: ReconstructionConfig, run: RunContext
 ) -> Reconstruction:
     """As `estimate_cameras`, whatever poses are given."""
+    doubtful = find_lenses_inside_bars(graph)
+    if doubtful:
+        found = _estimate_from_images(graph.forget_lenses(doubtful), rejected, config, run)
+        message = f"{found.verdict.message} {', '.join(sorted(doubtful))}: {LENS_INSIDE_BARS}"
+        return replace(found, graph=graph, verdict=replace(found.verdict, message=message))
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
         return Reconstruction(graph, None, None, explain_refusal(refusal, graph))
     found = _register_and_verify(graph, config, run)
     doubted = contradicts_exif(graph, found.registration, found.evidence, found.verdict, config.decision)
     return _estimate_without_exif(found, config, run) if doubted else found
+
+
+def find_lenses_inside_bars(graph: ViewGraph) -> frozenset[str]:
+    """The names of the images with a told lens and with black bars that others of the same lens lack.
+
+    A lens that is told may be that of the picture before it was shrunk into its bars. Where all images have the same
+    bars, it is taken for that of the images as they are.
+    """
+    pictures = {each.name: _measure_picture(each) for each in graph.keyframes if each.frame.intrinsics is not None}
+    found = np.array(list(pictures.values()))
+    if not len(found) or np.ptp(found, axis=0).max() <= _SAME_PICTURE:
+        return frozenset()
+    return frozenset(name for name, picture in pictures.items() if picture != _WHOLE)
+
+
+def _measure_picture(keyframe: Keyframe) -> tuple[float, float, float, float]:
+    """Upper, lower, left and right end of the picture between black bars, as shares of the sides."""
+    inside = find_picture(keyframe.image)
+    if inside is None:
+        return _WHOLE
+    (height, width), (rows, columns) = keyframe.image.shape[:2], inside
+    return rows.start / height, rows.stop / height, columns.start / width, columns.stop / width
 
 
 def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: RunContext) -> Reconstruction:

@@ -298,3 +298,55 @@ def _top_runs(dark: Mask, band: int) -> Mask:
     run[: band + 1] = np.logical_and.accumulate(dark[: band + 1], axis=0)
     run &= ~run[min(band, len(run) - 1)]
     return run & (run[0].mean() >= MIN_RIM_LENGTH)
+
+
+# Black bars, as editors and recorders put them around a picture that has another shape than its frame.
+
+_MAX_BAR_LEVEL = 24  # of 255: compressed black
+_MAX_BAR_SPECKS = 0.01  # share of a bar's row that compression, or a subtitle's edge, may make brighter
+_MIN_BAR_WIDTH = 0.03  # of the side that the bars shorten; a rim may be as wide
+_MAX_BAR_DIFFERENCE = 0.01  # of that side, between two opposite bars: a picture is put in the middle
+_MIN_PICTURE_EDGE = 0.5  # share of the row beside a bar that is no bar: else the scene itself is black there
+_MIN_PICTURE = 0.3  # of a side that two bars leave
+_EDGE_ROWS = 3  # beside a bar, over which shrinking and compression spread its edge
+
+
+def find_picture(image: Image) -> tuple[slice, slice] | None:
+    """Rows and columns of the picture between black bars on two opposite sides, or four, of an image (h, w, 3).
+
+    None where there are no such bars. They are found where they are alike on both sides and end in a straight edge: a
+    dark scene has none.
+    """
+    rows = _find_bars(image)
+    columns = _find_bars(image[rows or slice(None)].transpose(1, 0, 2))
+    if rows is None and columns is None:
+        return None
+    return rows or slice(0, image.shape[0]), columns or slice(0, image.shape[1])
+
+
+def _find_bars(image: Image) -> slice | None:
+    """The rows between two bars of black rows; None where there are none."""
+    height = len(image)
+    ends = image[[0, -1]].max(2) > _MAX_BAR_LEVEL
+    if height < 2 or ends.mean(1).max() > _MAX_BAR_SPECKS:
+        return None
+    bright = (image.max(2) > _MAX_BAR_LEVEL).mean(1)
+    (shown,) = np.nonzero(bright > _MAX_BAR_SPECKS)
+    if not len(shown):
+        return None
+    top, bottom = int(shown[0]), int(shown[-1]) + 1
+    bars = top, height - bottom
+    alike = abs(bars[0] - bars[1]) <= max(2.0, _MAX_BAR_DIFFERENCE * height)
+    wide = min(bars) >= _MIN_BAR_WIDTH * height and bottom - top >= _MIN_PICTURE * height
+    edges = min(bright[top : top + _EDGE_ROWS].max(), bright[bottom - _EDGE_ROWS : bottom].max())
+    return slice(top, bottom) if alike and wide and edges >= _MIN_PICTURE_EDGE else None
+
+
+def mask_bars(frame: Frame) -> Frame:
+    """The frame with black bars around its picture hidden by its mask; itself where it has none."""
+    picture = find_picture(frame.image)
+    if picture is None:
+        return frame
+    mask = np.zeros(frame.image.shape[:2], bool)
+    mask[picture] = True if frame.mask is None else frame.mask[picture]
+    return replace(frame, mask=mask)

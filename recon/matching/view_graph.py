@@ -118,6 +118,14 @@ class ViewGraph:
         )
         return rest if rest.select_pairs_to_match() else rest.select_geometries()
 
+    def forget_lenses(self, names: Collection[str]) -> ViewGraph:
+        """The same graph; nothing is told of the lenses of these keyframes."""
+        keyframes = [
+            replace(each, frame=replace(each.frame, intrinsics=None)) if each.name in names else each
+            for each in self.keyframes
+        ]
+        return replace(self, keyframes=tuple(keyframes))
+
     def forget_pairs(self, names: Collection[str]) -> ViewGraph:
         """The same keyframes; nothing is known of the pairs of these, and nothing pending."""
         gone = {index for index, keyframe in enumerate(self.keyframes) if keyframe.name in names}

@@ -359,6 +359,11 @@ _DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths a
 _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
 # Of two maps, the median error of the matches of the better one over that of the other, from which on they explain them
 _AS_WELL, _NEARLY = 0.97, 0.9  # as well as each other, and nearly so
+# Difference of log focals from which on a lens is far from a typical one, and from what its pairs vote for
+_FAR_FROM_TYPICAL = 0.8
+_FAR_FROM_VOTE = 0.3
+_HELD_SIGMA = 0.15  # of log focal, while such a focal length is held
+_OTHER_ATTEMPTS = 3  # first pairs that are tried with it
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
 
@@ -443,8 +448,77 @@ def build_map(
     finished = run_final_adjustment(problem, best, images, config.finishing)
     if finished is None:
         return None
-    problem, finished = give_own_lenses(problem, finished, images, config, run)
-    return make_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
+    found = give_own_lenses(problem, finished, images, config, run)
+    found = _try_other_hypotheses(problem, found, images, config, run)
+    return make_map(*found, config.incremental.triangulation.max_error_px, len(lenses))
+
+
+def _try_other_hypotheses(
+    problem: MapperInput,
+    found: tuple[MapperInput, FinalMap],
+    images: Sequence[PatchImage],
+    config: MapperConfig,
+    run: RunContext,
+) -> tuple[MapperInput, FinalMap]:
+    """Both as `problem` gives them from other focal lengths, where lenses came out far from these and it fits better.
+
+    Images with slightly different lenses can pass for images through one lens that is much longer, which no small
+    change of that lens shows. The other focal lengths are held until images have lenses of their own.
+    """
+    for focals in _list_other_focals(problem, found[1].map.estimate.log_focals):
+        run.pause()
+        held = [
+            lens if focal is None else replace(lens, focals=(focal,), sigma=_HELD_SIGMA)
+            for lens, focal in zip(problem.lenses, focals, strict=True)
+        ]
+        other = _map_lenses(replace(problem, lenses=tuple(held)), images, config, run)
+        if other is None:
+            continue
+        sigmas = other[1].map.prior.sigmas.copy()
+        sigmas[: len(held)] = [lens.sigma for lens in problem.lenses]
+        free = replace(other[1].map, prior=replace(other[1].map.prior, sigmas=sigmas))
+        finished = run_final_adjustment(other[0], free, images, config.finishing)
+        if finished is None:
+            continue
+        before, after = _score_of(found[0], found[1].map, config), _score_of(other[0], finished.map, config)
+        if after * _AS_WELL > before:
+            found = other[0], finished
+    return found
+
+
+def _list_other_focals(problem: MapperInput, log_focals: Array) -> list[list[float | None]]:
+    """Focal lengths in pixels to be tried besides, one a lens; None for a lens that keeps its own."""
+    tried = []
+    for choose, limit in ((_get_likeliest, _FAR_FROM_VOTE), (_get_typical, _FAR_FROM_TYPICAL)):
+        focals = [
+            choose(lens) if lens.typical is not None and abs(log_focal - np.log(choose(lens))) > limit else None
+            for lens, log_focal in zip(problem.lenses, log_focals, strict=False)
+        ]
+        if any(focal is not None for focal in focals) and focals not in tried:
+            tried.append(focals)
+    return tried
+
+
+def _get_likeliest(lens: Lens) -> float:
+    return lens.focals[0]
+
+
+def _get_typical(lens: Lens) -> float:
+    return lens.typical or lens.focals[0]
+
+
+def _map_lenses(
+    problem: MapperInput, images: Sequence[PatchImage], config: MapperConfig, run: RunContext
+) -> tuple[MapperInput, FinalMap] | None:
+    """The best map of few attempts with the first focal length of each lens, and lenses of their own for its views."""
+    best: tuple[float, PartialMap] | None = None
+    for first, focals in _starts(problem.lenses, problem.pairs, _OTHER_ATTEMPTS):
+        run.pause()
+        partial = grow(problem, focals, first, config.incremental)
+        if partial is not None and (best is None or _score_of(problem, partial, config) > best[0]):
+            best = _score_of(problem, partial, config), partial
+    finished = None if best is None else run_final_adjustment(problem, best[1], images, config.finishing)
+    return None if finished is None else give_own_lenses(problem, finished, images, config, run)
 
 
 def give_own_lenses(

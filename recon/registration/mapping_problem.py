@@ -43,6 +43,8 @@ class Lens:
     focals: tuple[float, ...]  # candidates in pixels, the most likely first
     sigma: float  # of log focal around the candidate; 0: it is calibrated
     radial: tuple[float, float] = (0.0, 0.0)  # radial coefficients
+    # Pixels, tried beside the candidates where these lead to one far from it; None where a focal length was told
+    typical: float | None = None
 
 
 @dataclass(frozen=True, eq=False)

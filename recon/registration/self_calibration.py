@@ -146,7 +146,8 @@ def candidates(
         # A single image has no pair through its own lens alone: those with other images say roughly what it is.
         inside = inside or [pair for key, pair in pairs.items() if key[0] in members or key[1] in members]
         ratios = vote(inside, _NUM_CANDIDATES)
-        found.append(Lens(tuple(ratio * grouping.longer_side for ratio in ratios), config.voted_sigma))
+        focals = tuple(ratio * grouping.longer_side for ratio in ratios)
+        found.append(Lens(focals, config.voted_sigma, typical=_TYPICAL_RATIO * grouping.longer_side))
     return found
 
 

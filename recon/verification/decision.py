@@ -171,12 +171,7 @@ def _measure_exif_changes(
 
 def forget_exif(graph: ViewGraph) -> ViewGraph:
     """The graph without the focal lengths that EXIF tells."""
-    nominal = _select_exif_keyframes(graph)
-    keyframes = [
-        replace(each, frame=replace(each.frame, intrinsics=None)) if each.name in nominal else each
-        for each in graph.keyframes
-    ]
-    return replace(graph, keyframes=tuple(keyframes))
+    return graph.forget_lenses(_select_exif_keyframes(graph))
 
 
 def _select_exif_keyframes(graph: ViewGraph) -> set[str]:

@@ -508,32 +508,44 @@ def free_principal_points(fit: BundleFit) -> CameraShifts | None:
 
 DOUBTED_FOCAL = 0.1  # sigma of log focal by which an image's lens may differ from the common one
 DOUBTED_SHIFT = 0.1  # sigma of the common principal point, of the longer side
+# The same where observations may ask for it themselves: keystone corrections of long lenses shift by as much
+FARTHEST_SHIFT = 0.3
+ASKED_WEIGHT = 1.5  # of what observations ask for, beside what they leave open
 
 
 def doubt_common_lenses(fit: BundleFit) -> CameraShifts:
     """How far off cameras may be if their lenses are not what they were taken for: RMS over such cameras.
 
-    The mean of these cameras is where an adjustment finds them, their spread is its covariance. The focal lengths are
-    those of the cameras (C,), and not of their lenses. A camera that shares its lens with no other keeps its prior.
+    The mean of these cameras is where an adjustment finds them under wide priors, and counts ASKED_WEIGHT times; their
+    spread is the covariance under the usual ones. The focal lengths are those of the cameras (C,), and not of their
+    lenses. A camera that shares its lens with no other keeps its prior.
     """
     whole = adjust(fit)
-    count, side = len(whole.problem.rotations), REFERENCE_SIDE * fit.scale
+    usual, prior = _doubt_lenses(whole, DOUBTED_SHIFT)
+    covariance = bundle_adjustment.covariance(usual, prior, fit.loss, 0)
+    farthest, _ = _doubt_lenses(whole, FARTHEST_SHIFT)
+    mean = compute_camera_shifts(
+        replace(whole, problem=self_calibration.expand_lenses(whole.problem)), replace(whole, problem=farthest)
+    )
+    rotations, centres = bundle_adjustment.camera_sigmas(usual, covariance, range(len(whole.problem.rotations)))
+    return CameraShifts(
+        rotation_deg=np.hypot(ASKED_WEIGHT * mean.rotation_deg, rotations),
+        centre=np.hypot(ASKED_WEIGHT * mean.centre, compute_rms_radius(whole.Ts_world_camera[:, :3, 3]) * centres),
+        focals_rel=np.hypot(ASKED_WEIGHT * mean.focals_rel, bundle_adjustment.sigmas(covariance.log_focals)),
+    )
+
+
+def _doubt_lenses(
+    whole: BundleFit, shift_sigma: float
+) -> tuple[bundle_adjustment.Problem, bundle_adjustment.LensPrior]:
+    """The bundle adjusted with a lens for each camera, and the prior; `shift_sigma` is of the longer side."""
+    count, side = len(whole.problem.rotations), REFERENCE_SIDE * whole.scale
     config = msgspec.structs.replace(self_calibration.OwnLensesConfig(), focal_sigma=DOUBTED_FOCAL)
     shared = np.bincount(whole.problem.lens_of_camera, minlength=len(whole.prior.sigmas)) > 1
-    shifts = np.where(shared, np.maximum(whole.prior.shift_sigmas, DOUBTED_SHIFT * side), whole.prior.shift_sigmas)
+    shifts = np.where(shared, np.maximum(whole.prior.shift_sigmas, shift_sigma * side), whole.prior.shift_sigmas)
     prior = replace(whole.prior, shift_sigmas=shifts)
     apart, prior = self_calibration.widen_lens_priors(whole.problem, prior, np.full(count, side), config)
-    apart = bundle_adjustment.adjust(apart, prior, fit.loss)
-    mean = compute_camera_shifts(
-        replace(whole, problem=self_calibration.expand_lenses(whole.problem)), replace(whole, problem=apart)
-    )
-    covariance = bundle_adjustment.covariance(apart, prior, fit.loss, 0)
-    rotations, centres = bundle_adjustment.camera_sigmas(apart, covariance, range(count))
-    return CameraShifts(
-        rotation_deg=np.hypot(mean.rotation_deg, rotations),
-        centre=np.hypot(mean.centre, compute_rms_radius(whole.Ts_world_camera[:, :3, 3]) * centres),
-        focals_rel=np.hypot(mean.focals_rel, bundle_adjustment.sigmas(covariance.log_focals)),
-    )
+    return bundle_adjustment.adjust(apart, prior, whole.loss), prior
 
 
 # The mirrored answer: seen from afar, a scene and its mirror image in depth look the same from mirrored cameras.

@@ -187,6 +187,58 @@ def test_cameras_are_found_whatever_the_first_focal_length(taken, pairs, focals)
     assert min(found.inlier_ratios.values()) > 0.95
 
 
+def photographed_from_the_side(zooms: tuple[float, ...], seed: int) -> Photographed:
+    """Steps aside before a deep scene, as with a camera that is moved by hand; each image enlarged by its zoom."""
+    generator, count = np.random.default_rng(seed), 500
+    depth = generator.uniform(3.0, 14.0, count)
+    points = np.stack(
+        [generator.uniform(-0.55, 0.55, count) * depth, generator.uniform(-0.4, 0.4, count) * depth, depth], 1
+    )
+    rotations, translations, pixels, visible = [], [], [], []
+    for view, zoom in enumerate(zooms):
+        rotation = cv2.Rodrigues(np.array([0.01 * view, np.radians(1.5 * (view - 1)), 0.01]))[0]
+        translation = -rotation @ np.array([0.12 * (view - 1), 0.03 * view, 0.02 * view])
+        in_camera = points @ rotation.T + translation
+        seen = zoom * FOCAL * in_camera[:, :2] / in_camera[:, 2:] + generator.normal(size=(count, 2)) * NOISE_PX
+        inside = (np.abs(seen) < np.array(SIZE) / 2).all(1) & (generator.random(count) < 0.85)
+        clutter = (generator.random((count, 2)) - 0.5) * SIZE
+        rotations.append(rotation)
+        translations.append(translation)
+        pixels.append(np.where(inside[:, None], seen, clutter))
+        visible.append(inside)
+    return Photographed(np.stack(rotations), np.stack(translations), pixels, np.stack(visible))
+
+
+@pytest.mark.parametrize(("zoom", "seed"), [(1.06, 0), (1.06, 1), (1.03, 0), (1.03, 2), (1.0, 0)])
+def test_a_small_zoom_does_not_pass_for_one_long_lens(zoom, seed):
+    """One lens two to three times as long fits three such images nearly, with cameras that are 4 to 7 degrees off."""
+    taken = photographed_from_the_side((1.0, zoom, 1.0), seed)
+    pairs = compared(taken)
+    votes = self_calibration.vote(list(pairs.values()), num_candidates=3)
+    views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
+    lens = Lens(tuple(vote * SIZE[0] for vote in votes), 0.3, typical=float(SIZE[0]))
+    found = incremental_mapper.build_map(views, [lens], pairs, incremental_mapper.MapperConfig())
+    assert found is not None and sorted(found.views) == [0, 1, 2]
+    rotation_deg, centre = errors(taken, found)
+    assert rotation_deg < 0.15 and centre < 0.03
+    focals = np.exp(found.estimate.log_focals[found.estimate.lens_of_camera])
+    assert focals == pytest.approx(FOCAL * np.array([1.0, zoom, 1.0]), rel=0.05)
+
+
+def test_a_long_lens_stays_what_it_is(monkeypatch):
+    """A typical focal length is tried beside it, and explains the matches less well."""
+    long = photographed_from_the_side((3.0, 3.0, 3.0), 0)
+    pairs = compared(long)
+    tried = []
+    real = incremental_mapper.grow
+    monkeypatch.setattr(incremental_mapper, "grow", lambda *given: tried.append(given[1]) or real(*given))
+    views = [MapperView(points, 0, max(SIZE)) for points in long.pixels]
+    lens = Lens((3.0 * FOCAL,), 0.3, typical=float(SIZE[0]))
+    found = incremental_mapper.build_map(views, [lens], pairs, incremental_mapper.MapperConfig())
+    assert [float(SIZE[0])] in tried
+    assert found is not None and np.exp(found.estimate.log_focals[0]) == pytest.approx(3.0 * FOCAL, rel=0.3)
+
+
 @pytest.mark.parametrize(("radial", "num_points"), [(-0.3, 400), (-0.2, 400), (0.1, 1200)])
 def test_a_lens_that_bends_lines_much_more_than_others_do_is_found(radial, num_points):
     taken = photographed(num_views=6, num_points=num_points, radials=(radial, 0.0))

@@ -12,11 +12,22 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.extras.evaluate.dataset import TrueCamera
-from splatnode.extras.evaluate.stability.degradations import KINDS, correct_keystone, set_intrinsics, zoom_image
+from splatnode.extras.evaluate.stability.degradations import (
+    KINDS,
+    correct_keystone,
+    letterbox_image,
+    set_intrinsics,
+    zoom_image,
+)
 from splatnode.extras.evaluate.stability.perturbations import TrialImage, crop_image
 from splatnode.extras.evaluate.stability.trial import list_registered_cameras, make_frames, make_world, score_cameras
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras
+from splatnode.recon.estimation import (
+    LENS_INSIDE_BARS,
+    Reconstruction,
+    estimate_cameras,
+    find_lenses_inside_bars,
+)
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.registration import bundle_adjustment, self_calibration
 from splatnode.recon.registration.registration import register
@@ -164,3 +175,23 @@ def test_images_of_different_cameras_share_no_lens():
     keyframes = [Keyframe(frame, frame.image, Features(*(np.zeros(0),) * 4)) for frame in named]
     lens_of = self_calibration.group(keyframes, across_sizes=True).lens_of
     assert lens_of[0] == lens_of[1] == lens_of[2] and lens_of[3] == lens_of[4] != lens_of[0]
+
+
+@pytest.mark.parametrize("setting", ["exif", "given"])
+def test_the_lens_that_is_told_of_an_image_shrunk_into_black_bars_is_not_used(setting):
+    """Three images cannot refute it."""
+    told = set_intrinsics(photographs()[1:4], setting)
+    photos = [letterbox_image(photo, 0.75) if index == 1 else photo for index, photo in enumerate(told)]
+    found = estimate(photos)
+    check_within_bounds(photos, found)
+    assert LENS_INSIDE_BARS in found.verdict.message and photos[1].name in found.verdict.message
+    assert found.registration is not None
+    focals = {found.graph.names[camera.index]: camera.focal for camera in found.registration.cameras}
+    assert focals[photos[1].name] == pytest.approx(0.75 * focals[photos[0].name], rel=0.05)
+    assert all(keyframe.frame.intrinsics is not None for keyframe in found.graph.keyframes)
+
+
+def test_a_lens_that_is_told_of_images_with_the_same_bars_is_used():
+    boxed = [letterbox_image(photo, 0.75) for photo in photographs()[1:4]]
+    graph = view_graph(make_frames(set_intrinsics(boxed, "given")))
+    assert find_lenses_inside_bars(graph) == frozenset()

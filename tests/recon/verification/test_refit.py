@@ -167,6 +167,19 @@ def test_where_depth_tells_the_lenses_little_is_doubted():
     assert deep.centre.max() < 0.2 * flat.centre.max() and deep.focals_rel.max() < 0.3 * flat.focals_rel.max()
 
 
+def test_a_keystone_correction_of_all_images_is_doubted_by_as_much_as_it_turns_them():
+    """All images shifted by a fifth of their side; the lens is taken to be behind their middle."""
+    fit = made_up()
+    truth = fit.Ts_world_camera
+    shifted = replace(fit, problem=replace(fit.problem, pixels=fit.problem.pixels + (0.0, 0.2 * 1024)))
+    whole = refit.adjust(shifted)
+    error = refit.compute_camera_shifts(replace(whole, problem=fit.problem), whole).rotation_deg
+    doubted, square = refit.doubt_common_lenses(shifted), refit.doubt_common_lenses(fit)
+    assert error.max() > 2.0 and (truth == fit.Ts_world_camera).all()
+    assert (error < 2.5 * 0.6 * doubted.rotation_deg).all()
+    assert square.rotation_deg.max() < 0.6 * doubted.rotation_deg.max()
+
+
 def test_a_lens_that_no_other_camera_shares_keeps_its_prior():
     """Four calibrated lenses, one a camera: nothing is doubted but what noise leaves open."""
     fit = made_up(depth=0.02)
