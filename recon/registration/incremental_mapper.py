@@ -260,7 +260,7 @@ def run_final_adjustment(
         if len(refined.points) >= config.min_points and _has_enough_observations(refined, partial.registered):
             partial = replace(partial, estimate=refined)
             for _ in range(_REFINED_ADJUSTMENTS):
-                partial = _fit_radial_prior(_adjust_and_filter(problem, partial, config), config)
+                partial = _fit_lens_priors(problem, _adjust_and_filter(problem, partial, config), config)
     loss, errors = _loss(problem, partial.estimate, config), _errors(problem, partial.estimate)
     return FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))))
 
@@ -271,7 +271,7 @@ def _adjust_final_tracks(
     """The map after an adjustment to the final tracks, its lenses held by what it found of them."""
     loss = _loss(problem, partial.estimate, config)
     adjusted = adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
-    return _fit_radial_prior(adjusted, config)
+    return _fit_lens_priors(problem, adjusted, config)
 
 
 def _free_lenses(
@@ -291,15 +291,19 @@ def _longer_sides(problem: MapperInput) -> Array:
     return np.array(list(sides), np.float64)
 
 
-def _fit_radial_prior(partial: PartialMap, config: FinalAdjustmentConfig) -> PartialMap:
-    """The map with a prior under which a radial coefficient is as likely as it was found, or as `config` has it.
+def _fit_lens_priors(problem: MapperInput, partial: PartialMap, config: FinalAdjustmentConfig) -> PartialMap:
+    """The map with priors under which distortion and displacement are as likely as they were found.
 
-    A prior as wide as what is found lets a coefficient stay where observations tell it to within half of what it is;
+    A prior as wide as what is found lets a parameter stay where observations tell it to within half of what it is;
     any other falls, adjustment by adjustment, to where `config` holds it (MacKay, "Bayesian interpolation", 1992).
     """
     found = np.maximum(np.abs(partial.estimate.radials), config.radial_sigma)
-    sigmas = np.where(partial.prior.radial_sigmas > 0, found, 0.0)
-    return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
+    radial_sigmas = np.where(partial.prior.radial_sigmas > 0, found, 0.0)
+    widest = np.array([lens.widest_shift for lens in problem.lenses])
+    shifts = np.sqrt((partial.estimate.shifts**2).mean(1))
+    least = config.shift_sigma * _longer_sides(problem)
+    shift_sigmas = np.where(widest > 0, np.clip(shifts, least, np.maximum(widest, least)), partial.prior.shift_sigmas)
+    return replace(partial, prior=replace(partial.prior, radial_sigmas=radial_sigmas, shift_sigmas=shift_sigmas))
 
 
 def _find_distorting_lenses(problem: MapperInput, estimate: bundle_adjustment.Problem) -> Flags:
@@ -647,13 +651,13 @@ def _try_other_focals(
         rest = adjust_quickly(problem, rest, SETTLED_TOLERANCE, config.incremental)
         if len(rest.estimate.points) < config.incremental.min_points:
             continue
-        focal = mapping_problem.own_focal(problem, rest, view, config.incremental.resection)
-        if focal is not None:
-            zoomed[view] = focal
+        lens = mapping_problem.find_own_lens(problem, rest, view, config.incremental.resection)
+        if lens is not None:
+            zoomed[view] = lens
     if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
         return None
-    for view, focal in zoomed.items():
-        problem, partial = self_calibration.add_lens(problem, partial, view, focal)
+    for view, lens in zoomed.items():
+        problem, partial = self_calibration.add_lens(problem, partial, view, lens.focal, lens.shift)
     partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None

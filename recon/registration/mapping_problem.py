@@ -5,6 +5,7 @@ A view enters it by resection.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -45,6 +46,8 @@ class Lens:
     radial: tuple[float, float] = (0.0, 0.0)  # radial coefficients
     # Pixels, tried beside the candidates where these lead to one far from it; None where a focal length was told
     typical: float | None = None
+    # Pixels: sigma of the principal point where the search for it begins, of what may be a crop; 0: there is no search
+    widest_shift: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +117,10 @@ _MAX_NEIGHBOURS = 4  # registered views, those with most matches, that propose a
 _ITERATIONS = {"min_iterations": 200, "max_iterations": 5000, "seed": 0}  # of RANSAC: 5000 do for 10 % inliers
 # Focal lengths that are tried for a view that its lens does not fit, over that of the lens
 _FOCAL_FACTORS = (1.0, 0.4, 0.5, 0.63, 0.72, 0.8, 0.87, 0.93, 1.07, 1.15, 1.25, 1.38, 1.55, 1.75, 2.0, 2.5, 3.2)
+_FITTING = 0.9  # share of the points that fit, below which displaced principal points are tried
+_SHIFTS = (0.07, 0.14)  # of them, of the longer side
+_DIRECTIONS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7))
+_NEAR_FACTORS = (1.0, 0.9, 1.1)  # focal lengths that are tried with them, over the best without
 _OWN_FOCAL_TOLERANCE = 1.5  # of reprojection errors then: the map is finished
 _MORE_POINTS = 1.1  # times as many points must fit with another focal length
 _MIN_SCALE_RATIO = 0.4  # share of the points that may fix the length of a translation which must agree on it
@@ -170,21 +177,42 @@ def resect(problem: MapperInput, partial: PartialMap, view: int, config: Resecti
     return best
 
 
-def own_focal(problem: MapperInput, partial: PartialMap, view: int, config: ResectionConfig) -> float | None:
-    """The focal length (pixels) with which most of the map's points fit a pose of `view`, where it is not its lens'.
+@dataclass(frozen=True, eq=False)
+class OwnLens:
+    """The lens of a view that does not have that of the others."""
 
-    None where the lens' own focal length, which is tried first, fits nearly as many.
+    focal: float  # pixels
+    shift: Array  # (2,) of the principal point, pixels
+
+
+def find_own_lens(problem: MapperInput, partial: PartialMap, view: int, config: ResectionConfig) -> OwnLens | None:
+    """The lens with which most of the map's points fit a pose of `view`, where it is not the common one.
+
+    None where the common lens, which is tried first, fits nearly as many. Displaced principal points, as of crops and
+    keystone corrections, are tried where other focal lengths alone leave many points that do not fit.
     """
     correspondences = _correspondences(partial, problem.growing_tracks, view)
     limit = config.max_error_px * problem.scale[view]
-    lens = float(np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[view]]))
+    common = float(np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[view]]))
     everything = np.ones(len(correspondences.tracks), bool)
-    counts = {}
-    for factor in _FOCAL_FACTORS:
-        found = _pnp(correspondences, everything, factor * lens, limit, config, _OWN_FOCAL_TOLERANCE)
-        counts[factor] = 0 if found is None else found[2]
-    best = max(counts, key=lambda factor: counts[factor])
-    return best * lens if counts[best] > _MORE_POINTS * counts[1.0] else None
+
+    def count(lens: OwnLens) -> int:
+        moved = replace(correspondences, pixels=correspondences.pixels - lens.shift)
+        found = _pnp(moved, everything, lens.focal, limit, config, _OWN_FOCAL_TOLERANCE)
+        return 0 if found is None else found[2]
+
+    middle = np.zeros(2)
+    zoomed = {factor: count(OwnLens(factor * common, middle)) for factor in _FOCAL_FACTORS}
+    factor = max(zoomed, key=lambda each: zoomed[each])
+    best, most = OwnLens(factor * common, middle), zoomed[factor]
+    if most < _FITTING * len(everything):
+        side = problem.views[view].longer_side
+        for size, direction, factor in itertools.product(_SHIFTS, _DIRECTIONS, _NEAR_FACTORS):
+            other = OwnLens(factor * best.focal, size * side * np.array(direction))
+            fitting = count(other)
+            if fitting > _MORE_POINTS * zoomed[1.0] and fitting > most:
+                best, most = other, fitting
+    return best if most > _MORE_POINTS * zoomed[1.0] else None
 
 
 def reprojection_errors(correspondences: Correspondences, rotation: Array, translation: Array, focal: float) -> Array:

@@ -501,8 +501,14 @@ def _pool_deviations(deviations: Array) -> Array:
     return sizes
 
 
-def add_lens(problem: MapperInput, partial: PartialMap, view: int, focal: float) -> tuple[MapperInput, PartialMap]:
-    """Both, with a lens of its own of this focal length (pixels) for a view, which the map then does not have."""
+def add_lens(
+    problem: MapperInput, partial: PartialMap, view: int, focal: float, shift: Array | None = None
+) -> tuple[MapperInput, PartialMap]:
+    """Both, with a lens of its own for a view, which the map then does not have.
+
+    Focal length and shift (2,) of the principal point are in pixels. The view may be a crop: that point is free.
+    """
+    widest_shift = OwnLensesConfig().widest_shift * problem.views[view].longer_side
     number, before, prior = len(problem.lenses), partial.estimate, partial.prior
     lens_of = before.lens_of_camera.copy()
     lens_of[view] = number
@@ -511,20 +517,21 @@ def add_lens(problem: MapperInput, partial: PartialMap, view: int, focal: float)
         lens_of_camera=lens_of,
         log_focals=np.append(before.log_focals, np.log(focal)),
         radials=np.vstack([before.radials, np.zeros((1, 2))]),
-        shifts=np.vstack([before.shifts, np.zeros((1, 2))]),
+        shifts=np.vstack([before.shifts, np.zeros(2) if shift is None else shift]),
         log_aspects=np.append(np.log(before.aspects), 0.0),
     )
     prior = bundle_adjustment.LensPrior(
         log_focals=np.append(prior.log_focals, np.log(focal)),
         sigmas=np.append(prior.sigmas, _OWN_SIGMA),
         radial_sigmas=np.vstack([prior.radial_sigmas, np.zeros((1, 2))]),
-        shift_sigmas=np.append(prior.shift_sigmas, 0.0),
+        shift_sigmas=np.append(prior.shift_sigmas, widest_shift),
         aspect_sigmas=None if prior.aspect_sigmas is None else np.append(prior.aspect_sigmas, 0.0),
         ties=None
         if prior.ties is None
         else bundle_adjustment.LensTies(np.append(prior.ties.to, -1), np.vstack([prior.ties.sigmas, np.zeros((1, 6))])),
     )
     views = tuple(replace(each, lens=number) if index == view else each for index, each in enumerate(problem.views))
-    problem = replace(problem, views=views, lenses=(*problem.lenses, Lens((focal,), _OWN_SIGMA)))
+    own = Lens((focal,), _OWN_SIGMA, widest_shift=widest_shift)
+    problem = replace(problem, views=views, lenses=(*problem.lenses, own))
     registered = tuple(each for each in partial.registered if each != view)
     return problem, replace(partial, registered=registered, estimate=estimate, prior=prior)

@@ -518,7 +518,8 @@ def doubt_common_lenses(fit: BundleFit) -> CameraShifts:
 
     The mean of these cameras is where an adjustment finds them under wide priors, and counts ASKED_WEIGHT times; their
     spread is the covariance under the usual ones. The focal lengths are those of the cameras (C,), and not of their
-    lenses. A camera that shares its lens with no other keeps its prior.
+    lenses. A camera that shares its lens with no other keeps its prior, unless its image refuted a shared one: then it
+    may be a crop.
     """
     whole = adjust(fit)
     usual, prior = _doubt_lenses(whole, DOUBTED_SHIFT)
@@ -542,7 +543,7 @@ def _doubt_lenses(
     count, side = len(whole.problem.rotations), REFERENCE_SIDE * whole.scale
     config = msgspec.structs.replace(self_calibration.OwnLensesConfig(), focal_sigma=DOUBTED_FOCAL)
     shared = np.bincount(whole.problem.lens_of_camera, minlength=len(whole.prior.sigmas)) > 1
-    shifts = np.where(shared, np.maximum(whole.prior.shift_sigmas, shift_sigma * side), whole.prior.shift_sigmas)
+    shifts = np.maximum(whole.prior.shift_sigmas, np.where(shared | whole.own, shift_sigma * side, 0.0))
     prior = replace(whole.prior, shift_sigmas=shifts)
     apart, prior = self_calibration.widen_lens_priors(whole.problem, prior, np.full(count, side), config)
     return bundle_adjustment.adjust(apart, prior, whole.loss), prior
