@@ -35,8 +35,10 @@ def windows() -> str:
         (title, *(raw(name)["summary"][method]["all"][kind] for kind in counts))
         for title, name, method in (
             ("splatnode", "windows", "splatnode"),
-            ("COLMAP", "windows", "colmap"),
-            ("GLOMAP", "windows", "glomap"),
+            ("COLMAP, default options", "windows", "colmap"),
+            ("COLMAP, options for few views", "windows", "colmap-few-views"),
+            ("GLOMAP, default options", "windows", "glomap"),
+            ("GLOMAP, options for few views", "windows", "glomap-few-views"),
             (
                 "splatnode, older code, numbers fitted to these windows (`windows_again.json`)",
                 "windows_again",

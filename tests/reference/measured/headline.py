@@ -52,7 +52,8 @@ def _windows() -> list[tuple[str, str, str]]:
         (
             f"{windows['splatnode']['sets']} windows from the {scenes} scenes of development",
             f"{right['splatnode']}; {rough} of the {len(own)} published are called rough",
-            f"COLMAP {right['colmap']}; GLOMAP {right['glomap']}; both by default",
+            f"COLMAP {right['colmap-few-views']} and GLOMAP {right['glomap-few-views']} with options for few views, "
+            f"{right['colmap']} and {right['glomap']} by default",
         ),
     ]
 
