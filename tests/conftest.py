@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from hypothesis import settings
 
 from tests.support.long_tests import LIST, is_long, parse_long_tests
 
-pytest_plugins = ["tests.support.processor_times", "tests.support.skip_check"]
+pytest_plugins = ["tests.support.processor_times", "tests.support.reuse", "tests.support.skip_check"]
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -40,6 +41,17 @@ def pytest_configure(config: pytest.Config) -> None:
     # The same examples every time, however slow the machine: a test that fails by chance is no test.
     settings.register_profile("splatnode", deadline=None, derandomize=True, database=None)
     settings.load_profile("splatnode")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Modules and tests stay until the end: to look through them for garbage, again and again, finds none."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -18,7 +18,11 @@ from splatnode.capture.keyframe_selection import (
 from tests.support import synthetic
 
 LIMITS = Limits()
-SHARP = synthetic.photographs()[0]
+
+
+@pytest.fixture(scope="module")
+def sharp() -> Frame:
+    return synthetic.photographs()[0]
 
 
 def box_edge(width: int, contrast: float = 120.0) -> np.ndarray:
@@ -35,19 +39,19 @@ def test_blur_is_the_width_of_edges_whatever_their_contrast(width, contrast):
 
 
 @pytest.mark.parametrize("angle", [0, 45, 90, 135])
-def test_motion_blur_is_found_in_every_direction(angle):
-    before = blur_width(SHARP.image)
-    widths = [blur_width(synthetic.blurred(SHARP, length, angle).image) for length in (3, 6, 12)]
+def test_motion_blur_is_found_in_every_direction(sharp, angle):
+    before = blur_width(sharp.image)
+    widths = [blur_width(synthetic.blurred(sharp, length, angle).image) for length in (3, 6, 12)]
     assert before is not None and before < 2
     assert widths == sorted(widths) and widths[0] > 1.3 * before and widths[-1] > 4 * before
 
 
-def test_blur_does_not_depend_on_noise_or_exposure():
-    noise = np.random.default_rng(0).normal(scale=4, size=SHARP.image.shape)
-    noisy = np.clip(SHARP.image + noise, 0, 255).astype(np.uint8)
-    expected = blur_width(SHARP.image)
+def test_blur_does_not_depend_on_noise_or_exposure(sharp):
+    noise = np.random.default_rng(0).normal(scale=4, size=sharp.image.shape)
+    noisy = np.clip(sharp.image + noise, 0, 255).astype(np.uint8)
+    expected = blur_width(sharp.image)
     assert blur_width(noisy) == pytest.approx(expected, rel=0.25)
-    assert blur_width(synthetic.exposed(SHARP, 0.4).image) == pytest.approx(expected, rel=0.25)
+    assert blur_width(synthetic.exposed(sharp, 0.4).image) == pytest.approx(expected, rel=0.25)
 
 
 def test_exposure_shares():
@@ -81,11 +85,11 @@ def test_a_frame_is_blurred_beside_sharper_ones():
     assert "sharpest 1.2" in (why_unusable(soft, LIMITS, sharpest_px=1.2) or "")
 
 
-def test_spoilt_frames_are_unusable():
-    assert why_unusable(assess(SHARP.image), LIMITS) is None
-    assert "underexposed" in (why_unusable(assess(synthetic.exposed(SHARP, 1e-4).image), LIMITS) or "")
-    assert "overexposed" in (why_unusable(assess(synthetic.exposed(SHARP, 1e4).image), LIMITS) or "")
-    grain = np.random.default_rng(0).normal(128, 5, SHARP.image.shape)
+def test_spoilt_frames_are_unusable(sharp):
+    assert why_unusable(assess(sharp.image), LIMITS) is None
+    assert "underexposed" in (why_unusable(assess(synthetic.exposed(sharp, 1e-4).image), LIMITS) or "")
+    assert "overexposed" in (why_unusable(assess(synthetic.exposed(sharp, 1e4).image), LIMITS) or "")
+    grain = np.random.default_rng(0).normal(128, 5, sharp.image.shape)
     assert "blank" in (why_unusable(assess(np.rint(grain).astype(np.uint8)), LIMITS) or "")
     smooth = synthetic.textureless()[0]
     assert why_unusable(assess(smooth.image), LIMITS) is not None
@@ -122,11 +126,11 @@ def test_real_motion_blur_and_real_sharp_photographs(shared):
         assert [why_unusable(quality, LIMITS, sharpest) for quality in qualities] == [None] * len(qualities)
 
 
-def test_assessing_leaves_the_image_alone():
-    image = SHARP.image.copy()
+def test_assessing_leaves_the_image_alone(sharp):
+    image = sharp.image.copy()
     assess(image)
     novelty(image, image)
-    assert np.array_equal(image, SHARP.image)
+    assert np.array_equal(image, sharp.image)
     assert assess(cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA)).blur_px is not None
 
 

@@ -1,19 +1,22 @@
 """The seconds of each step: what is measured, how it is written, and what is refused."""
 
 import json
+from functools import partial
 
 import pytest
 
 from splatnode import command_line
+from splatnode.capture.cameras import synthetic
 from splatnode.recon import doctor
-from splatnode.recon.config import preset
+from splatnode.recon.config import apply_changes, preset
 from splatnode.recon.doctor import Rates, format_rates, measure_rates, record_rates
 
 SOME = Rates(6, 0.2, 0.75, 0.05, "5 of 5", 12.0, None, "OK_ROUGH", 9000)
 
 
-def test_every_step_is_measured():
-    (found,) = measure_rates((4,), preset("preview"))
+def test_every_step_is_measured(monkeypatch):
+    monkeypatch.setattr(synthetic, "Config", partial(synthetic.Config, width=320, height=240))
+    (found,) = measure_rates((4,), apply_changes(preset("preview"), {"optimize": {"iterations": 10}}))
     assert found.views == 4 and found.verdict.startswith("OK") and found.gaussians > 0
     assert min(found.add_s, found.update_s, found.finalize_s, found.localize_s) > 0
     assert found.localized == "3 of 3"

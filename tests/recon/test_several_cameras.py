@@ -117,6 +117,17 @@ def test_an_mcap_file_with_three_cameras_is_one_world(seen, tmp_path):
     assert told == {"front", "side"}
 
 
+def test_an_mcap_file_with_three_cameras_has_a_set_a_step_and_the_lenses_that_are_told(seen, tmp_path):
+    frames = [each for each in load(write_log(seen, tmp_path / "drive.mcap")).frames if isinstance(each, Frame)]
+    sets = [sorted(each.camera_id for each in sets) for sets in group_frame_sets(frames) if isinstance(sets, tuple)]
+    assert sets == [["front", "side", "wrist"]] * STEPS
+    lenses = {each.camera_id: each.intrinsics for each in frames}
+    assert lenses["wrist"] is None
+    for camera in ("front", "side"):
+        told = lenses[camera]
+        assert told is not None and told.fx == pytest.approx(told_lens(seen, camera).fx)
+
+
 def test_an_episode_with_three_cameras_is_one_world(seen, tmp_path):
     lenses = Lenses({camera: told_lens(seen, camera) for camera in ("front", "wrist")})
     source = load(write_episode(seen, tmp_path / "set"), lenses)

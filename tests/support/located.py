@@ -38,8 +38,12 @@ def known_place() -> KnownPlace:
 
 def photograph(index: int) -> tuple[np.ndarray, Camera]:
     """Midway between two photographs of the scene, with its true camera."""
-    camera = synthetic.evaluation_cameras(PLACE)[index]
-    return synthetic.render_image(PLACE, camera, 100 + index), camera
+    return _render(index).copy(), synthetic.evaluation_cameras(PLACE)[index]
+
+
+@lru_cache(maxsize=PLACE.views)
+def _render(index: int) -> np.ndarray:
+    return synthetic.render_image(PLACE, synthetic.evaluation_cameras(PLACE)[index], 100 + index)
 
 
 def turned(camera: Camera, degrees: float) -> Camera:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -11,9 +12,10 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 
 
-def look_of(seed: int) -> np.ndarray:
-    """(H, W, 3) of the built-in place of this seed."""
-    config = synthetic.Config(seed=seed)
+@lru_cache(maxsize=2)
+def look_of(seed: int, width: int = 640, height: int = 480) -> np.ndarray:
+    """(height, width, 3) of the built-in place of this seed."""
+    config = synthetic.Config(seed=seed, width=width, height=height)
     return synthetic.render_image(config, synthetic.scene_cameras(config)[0])
 
 

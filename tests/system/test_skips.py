@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from fnmatch import fnmatch
@@ -23,7 +24,8 @@ def run(folder, kind: str, *options: str) -> subprocess.CompletedProcess[str]:
     (folder / "test_one.py").write_text(FILES[kind] + "def test_another(): pass\n")
     (folder / "pytest.ini").write_text("[pytest]\n")
     command = [sys.executable, "-m", "pytest", "-p", "tests.support.skip_check", *options, str(folder)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    plain = os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}  # others' plug-ins take longer than the tests
+    return subprocess.run(command, cwd=ROOT, env=plain, capture_output=True, text=True)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,7 @@
-"""Every command of docs/tutorial.md, one task after the other in one folder, as a newcomer types them."""
+"""Every command of docs/tutorial.md, one task after the other in one folder, as a newcomer types them.
+
+The demo's photographs are small here, and with them those of the tasks after it: `.ci/run` makes the demo as it is.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,14 @@ from tests.conftest import ROOT
 
 PATIENCE_S = 900.0
 ENDS_ALL = "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT"  # also where a line in between fails
+SMALL_DEMO = """
+import sys
+from functools import partial
+from splatnode.__main__ import main
+from splatnode.capture.cameras import synthetic
+synthetic.Config = partial(synthetic.Config, width=320, height=240)
+sys.exit(main())
+"""
 TASKS = re.findall(
     r"^## \d+\. ([^\n]+)\n.*?^```sh\n(.*?)^```$",
     (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"),
@@ -28,8 +39,10 @@ def newcomer(tmp_path_factory) -> tuple[Path, dict[str, str]]:
     programs, home = folder / "bin", folder / "home"
     programs.mkdir()
     home.mkdir(mode=0o700)
-    for name, command in (("splatnode", "-m splatnode"), ("python", "")):
-        (programs / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {command} "$@"\n')
+    (programs / "small_demo.py").write_text(SMALL_DEMO)
+    small_demo = f'[ "$1" != demo ] || exec "{sys.executable}" "{programs}/small_demo.py" "$@"'
+    for name, first, command in (("splatnode", small_demo, "-m splatnode"), ("python", "", "")):
+        (programs / name).write_text(f'#!/bin/sh\n{first}\nexec "{sys.executable}" {command} "$@"\n')
         (programs / name).chmod(0o755)
     of_a_user = {"HOME": home, "XDG_RUNTIME_DIR": home, "XDG_STATE_HOME": home / "state", "PYTHONPATH": ROOT}
     path = f"{programs}{os.pathsep}{os.environ['PATH']}"

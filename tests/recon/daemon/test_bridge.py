@@ -6,6 +6,7 @@ import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from splatnode.recon.daemon.loop_closure import (
 )
 from splatnode.recon.daemon.pose_graph import EdgeKind, make_loop_edge
 from splatnode.recon.estimation import estimate_cameras, prepare
+from splatnode.recon.geometry import Similarity
 from splatnode.recon.matching.view_graph import ViewGraph, match
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import RunContext
@@ -72,6 +74,9 @@ def cameras(given) -> dict[str, np.ndarray]:
     return {f"{index}.png": T for index, (T, _) in enumerate(given)}
 
 
+MINE, THEIRS = cameras(TRUE[:4]), cameras(BETWEEN[1:5])
+
+
 def test_a_place_seen_again_is_bridged_as_it_lies(sides):
     found = verify_loop(sides["scene-0001"], sides["scene-0002"], ReconstructionConfig(), None)
     assert isinstance(found, VerifiedLoop), found
@@ -81,18 +86,20 @@ def test_a_place_seen_again_is_bridged_as_it_lies(sides):
     K = np.stack([TRUE[0][1]] * len(names))
     errors = compare_cameras(np.stack([*found.one.values(), *found.other.values()]), np.stack(true), K, K)
     assert errors.rotation_deg < 0.5 and errors.centre_pct < 3
+    link = make_loop_edge("scene-0001", "scene-0002", MINE, THEIRS, (found.one, found.other), "")
+    assert link is not None and abs(link.scale - 1) < 0.05
+    assert np.abs(np.array(link.rotation) - np.eye(3)).max() < 0.02
 
 
-def test_the_link_carries_the_one_scene_onto_the_other(sides):
-    found = verify_loop(sides["scene-0001"], sides["scene-0002"], ReconstructionConfig(), None)
-    assert isinstance(found, VerifiedLoop), found
-    mine, theirs = cameras(TRUE[:4]), cameras(BETWEEN[1:5])
-    link = make_loop_edge("scene-0001", "scene-0002", mine, theirs, (found.one, found.other), "for the test")
+def test_the_link_carries_the_one_scene_onto_the_other():
+    turned = Similarity(0.5, cv2.Rodrigues(np.array([0.1, -0.4, 0.2]))[0], np.array([1.0, 2.0, 3.0]))
+    together = [{name: turned.camera(T) for name, T in each.items()} for each in (MINE, THEIRS)]
+    link = make_loop_edge("scene-0001", "scene-0002", MINE, THEIRS, (together[0], together[1]), "for the test")
     assert link is not None and link.kind is EdgeKind.LOOP and link.why == "for the test"
-    assert abs(link.scale - 1) < 0.05 and np.abs(np.array(link.rotation) - np.eye(3)).max() < 0.02
-    moved = {name: T.copy() for name, T in theirs.items()}
+    assert abs(link.scale - 1) < 1e-3 and np.abs(np.array(link.rotation) - np.eye(3)).max() < 1e-3
+    moved = {name: T.copy() for name, T in THEIRS.items()}
     moved["1.png"][:3, 3] += 0.5
-    assert make_loop_edge("scene-0001", "scene-0002", mine, moved, (found.one, found.other), "") is None
+    assert make_loop_edge("scene-0001", "scene-0002", MINE, moved, (together[0], together[1]), "") is None
 
 
 def test_the_same_photographs_have_the_same_cameras(sides):

@@ -20,9 +20,12 @@ SHARE = 0.2
 CONFIG = apply_changes(preset("preview"), {"size": 320})
 
 
+@lru_cache(maxsize=1)
 def with_thing():
     """The photographs with a thing pasted over each, and what it leaves free."""
-    return [pasted(frame, SHARE, seed, look_of(7)) for seed, frame in enumerate(photographs())]
+    return [
+        pasted(frame, SHARE, seed, look_of(7, SMALL.width, SMALL.height)) for seed, frame in enumerate(photographs())
+    ]
 
 
 @lru_cache(maxsize=2)

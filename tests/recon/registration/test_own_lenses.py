@@ -38,13 +38,16 @@ pytestmark = pytest.mark.numerical
 PLACE = synthetic.Config(views=6, width=640, height=480)
 
 
-@lru_cache(maxsize=1)
-def photographs() -> tuple[TrialImage, ...]:
-    cameras = synthetic.scene_cameras(PLACE)
+SMALL = synthetic.Config(views=4, width=320, height=240)
+
+
+@lru_cache(maxsize=3)
+def photographs(place: synthetic.Config = PLACE) -> tuple[TrialImage, ...]:
+    cameras = synthetic.scene_cameras(place)
     found = []
-    for frame, (T_world_camera, K) in zip(synthetic.stream(PLACE), cameras, strict=True):
+    for frame, (T_world_camera, K) in zip(synthetic.stream(place), cameras, strict=True):
         found.append(
-            TrialImage(frame.name, frame.image, TrueCamera(T_world_camera, K, PLACE.width, PLACE.height), "built-in")
+            TrialImage(frame.name, frame.image, TrueCamera(T_world_camera, K, place.width, place.height), "built-in")
         )
     return tuple(found)
 
@@ -159,7 +162,7 @@ def test_a_group_has_the_covariance_of_common_and_own():
 
 def test_what_is_not_refuted_widens_the_covariance():
     """A lens that is taken to be common may differ a little from image to image."""
-    graph, settings = view_graph(make_frames(photographs())), ReconstructionConfig().registration
+    graph, settings = view_graph(make_frames(photographs(SMALL))), ReconstructionConfig().registration
     tight = msgspec.structs.replace(settings.mapper.own_lenses, focal_sigma=1e-5, shift_sigma=1e-5, radial_sigma=1e-5)
     sure = msgspec.structs.replace(settings, mapper=msgspec.structs.replace(settings.mapper, own_lenses=tight))
     wide, narrow = (register(graph.keyframes, graph.pairs, each) for each in (settings, sure))
@@ -171,7 +174,8 @@ def test_what_is_not_refuted_widens_the_covariance():
 
 def test_images_of_different_cameras_share_no_lens():
     cameras = ("a", "a", "", "b", "b", "")
-    named = [replace(frame, camera=camera) for frame, camera in zip(make_frames(photographs()), cameras, strict=True)]
+    photos = photographs(msgspec.structs.replace(SMALL, views=len(cameras)))
+    named = [replace(frame, camera=camera) for frame, camera in zip(make_frames(photos), cameras, strict=True)]
     keyframes = [Keyframe(frame, frame.image, Features(*(np.zeros(0),) * 4)) for frame in named]
     lens_of = self_calibration.group(keyframes, across_sizes=True).lens_of
     assert lens_of[0] == lens_of[1] == lens_of[2] and lens_of[3] == lens_of[4] != lens_of[0]

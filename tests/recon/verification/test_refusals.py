@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 from string import Formatter
 
@@ -24,6 +25,7 @@ ENTRIES = {
 }
 
 
+@cache
 def calls_of_refuse() -> dict[str, list[set[str | None]]]:
     """The keywords of every call of `refuse` in the product, by the entry that it fills in."""
     found = defaultdict(list)
@@ -36,19 +38,16 @@ def calls_of_refuse() -> dict[str, list[set[str | None]]]:
     return found
 
 
-CALLS = calls_of_refuse()
-
-
 def test_the_table_has_all_entries_that_are_filled_in_anywhere():
-    assert set(CALLS) == set(ENTRIES)
+    assert set(calls_of_refuse()) == set(ENTRIES)
 
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_every_caller_names_the_fields_of_the_sentence_and_no_others(name):
     text = ENTRIES[name].message + ENTRIES[name].advice
     wanted = {field for _, field, _, _ in Formatter().parse(text) if field is not None}
-    assert CALLS[name]
-    assert all(named == wanted for named in CALLS[name])
+    calls = calls_of_refuse()[name]
+    assert calls and all(named == wanted for named in calls)
 
 
 @pytest.mark.parametrize("name", ENTRIES)
