@@ -294,10 +294,16 @@ class _CameraPairs:
         )
 
     def make_scene_sigmas(self, scale: float) -> Array:
-        """(C, 2) standard deviations of the cameras' turns, radians, and of their centres, metres."""
-        found = np.column_stack([np.radians(self.bounds_deg), scale * self.bounds]) / TWO_SIDED_95
-        least = _LEAST_TURN, _LEAST_SHIFT * compute_rms_radius(self.given[:, :3, 3])
-        return np.maximum(found, least)
+        """(C, 2) standard deviations of the cameras' turns, radians, and of their centres, metres, at most.
+
+        Bounds hold what all cameras have wrong together, too: how the scene is bent.
+        """
+        return np.column_stack([np.radians(self.bounds_deg), scale * self.bounds]) / TWO_SIDED_95
+
+    @property
+    def least_sigmas(self) -> Array:
+        """(2,) likewise, at least."""
+        return np.array([_LEAST_TURN, _LEAST_SHIFT * compute_rms_radius(self.given[:, :3, 3])])
 
     def compute_errors(self, by: Similarity) -> tuple[Array, Array]:
         """Metres (C,) and degrees (C,) by which each pose is off."""
@@ -359,11 +365,8 @@ def _describe_noise(
     ahead = steps / max(float(steps.sum()), 1e-12)  # shares of the way, and of all turns
     turned = (ahead + turns / max(float(turns.sum()), 1e-12)) / 2.0
     grown = np.column_stack([drift * np.sqrt(turned), drift * steps.sum() * np.sqrt(ahead / 3.0)])
-    return PoseNoise(
-        pairs.make_scene_sigmas(by.scale),
-        np.column_stack([np.radians(rotation_deg), position_m]),
-        np.vstack([np.zeros(2), grown]),
-    )
+    own = np.hypot(np.column_stack([np.radians(rotation_deg), position_m]), pairs.make_scene_sigmas(by.scale))
+    return PoseNoise(own, np.vstack([np.zeros(2), grown]), pairs.least_sigmas)
 
 
 def align_to_motions(
@@ -384,8 +387,8 @@ def align_to_motions(
     turn = pairs.given[0, :3, :3] @ pairs.scene[0, :3, :3].T
     scale = compute_rms_radius(pairs.given[:, :3, 3]) / max(compute_rms_radius(pairs.scene[:, :3, 3]), 1e-12)
     begun = Similarity(scale, turn, pairs.given[0, :3, 3] - scale * turn @ pairs.scene[0, :3, 3])
-    own = np.tile(np.median(grown[1:], axis=0), (len(names), 1))
-    noise = PoseNoise(pairs.make_scene_sigmas(scale), own, grown)
+    own = np.hypot(np.median(grown[1:], axis=0), pairs.make_scene_sigmas(scale))
+    noise = PoseNoise(own, grown, pairs.least_sigmas)
     noise = part_steps(noise, np.concatenate([[False], ~fitting]), float(np.ptp(pairs.given[:, :3, 3], axis=0).max()))
     return fit_placement(pairs.scene, pairs.given, begun, np.ones(len(names), bool), noise)
 

@@ -41,15 +41,15 @@ _PARTED = 30.0  # times the poses' spread, and radians: standard deviation of an
 class PoseNoise:
     """Standard deviations of the errors of C poses along the way: radians about each axis, metres in each direction."""
 
-    scene: Array  # (C, 2) of the scene's own cameras
-    own: Array  # (C, 2) of each pose by itself, as far as it was told
+    own: Array  # (C, 2) of each pose by itself, and of the scene's camera, as far as they were told
     steps: Array  # (C, 2) of the step that leads to it, as far as it was told; the first counts for nothing
+    least: Array  # (2,) of each pose by itself, at least
 
     def choose(self, kept: Mask | Index) -> PoseNoise:
         """Returns that of some of the poses; their steps have the errors of all that are between."""
         grown = np.cumsum(np.where(np.arange(len(self.steps))[:, None] > 0, self.steps, 0.0) ** 2, axis=0)[kept]
         steps = np.sqrt(np.diff(grown, axis=0, prepend=grown[:1]))
-        return PoseNoise(self.scene[kept], self.own[kept], steps)
+        return PoseNoise(self.own[kept], steps, self.least)
 
 
 @dataclass(frozen=True)
@@ -163,8 +163,8 @@ def _make_turn_covariances(given: Array, noise: PoseNoise, factors: NoiseFactors
 
 
 def _own_variances(noise: PoseNoise, factor: float, kind: int) -> Array:
-    """(C,) of each pose's own errors, with its camera's."""
-    return noise.scene[:, kind] ** 2 + (factor * noise.own[:, kind]) ** 2
+    """(C,) of each pose's own errors."""
+    return noise.least[kind] ** 2 + (factor * noise.own[:, kind]) ** 2
 
 
 def _sum_variances(noise: PoseNoise, kind: int) -> Array:

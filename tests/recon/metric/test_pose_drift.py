@@ -48,13 +48,13 @@ def make_error(rng: np.random.Generator, metres: float, degrees: float) -> np.nd
     return T
 
 
-def make_views(Ts: np.ndarray) -> dict[str, MetricView]:
-    """The true cameras, as a scene has them whose unit and axes are others."""
+def make_views(Ts: np.ndarray, bounds: tuple[float, float] = (0.001, 0.05)) -> dict[str, MetricView]:
+    """The true cameras, as a scene has them whose unit and axes are others; `bounds` in its unit, and in degrees."""
     found = {}
     for index, T in enumerate(Ts):
         moved = np.eye(4)
         moved[:3, :3], moved[:3, 3] = TURN @ T[:3, :3], TURN @ T[:3, 3] / UNIT
-        found[f"{index:03d}"] = MetricView(moved, 1.0, np.zeros(2), np.zeros(2), 0.001, 0.05)
+        found[f"{index:03d}"] = MetricView(moved, 1.0, np.zeros(2), np.zeros(2), *bounds)
     return found
 
 
@@ -88,6 +88,18 @@ def test_poses_that_drift_place_the_scene_where_they_begin():
         low, high = found.unit.interval_95
         assert low <= UNIT / found.unit.metres_per_unit <= high
     assert np.median(worst) < 0.008 and max(worst) < 0.02  # the end of the odometry is 0.1 m off
+
+
+def test_bounds_of_the_scene_s_cameras_that_are_too_wide_hide_no_drift():
+    worst = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        Ts = make_walk(40, rng)
+        views, given = make_views(Ts, (0.01, 0.7)), measure(Ts, rng, (0.002, 0.2), NONE)
+        found = align_to_poses(views, dict(zip(views, given, strict=True)), TOLD)
+        assert isinstance(found, PoseAlignment)
+        worst.append(find_worst_m(found.rescale(UNIT), views, Ts))
+    assert np.median(worst) < 0.008 and max(worst) < 0.02
 
 
 def test_errors_of_each_pose_s_own_are_averaged():
@@ -170,7 +182,7 @@ def test_of_many_poses_an_even_choice_is_looked_at_and_others_keep_what_was_thou
     Ts = make_walk(400, rng)
     given = measure(Ts, rng, (0.002, 0.2), NONE)
     sigmas = np.tile([np.radians(0.2), 0.002], (400, 1))
-    noise = PoseNoise(1e-4 * np.ones((400, 2)), sigmas, sigmas)
+    noise = PoseNoise(sigmas, sigmas, np.array([1e-4, 1e-4]))
     kept = np.ones(400, bool)
     kept[1] = False
     placement = fit_placement(Ts, given, Similarity(1.0, np.eye(3), np.zeros(3)), kept, noise)
@@ -183,7 +195,7 @@ def test_of_many_poses_an_even_choice_is_looked_at_and_others_keep_what_was_thou
 
 def test_a_chosen_few_have_the_errors_of_the_steps_between():
     steps = np.array([[9.0, 9.0], [3.0, 0.3], [4.0, 0.4], [1.0, 0.1]])
-    noise = PoseNoise(np.ones((4, 2)), np.ones((4, 2)), steps)
+    noise = PoseNoise(np.ones((4, 2)), steps, np.ones(2))
     np.testing.assert_allclose(noise.choose(np.array([0, 2, 3])).steps, [[0.0, 0.0], [5.0, 0.5], [1.0, 0.1]])
     parted = part_steps(noise, np.array([False, False, True, False]), 2.0)
     np.testing.assert_allclose(parted.steps[[1, 3]], steps[[1, 3]])
