@@ -36,7 +36,7 @@ KINDS = {
     "lens": DepthCamera(),
 }
 _LONGER = 1.1  # focal length told over the true one, of `lens`
-_WRONG = 2.5  # times a bound
+WRONG = 2.5  # times a bound
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Row:
     @property
     def is_wrong(self) -> bool:
         """Whether a camera is far beyond its bound."""
-        return max(self.rotation_over_bound or 0.0, self.centre_over_bound or 0.0) > _WRONG
+        return max(self.rotation_over_bound or 0.0, self.centre_over_bound or 0.0) > WRONG
 
 
 def main() -> None:
@@ -93,7 +93,7 @@ def measure(seed: int, kind: str) -> Row:
     codes = seed, kind, alone.verdict.code.value, estimate.verdict.code.value
     if estimate.prior_world is None or not estimate.verdict.publishable:
         return Row(*codes, 0, None, None, None, None, None, None, seconds)
-    return Row(*codes, *_compare(room, estimate), seconds)
+    return Row(*codes, *compare_in_metres(room, estimate), seconds)
 
 
 def _lengthen(frame: Frame) -> Frame:
@@ -102,7 +102,8 @@ def _lengthen(frame: Frame) -> Frame:
     return replace(frame, intrinsics=replace(lens, fx=_LONGER * lens.fx, fy=_LONGER * lens.fy))
 
 
-def _compare(room: Room, estimate: Reconstruction) -> tuple[int, float, float, float, float, float, float]:
+def compare_in_metres(room: Room, estimate: Reconstruction) -> tuple[int, float, float, float, float, float, float]:
+    """How many cameras there are, and the last six errors of a Row: those of cameras held by depth."""
     given, registration = estimate.prior_world, estimate.registration
     assert given is not None and registration is not None
     cameras, names = registration.cameras, estimate.graph.names
