@@ -80,7 +80,8 @@ def measure(seed: int) -> Row:
     told = seed, plain, estimate.verdict.code.value, len(names), frames[plain].name in names
     if estimate.prior_world is None or not estimate.publishable:
         return Row(*told, None, None, None, None, None)
-    return Row(*told, *compare_in_metres(room, estimate)[1:6])
+    beside = 1 if plain == 0 and frames[plain].name in names else 0  # a camera that images place
+    return Row(*told, *compare_in_metres(room, estimate, beside)[1:6])
 
 
 if __name__ == "__main__":
