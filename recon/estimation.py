@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
-from splatnode.capture.frame import DroppedFrame, Frame, Stamp, make_given_pose
+from splatnode.capture.frame import LEAST_SIGMA, DroppedFrame, Frame, GivenPose, Stamp, make_given_pose
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.system import raise_shortage
 from splatnode.recon.config import ReconstructionConfig
@@ -26,7 +26,7 @@ from splatnode.recon.keyframes import (
 from splatnode.recon.locating.localize import collect_landmarks
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
-from splatnode.recon.metric.depth_alignment import place_by_depth
+from splatnode.recon.metric.depth_alignment import place_beside, place_by_depth
 from splatnode.recon.metric.depth_fit import fit_depth_images, make_depth_views
 from splatnode.recon.metric.depth_fusion import fill_measured_depth
 from splatnode.recon.priors import Pointmap, Prior, apply_image_masks
@@ -38,7 +38,7 @@ from splatnode.recon.registration.posed_mapping import TELLING_MATCHES, offset_o
 from splatnode.recon.registration.registration import Registration, register, undistort_keyframes
 from splatnode.recon.registration.rigs import RigEstimate
 from splatnode.recon.result.snapshot import DepthCode, Landmarks
-from splatnode.recon.result.verdict import SURE, Bounds, Code, Verdict
+from splatnode.recon.result.verdict import SURE, TWO_SIDED_95, Bounds, Code, Verdict
 from splatnode.recon.threads import BACKGROUND, RunContext
 from splatnode.recon.verification.decision import (
     EXIF_LEFT_OUT,
@@ -379,21 +379,67 @@ def estimate_cameras_by_depth(
     None where depth images place fewer than two cameras, or what the images match contradicts them. It pauses about
     once a second, which may raise.
     """
-    placed = {each.name: each for each in place_by_depth([each.frame for each in graph.keyframes], run.pause)}
+    placed = place_by_depth([each.frame for each in graph.keyframes], run.pause)
     if not placed:
         return None
-    keyframes = []
-    for keyframe in graph.keyframes:
-        camera = placed.get(keyframe.name)
-        pose = None if camera is None else make_given_pose(camera.T_world_camera, camera.sigma_m, camera.sigma_deg)
-        keyframes.append(replace(keyframe, frame=replace(keyframe.frame, given_pose=pose)))
+    poses = {each.name: make_given_pose(each.T_world_camera, each.sigma_m, each.sigma_deg) for each in placed}
+    return _hold_by_depth(graph, poses, max(each.scale_sigma for each in placed), config, run)
+
+
+def add_cameras_by_depth(
+    known: Reconstruction, config: ReconstructionConfig, run: RunContext = BACKGROUND
+) -> Reconstruction | None:
+    """The estimate `known`, in metres, with cameras that it lacks and depth images place beside its own.
+
+    Its own cameras are held within their bounds, and adjusted together with the others. None where no camera is added,
+    the depth images do not fit the images, or these contradict the others. It pauses about once a second, which may
+    raise.
+    """
+    graph, registration = known.graph, known.registration
+    lacking = {each.name for each in graph.keyframes if each.frame.depth is not None} - known.camera_names
+    if not lacking or not known.publishable or registration is None or registration.given is not None:
+        return None
+    fits = fit_depth_images(make_depth_views(graph, registration))
+    if not fits or not all(fit.is_usable for fit in fits):
+        return None
+    weights = np.array([fit.sigma for fit in fits]) ** -2.0
+    unit = float(np.exp(np.average([np.log(fit.metres_per_unit) for fit in fits], weights=weights)))
+    own, poses = {}, {}
+    for camera in registration.cameras:
+        name, T = graph.names[camera.index], camera.T_world_camera.copy()
+        T[:3, 3] *= unit
+        own[name], bound = T, known.bounds[name]
+        sigma_m, sigma_deg = unit * bound.centre / TWO_SIDED_95, bound.rotation_deg / TWO_SIDED_95
+        poses[name] = make_given_pose(T, max(sigma_m, LEAST_SIGMA), max(sigma_deg, LEAST_SIGMA))
+    placed = place_beside([each.frame for each in graph.keyframes], own, run.pause)
+    if not placed:
+        return None
+    poses |= {each.name: make_given_pose(each.T_world_camera, each.sigma_m, each.sigma_deg) for each in placed}
+    posed = _hold_by_depth(graph, poses, float(weights.sum() ** -0.5), config, run)
+    if posed is None or posed.registration is None or posed.registration.given is None:
+        return None
+    by_depth = frozenset(graph.names.index(each.name) for each in placed) & posed.registration.given.held
+    verdict = decide_posed(graph, posed.registration, replace(posed.registration.given, held=by_depth), config.decision)
+    return replace(posed, verdict=verdict) if by_depth else None
+
+
+def _hold_by_depth(
+    graph: ViewGraph, poses: Mapping[str, GivenPose], scale_sigma: float, config: ReconstructionConfig, run: RunContext
+) -> Reconstruction | None:
+    """The estimate whose cameras are held by `poses`, of which depth images tell; None where images contradict them.
+
+    `scale_sigma` is the standard deviation of the logarithm of all lengths alike.
+    """
+    keyframes = [
+        replace(keyframe, frame=replace(keyframe.frame, given_pose=poses.get(keyframe.name)))
+        for keyframe in graph.keyframes
+    ]
     absolute = msgspec.structs.replace(config.registration, poses_drift=0.0, poses_drift_deg=0.0)
     found = register_posed(keyframes, graph.pairs, absolute, run)
     give_back_memory()
     if found is None or found.given is None:
         return None
-    scale_sigma = float(np.hypot(found.given.scale_sigma, max(each.scale_sigma for each in placed.values())))
-    given = replace(found.given, from_depth=True, scale_sigma=scale_sigma)
+    given = replace(found.given, from_depth=True, scale_sigma=float(np.hypot(found.given.scale_sigma, scale_sigma)))
     registration = replace(found, given=given)
     verdict = decide_posed(graph, registration, given, config.decision)
     posed = Reconstruction(graph, registration, None, verdict)

@@ -27,7 +27,13 @@ import numpy.typing as npt
 
 from splatnode.recon import networks
 from splatnode.recon.config import PriorChoice, ReconstructionConfig
-from splatnode.recon.estimation import Reconstruction, estimate_cameras, estimate_cameras_by_depth, find_telling_pairs
+from splatnode.recon.estimation import (
+    Reconstruction,
+    add_cameras_by_depth,
+    estimate_cameras,
+    estimate_cameras_by_depth,
+    find_telling_pairs,
+)
 from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.keyframes import PLAIN, Rejected
 from splatnode.recon.matching.features import count_search_pixels
@@ -300,12 +306,26 @@ def run_fallbacks(
         return estimate
     estimate = estimate_without_doubtful(estimate, rejected, config, run)
     if not _wants_depth(estimate):
-        return estimate
+        return _extend_by_depth(estimate, config, run)
     by_depth = estimate_cameras_by_depth(estimate.graph, config, run)
     if by_depth is None or not by_depth.publishable:
         return _advise_lens(estimate)
     log.info("depth images place %d cameras", len(by_depth.camera_names))
     return by_depth
+
+
+def _extend_by_depth(estimate: Reconstruction, config: ReconstructionConfig, run: RunContext) -> Reconstruction:
+    """The estimate with cameras that depth images place beside its own; as it is where these would move or be rough."""
+    if not estimate.publishable or not find_unplaced_keyframes(estimate):
+        return estimate
+    extended = add_cameras_by_depth(estimate, config, run)
+    if extended is None or not estimate.camera_names < extended.camera_names:
+        return estimate
+    is_blurred = extended.verdict.code is Code.OK_ROUGH and estimate.verdict.code is not Code.OK_ROUGH
+    if not extended.publishable or is_blurred or _compute_turn_deg(estimate, extended) > MAX_TURN_DEG:
+        return estimate
+    log.info("depth images place %d further cameras", len(extended.camera_names - estimate.camera_names))
+    return extended
 
 
 def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, rungs: Sequence[Fallback] = RUNGS) -> str:

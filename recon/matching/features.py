@@ -164,12 +164,16 @@ def extract(image: Image, config: FeatureConfig) -> Features:
     return Features(points, descriptors, np.arange(len(points)), np.ones(len(points)))
 
 
-def apply_mask(features: Features, mask: npt.NDArray[np.bool_] | None) -> Features:
-    """Those that lie well inside of what `mask` (H, W) of their image uses; None: all."""
+def apply_mask(features: Features, mask: npt.NDArray[np.bool_] | None, first: int = 0) -> Features:
+    """Those that lie well inside of what `mask` (H, W) of their image uses; None: all.
+
+    Points before the `first` stay, hidden or not: matches know them by their numbers.
+    """
     if mask is None:
         return features
     inside = well_inside(mask)
     keep = inside[tuple(np.minimum(features.points.astype(np.int64), np.array(mask.shape)[::-1] - 1).T[::-1])]
+    keep[:first] = True
     number = np.cumsum(keep) - 1
     described = keep[features.point_of]
     return Features(

@@ -443,7 +443,8 @@ def _try_affine_features(keyframe: Keyframe, tilts: Sequence[float], config: Mat
 
 def _add_affine_features(keyframe: Keyframe, tilts: Sequence[float], config: MatchingConfig) -> Keyframe:
     found = features.add_affine_features(keyframe.features, keyframe.frame.image, tilts, config.features)
-    return replace(keyframe, features=features.apply_mask(found, keyframe.frame.mask))
+    first = len(keyframe.features.points)
+    return replace(keyframe, features=features.apply_mask(found, keyframe.frame.mask, first))
 
 
 def _add_matcher_proposals(

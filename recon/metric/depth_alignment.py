@@ -472,6 +472,7 @@ def _trim_information(J: Array, weight: Array) -> Array:
 _ROUNDS = 12  # of the joint adjustment
 _OPEN_M, _OPEN_RAD = 10.0, np.pi  # standard deviations of what surfaces leave open
 _LEAST_SIGMA_M, _LEAST_SIGMA_DEG = 0.002, 0.05  # of a placed camera
+_FARTHEST_KNOWN = 2  # in the order of the frames, of a known camera beside which another one is placed
 _MOST_SIGMA, _MOST_SIGMA_DEG = 0.03, 1.0  # of a camera that is placed: share of the distance, degrees
 
 
@@ -493,13 +494,7 @@ def place_by_depth(frames: Sequence[Frame], pause: Callable[[], None] = lambda: 
     with depth and a lens that was told count. Neighbours in time look at the same place, from at most some tens of
     degrees apart. `pause` is called between steps and may raise.
     """
-    ordered = sorted(frames, key=lambda frame: (frame.stamp_ns, frame.frame_id, frame.name))
-    clouds = [cloud for frame in ordered if (cloud := make_depth_cloud(frame)) is not None]
-    exchanged = find_exchanged_depth(clouds)
-    for k, other in exchanged.items():
-        names = sanitize_text(clouds[k].name), sanitize_text(clouds[other].name)
-        log.warning("the depth image of %s fits the photograph %s much better, and is not used", *names)
-    clouds = [cloud for k, cloud in enumerate(clouds) if k not in exchanged]
+    clouds = _collect_clouds(frames)
     # Of frames that are farther from each other a corner may be taken for the next one, where rooms are alike
     aligned = []
     for target, cloud in itertools.pairwise(clouds):
@@ -510,6 +505,79 @@ def place_by_depth(frames: Sequence[Frame], pause: Callable[[], None] = lambda: 
         return ()
     placed = _place(clouds, poses, pause)
     return () if placed is None else _make_cameras(clouds, *placed)
+
+
+def _collect_clouds(frames: Sequence[Frame]) -> list[DepthCloud]:
+    """The clouds of frames, in the order in which these were taken; a depth image of another photograph gives none."""
+    ordered = sorted(frames, key=lambda frame: (frame.stamp_ns, frame.frame_id, frame.name))
+    clouds = [cloud for frame in ordered if (cloud := make_depth_cloud(frame)) is not None]
+    exchanged = find_exchanged_depth(clouds)
+    for k, other in exchanged.items():
+        names = sanitize_text(clouds[k].name), sanitize_text(clouds[other].name)
+        log.warning("the depth image of %s fits the photograph %s much better, and is not used", *names)
+    return [cloud for k, cloud in enumerate(clouds) if k not in exchanged]
+
+
+def place_beside(
+    frames: Sequence[Frame], known: Mapping[str, Array], pause: Callable[[], None] = lambda: None
+) -> tuple[PlacedCamera, ...]:
+    """The cameras of frames of which `known`, T_world_camera (4, 4) in metres by name, tells none.
+
+    Each is aligned with two known neighbours in time by itself, which must agree, and no known camera may contradict
+    it. Empty where nothing can be placed, or the depth images contradict the known cameras. Frames are as those of
+    `place_by_depth`.
+    """
+    clouds = _collect_clouds(frames)
+    poses = {k: known[cloud.name] for k, cloud in enumerate(clouds) if cloud.name in known}
+    told = sorted(poses)
+    if len(told) < 2 or any(_is_contradicted(clouds, poses, i, told) for i in told):
+        return ()
+    for k in range(len(clouds)):
+        pause()
+        if k not in poses and (T := _place_between(clouds, {i: poses[i] for i in told}, k)) is not None:
+            poses[k] = T
+    for _ in range(_ROUNDS if len(poses) > len(told) else 0):
+        pause()
+        poses, _ = _adjust(clouds, poses, [*told, *(k for k in sorted(poses) if k not in told)], len(told))
+    found = []
+    for k in sorted(set(poses) - set(told)):
+        pause()
+        _, covariance = _adjust(clouds, poses, [*told, k], len(told))
+        ((sigma_m, sigma_deg),) = _compute_sigmas(covariance[-6:, -6:])
+        is_open = sigma_m > _MOST_SIGMA * np.median(clouds[k].points[:, 2]) or sigma_deg > _MOST_SIGMA_DEG
+        if is_open or _is_contradicted(clouds, poses, k, told):
+            continue
+        sigma_m, sigma_deg = float(np.hypot(sigma_m, _LEAST_SIGMA_M)), float(np.hypot(sigma_deg, _LEAST_SIGMA_DEG))
+        found.append(PlacedCamera(clouds[k].name, poses[k], sigma_m, sigma_deg, clouds[k].scale_sigma))
+    return tuple(found)
+
+
+def _place_between(clouds: Sequence[DepthCloud], known: Mapping[int, Array], k: int) -> Array | None:
+    """The pose (4, 4) of cloud `k` by the two nearest known ones that it aligns with; None where they tell no one pose.
+
+    One alignment is no proof: along a plain wall another one looks as good, and better where it overlaps more.
+    """
+    found: list[Array] = []
+    for i in sorted(known, key=lambda i: (abs(i - k), i)):
+        if abs(i - k) > _FARTHEST_KNOWN or len(found) == 2:
+            break
+        if (T := choose_alignment(align_clouds(clouds[k], clouds[i]), clouds[k], clouds[i])) is not None:
+            found.append(known[i] @ T)
+    if len(found) < 2:
+        return None
+    turn = Rotation.from_matrix(found[0][:3, :3].T @ found[1][:3, :3]).magnitude()
+    apart = np.linalg.norm(found[0][:3, 3] - found[1][:3, 3])
+    return found[0] if np.degrees(turn) < _SAME_DEG and apart < _SAME_M else None
+
+
+def _is_contradicted(clouds: Sequence[DepthCloud], poses: Mapping[int, Array], k: int, others: Sequence[int]) -> bool:
+    """Whether cloud `k` and one of the others contradict each other where they overlap."""
+    for i in others:
+        for one, other in ((k, i), (i, k)) if i != k else ():
+            agreement = compute_agreement(clouds[one], clouds[other], invert_pose(poses[other]) @ poses[one])
+            if agreement.overlap >= _LEAST_OVERLAP and agreement.is_contradicted:
+                return True
+    return False
 
 
 def _join(aligned: Sequence[Array | None]) -> dict[int, Array]:
@@ -536,12 +604,8 @@ def _place(
         poses, sigmas, views = _leave_out_open(clouds, poses, views, pause)
         if len(views) < 2:
             return None
-    for i in views:
-        for j in views:
-            if i != j:
-                agreement = compute_agreement(clouds[i], clouds[j], invert_pose(poses[j]) @ poses[i])
-                if agreement.overlap >= _LEAST_OVERLAP and agreement.is_contradicted:
-                    return None
+    if any(_is_contradicted(clouds, poses, i, views) for i in views):
+        return None
     return {i: poses[i] for i in views}, sigmas
 
 
@@ -588,15 +652,19 @@ def _make_cameras(
 
 
 def _adjust(
-    clouds: Sequence[DepthCloud], poses: Mapping[int, Array], views: Sequence[int]
+    clouds: Sequence[DepthCloud], poses: Mapping[int, Array], views: Sequence[int], held: int = 1
 ) -> tuple[dict[int, Array], Array]:
-    """One Gauss-Newton step of all poses but the first, and their (6 V, 6 V) covariance: turns, then centres."""
+    """One Gauss-Newton step of all poses but those `held` first, and their (6 V, 6 V) covariance: turns, centres."""
     count = len(views)
     A, sure, b = np.zeros((6 * count,) * 2), np.zeros((6 * count,) * 2), np.zeros(6 * count)
     for k, i in enumerate(views):
         for m, j in enumerate(views):
             T_ji = invert_pose(poses[j]) @ poses[i]
-            if i == j or not (found := _compute_information(clouds[i], clouds[j], T_ji)).matrix.any():
+            if (
+                i == j
+                or max(k, m) < held
+                or not (found := _compute_information(clouds[i], clouds[j], T_ji)).matrix.any()
+            ):
                 continue
             # A turn and a shift of the world that move camera i do so in the frame of camera j, and the other way round
             to_j, own, his = _adjoint(invert_pose(poses[j])), slice(6 * k, 6 * k + 6), slice(6 * m, 6 * m + 6)
@@ -608,8 +676,8 @@ def _adjust(
                 matrix[his, own] -= world
             b[own] -= to_j.T @ found.gradient
             b[his] += to_j.T @ found.gradient
-    free = slice(6, 6 * count)
-    least = np.diag(np.tile(np.repeat([_OPEN_RAD**-2, _OPEN_M**-2], 3), count - 1))
+    free = slice(6 * held, 6 * count)
+    least = np.diag(np.tile(np.repeat([_OPEN_RAD**-2, _OPEN_M**-2], 3), count - held))
     step, covariance = np.zeros_like(b), np.zeros_like(A)
     step[free] = np.linalg.solve(A[free, free] + least, b[free])
     covariance[free, free] = np.linalg.inv(sure[free, free] + least)

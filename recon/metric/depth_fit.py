@@ -123,6 +123,12 @@ _LEAST_GAIN = 4.0  # standard deviations by which depths fit better at another p
 _LEAST_SHARE = 0.7  # of the points that have a depth somewhere: a shift must keep so many
 _LEAST_AGREEING = 0.5  # share of the points whose depths agree: of fewer, the depth camera saw something else
 _AGREEING_SIGMAS = 4.0
+# Noise is in all images, and all over them, alike. Where few points of a part of an image agree with all others, and
+# most of these with each other, or few of an image where most of other images do, something else was seen, or from
+# elsewhere. That may be so of some of the points
+_LEAST_PART, _FEW, _ALIKE = 15, 0.3, 0.6
+_FEW_OF_IMAGE, _MOST_OF_OTHERS = 0.5, 0.8
+_MOST_CONTRADICTING = 0.25
 # How much of its logarithm a depth may be off by where cameras are rough: a focal length that nothing tells bends the
 # scene. Beyond, it is not the cameras: disparity in place of depth has 2
 _MOST_BENDING = 0.15
@@ -245,16 +251,55 @@ def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
     agreeing = float((np.abs(ratio[known] - mean) < _AGREEING_SIGMAS * sigma[known]).mean())
     shift, gain = _find_shift(samples, scale)
     check = _judge(camera_id, len(names), int(known.sum()), agreeing, shift, gain)
-    if check.code is not DepthCode.FITS and (bending := _find_bending(samples, scale)):
-        return _blame_cameras(check, names, bending)
+    parted = _test_parts(check, names, samples, ratio - mean, sigma)
+    if parted.code is not DepthCode.FITS:
+        bending, left = _find_bending(samples, scale)
+        if bending and (check.code is not DepthCode.FITS or _test_parts(check, names, samples, left, sigma) == check):
+            return _blame_cameras(check, names, bending)
+    check = parted
     noise = max(view.depth.noise.scale_sigma for view in views)
     return DepthFit(camera_id, names, unit * float(np.exp(mean)), float(np.hypot(mean_sigma, noise)), check)
 
 
-def _find_bending(samples: _Samples, scale: float) -> float:
+def _test_parts(check: DepthCheck, names: Sequence[str], samples: _Samples, off: Array, sigma: Array) -> DepthCheck:
+    """The check; untested if it fits and a part of the points contradicts the rest, instead of being noisy as all are.
+
+    `off` (M,) are the logarithms by which measured depths are too large, NaN where there is none.
+    """
+    if check.code is not DepthCode.FITS:
+        return check
+    known = np.isfinite(off)
+    agrees = known & (np.abs(off) < _AGREEING_SIGMAS * sigma)
+    middle = np.array([[depth.shape[1], depth.shape[0]] for depth, _ in samples.maps])[samples.view_of] / 2.0
+    quarter = (samples.pixels > middle) @ np.array([1, 2])
+    images = [known & (samples.view_of == number) for number in range(len(samples.maps))]
+    shares = [float(agrees[image].mean()) if image.sum() >= _LEAST_PART else 1.0 for image in images]
+    contradicts = np.zeros(len(off), bool)
+    for number, image in enumerate(images):
+        others = shares[:number] + shares[number + 1 :]
+        if others and shares[number] < _FEW_OF_IMAGE and float(np.median(others)) > _MOST_OF_OTHERS:
+            contradicts |= image
+        for part in (image & (quarter == place) for place in range(4)):
+            if part.sum() >= _LEAST_PART and agrees[part].mean() < _FEW:
+                alike = np.abs(off[part] - np.median(off[part])) < _AGREEING_SIGMAS * sigma[part]
+                contradicts |= part & (alike.mean() >= _ALIKE)
+    if contradicts.sum() <= _MOST_CONTRADICTING * known.sum():
+        return check
+    where = [name for name, image in zip(names, images, strict=True) if 2 * (contradicts & image).sum() > image.sum()]
+    which = f", those of {', '.join(map(sanitize_name, where))}" if where else ""
+    share = f"{100 * contradicts.sum() / known.sum():.0f} % of {check.num_points} points of the images"
+    message = (
+        f"{name_depth_images(len(names), check.camera_id)} were left out: {share} contradict them where the others "
+        f"fit{which}. Check that each depth image goes with its photograph; or the estimated cameras of these are wrong"
+    )
+    return replace(check, code=DepthCode.UNTESTED, message=message)
+
+
+def _find_bending(samples: _Samples, scale: float) -> tuple[float, Array]:
     """Finds by how much of its logarithm a depth is off, if depth images fit but for that; 0 where they do not.
 
-    A wrong focal length has far things too near, or too far, for all images alike.
+    Beside it the logarithms (M,) by which measured depths are too large then, NaN where there is none. A wrong
+    focal length has far things too near, or too far, for all images alike.
     """
     ratio, sigma = samples.look((0.0, 0.0), scale)
     known = np.isfinite(ratio)
@@ -268,12 +313,14 @@ def _find_bending(samples: _Samples, scale: float) -> float:
         weights = np.where(off > _CUT, 0.0, np.clip(_HUBER / np.maximum(off, 1e-12), 0.0, 1.0))
     bending = float(found[1])
     if not weights.any() or abs(bending) > _MOST_BENDING:
-        return 0.0
+        return 0.0, ratio
     straight = replace(samples, log_z=samples.log_z + bending * log_z)
     shift, gain = _find_shift(straight, scale)
     agreeing = float((off < _AGREEING_SIGMAS).mean())
     fits = agreeing >= _LEAST_AGREEING and (gain <= _LEAST_GAIN or float(np.hypot(*shift)) < _LEAST_SHIFT_PX)
-    return bending if fits else 0.0
+    left = np.full(len(ratio), np.nan)
+    left[known] = ratio[known] - factors @ found
+    return (bending if fits else 0.0), left
 
 
 def _blame_cameras(check: DepthCheck, names: tuple[str, ...], bending: float) -> DepthFit:

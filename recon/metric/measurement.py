@@ -169,6 +169,7 @@ class MetricView:
     radial: Array  # (2,) radial coefficients, as recon/registration/bundle_adjustment.py has them
     shift: Array  # (2,) of the principal point from the middle of the picture
     bound: float  # 95 % bound of the centre's error, in the scene's unit; 0 where none is known
+    bound_deg: float = 0.0  # and of the orientation's, degrees
 
     @property
     def centre(self) -> Array:
@@ -191,7 +192,10 @@ class MetricView:
 
 def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
     """Makes the views by image name, in their order: as registered where that is known, else as published."""
-    bounds = {camera.name: camera.bounds.centre if camera.bounds else 0.0 for camera in snapshot.cameras}
+    bounds = {
+        camera.name: (camera.bounds.centre, camera.bounds.rotation_deg) if camera.bounds else (0.0, 0.0)
+        for camera in snapshot.cameras
+    }
     found = {}
     for camera in sorted(snapshot.cameras, key=lambda camera: camera.frame_id):
         side, size = max(camera.width, camera.height), np.array([camera.width, camera.height])
@@ -199,7 +203,7 @@ def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
         shift = (K[:2, 2] - size / 2.0) / side
         radial = np.array(radial_of(camera.lens))
         found[camera.name] = MetricView(
-            camera.T_world_camera, float(K[0, 0]) / side, radial, shift, bounds[camera.name]
+            camera.T_world_camera, float(K[0, 0]) / side, radial, shift, *bounds[camera.name]
         )
     landmarks = snapshot.landmarks
     if landmarks is None:
@@ -208,7 +212,7 @@ def make_metric_views(snapshot: Snapshot) -> Mapping[str, MetricView]:
     for index, name in enumerate(landmarks.names):
         if name in found:
             lens = float(lenses.focals[index]), lenses.radials[index], lenses.shifts[index]
-            found[name] = MetricView(landmarks.Ts_world_camera[index], *lens, bounds[name])
+            found[name] = MetricView(landmarks.Ts_world_camera[index], *lens, *bounds[name])
     return found
 
 

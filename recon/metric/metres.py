@@ -39,6 +39,7 @@ from splatnode.recon.metric.measurement import (
 from splatnode.recon.metric.odometry import (
     PoseAlignment,
     PoseSigmas,
+    align_to_motions,
     align_to_poses,
     estimate_scale_from_motions,
     estimate_up,
@@ -345,7 +346,7 @@ def _find_base(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) ->
     return _Found(mount @ invert_pose(first.T_world_camera), source)
 
 
-def _find_odometry(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> _Found | _Missing:
+def _find_odometry(snapshot: Snapshot, _config: MetricConfig, evidence: Evidence) -> _Found | _Missing:
     """The world of given poses, where the scene lies already if they fit; else the start of its motions."""
     scale = snapshot.scale
     if scale.frame.name is FrameName.ODOMETRY:
@@ -359,14 +360,10 @@ def _find_odometry(snapshot: Snapshot, config: MetricConfig, evidence: Evidence)
     poses = _chain_motions(snapshot, evidence)
     if isinstance(poses, _Missing):
         return poses
-    own = {name: (max(each.sigma_m, config.poses_sigma_m), max(each.sigma_deg, config.poses_sigma_deg))
-           for name, each in evidence.motions.items() if name in poses}  # fmt: skip
-    aligned = align_to_poses(
-        make_metric_views(snapshot), poses, PoseSigmas(config.poses_sigma_m, config.poses_sigma_deg, 0.0), own
-    )
-    if not isinstance(aligned, PoseAlignment):
-        return _Missing(f"the motions do not tell it: {aligned}", USE_FIRST)
-    rigid, T = aligned.rescale(1.0), np.eye(4)
+    placement = align_to_motions(make_metric_views(snapshot), evidence.motions, poses)
+    if isinstance(placement, str):
+        return _Missing(f"the motions do not tell it: {placement}", USE_FIRST)
+    rigid, T = placement.place(1.0), np.eye(4)
     T[:3, :3], T[:3, 3] = rigid.rotation, rigid.translation
     return _Found(T, f"motions of {len(poses)} images since they began")
 

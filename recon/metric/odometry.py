@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Gravity, Motion
 from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, compute_rms_radius
 from splatnode.recon.metric.measurement import TWO_SIDED_95, Measurement, MetricView
+from splatnode.recon.metric.pose_drift import PoseNoise, PosePlacement, fit_placement, part_steps
 from splatnode.recon.result.verdict import Up
 
 Array = npt.NDArray[np.float64]
@@ -239,6 +240,8 @@ _MOST_SHARE, _MOST_DEG = 0.05, 15.0
 _DRIFT_LEFT = 0.5  # of the drift at the end of the way, in one direction: what is left of it beside the best similarity
 _TO_SIGMA = 0.65  # standard deviation in one dimension over the median length in three
 _MOST_PAIRS = 500  # of cameras, each of which proposes a similarity
+# Standard deviations of a camera of the scene, at least: radians, and a share of the poses' spread
+_LEAST_TURN, _LEAST_SHIFT = math.radians(0.01), 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,11 +250,14 @@ class PoseAlignment:
 
     unit: Measurement
     to_world: Similarity  # from the scene to the world of the poses
-    centre: Array  # (3,) mean of the cameras that count, in the scene: by which another unit turns and moves it, too
+    centre: Array  # (3,) mean of the cameras that count, in the scene
     told: tuple[str, ...]  # a sentence for each pose that was left out
+    placement: PosePlacement | None = None  # by the errors that the poses have; None: nothing is known of these
 
     def rescale(self, scale: float) -> Similarity:
-        """The similarity with another scale, which keeps the middle of the cameras where it is."""
+        """The similarity with another scale, where the poses place that; else with the cameras' middle where it is."""
+        if self.placement is not None:
+            return self.placement.place(scale)
         rotation = self.to_world.rotation
         return Similarity(scale, rotation, self.to_world(self.centre) - scale * rotation @ self.centre)
 
@@ -273,6 +279,31 @@ class _CameraPairs:
     scene: Array  # (C, 4, 4)
     given: Array  # (C, 4, 4)
     bounds: Array  # (C,) 95 % of the cameras' centres, in the scene's unit
+    bounds_deg: Array  # (C,) and of their orientations, degrees
+
+    @classmethod
+    def collect(cls, views: Mapping[str, MetricView], poses: Mapping[str, Array]) -> _CameraPairs:
+        """The cameras that have a pose, in the order of the views."""
+        chosen = {name: view for name, view in views.items() if name in poses}
+        return cls(
+            tuple(chosen),
+            np.stack([view.T_world_camera for view in chosen.values()]),
+            np.stack([poses[name] for name in chosen]),
+            np.array([view.bound for view in chosen.values()]),
+            np.array([view.bound_deg for view in chosen.values()]),
+        )
+
+    def make_scene_sigmas(self, scale: float) -> Array:
+        """(C, 2) standard deviations of the cameras' turns, radians, and of their centres, metres, at most.
+
+        Bounds hold what all cameras have wrong together, too: how the scene is bent.
+        """
+        return np.column_stack([np.radians(self.bounds_deg), scale * self.bounds]) / TWO_SIDED_95
+
+    @property
+    def least_sigmas(self) -> Array:
+        """(2,) likewise, at least."""
+        return np.array([_LEAST_TURN, _LEAST_SHIFT * compute_rms_radius(self.given[:, :3, 3])])
 
     def compute_errors(self, by: Similarity) -> tuple[Array, Array]:
         """Metres (C,) and degrees (C,) by which each pose is off."""
@@ -300,10 +331,7 @@ def align_to_poses(
     names = tuple(name for name in views if name in poses)
     if len(names) < 2:
         return f"poses were given, and {len(names) or 'none'} of them is of a camera of the scene; two are needed"
-    scene = np.stack([views[name].T_world_camera for name in names])
-    pairs = _CameraPairs(
-        names, scene, np.stack([poses[name] for name in names]), np.array([views[n].bound for n in names])
-    )
+    pairs = _CameraPairs.collect(views, poses)
     usual = sigmas.position_m, sigmas.rotation_deg
     position_m, rotation_deg = np.array([own.get(name, usual) for name in names]).T
     if compute_rms_radius(pairs.given[:, :3, 3]) <= np.median(position_m):
@@ -314,6 +342,9 @@ def align_to_poses(
             f"poses of {len(names)} photographs were given, of which no more than {kept.sum()} fit the cameras of the "
             "scene: are they of the cameras, with x right, y down and z forward, and in metres?"
         )
+    noise = _describe_noise(pairs, by, position_m, rotation_deg, sigmas.drift)
+    placement = fit_placement(pairs.scene, pairs.given, by, kept, noise)
+    kept = placement.fits
     by, sigma = _refine_similarity(pairs, by, kept, position_m, scattered_deg, sigmas.drift)
     off_m, off_deg = pairs.compute_errors(by)
     told = tuple(
@@ -322,7 +353,44 @@ def align_to_poses(
         if not kept[i]
     )
     unit = Measurement(by.scale, sigma, f"poses of {kept.sum()} photographs")
-    return PoseAlignment(unit, by, pairs.scene[kept, :3, 3].mean(0), told)
+    return PoseAlignment(unit, placement.place(by.scale), pairs.scene[kept, :3, 3].mean(0), told, placement)
+
+
+def _describe_noise(
+    pairs: _CameraPairs, by: Similarity, position_m: Array, rotation_deg: Array, drift: float
+) -> PoseNoise:
+    """What is told of the errors: a turn has grown at the end of the way that moves as much as the drift does."""
+    steps = np.linalg.norm(np.diff(pairs.given[:, :3, 3], axis=0), axis=1)
+    turns = np.radians(angles_deg(pairs.given[:-1, :3, :3], pairs.given[1:, :3, :3]))
+    ahead = steps / max(float(steps.sum()), 1e-12)  # shares of the way, and of all turns
+    turned = (ahead + turns / max(float(turns.sum()), 1e-12)) / 2.0
+    grown = np.column_stack([drift * np.sqrt(turned), drift * steps.sum() * np.sqrt(ahead / 3.0)])
+    own = np.hypot(np.column_stack([np.radians(rotation_deg), position_m]), pairs.make_scene_sigmas(by.scale))
+    return PoseNoise(own, np.vstack([np.zeros(2), grown]), pairs.least_sigmas)
+
+
+def align_to_motions(
+    views: Mapping[str, MetricView], motions: Mapping[str, Motion], poses: Mapping[str, Array]
+) -> PosePlacement | str:
+    """Places the scene in the frame in which one chain of motions began; else returns why it cannot.
+
+    `poses` are the (4, 4) T_start_camera to which the motions add up, by image name. A motion that the images
+    contradict parts what follows it from the start. `views` are in the order of the way.
+    """
+    steps = _collect_steps(views, {name: each for name, each in motions.items() if name in poses})
+    names = [name for name in views if name in poses]
+    if steps is None or len(steps.names) < len(names) - 1:
+        return f"motions of {len(names)} images were given, which are not in the order of their chain"
+    _, fitting = _find_consensus(steps)
+    pairs = _CameraPairs.collect(views, poses)
+    grown = np.vstack([np.zeros(2), np.column_stack([np.radians(steps.sigma_deg), steps.sigma_m])])
+    turn = pairs.given[0, :3, :3] @ pairs.scene[0, :3, :3].T
+    scale = compute_rms_radius(pairs.given[:, :3, 3]) / max(compute_rms_radius(pairs.scene[:, :3, 3]), 1e-12)
+    begun = Similarity(scale, turn, pairs.given[0, :3, 3] - scale * turn @ pairs.scene[0, :3, 3])
+    own = np.hypot(np.median(grown[1:], axis=0), pairs.make_scene_sigmas(scale))
+    noise = PoseNoise(own, grown, pairs.least_sigmas)
+    noise = part_steps(noise, np.concatenate([[False], ~fitting]), float(np.ptp(pairs.given[:, :3, 3], axis=0).max()))
+    return fit_placement(pairs.scene, pairs.given, begun, np.ones(len(names), bool), noise)
 
 
 def _format_error(metres: float, degrees: float, rotation_deg: float) -> str:

@@ -66,6 +66,7 @@ BENCHMARKS = {
         "odometry_sets",
         "odometry_walk",
         "plain_rooms",
+        "plain_view",
         "several_cameras",
         "rigs",
         "rgbd",

@@ -36,7 +36,7 @@ KINDS = {
     "lens": DepthCamera(),
 }
 _LONGER = 1.1  # focal length told over the true one, of `lens`
-_WRONG = 2.5  # times a bound
+WRONG = 2.5  # times a bound
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Row:
     @property
     def is_wrong(self) -> bool:
         """Whether a camera is far beyond its bound."""
-        return max(self.rotation_over_bound or 0.0, self.centre_over_bound or 0.0) > _WRONG
+        return max(self.rotation_over_bound or 0.0, self.centre_over_bound or 0.0) > WRONG
 
 
 def main() -> None:
@@ -93,7 +93,7 @@ def measure(seed: int, kind: str) -> Row:
     codes = seed, kind, alone.verdict.code.value, estimate.verdict.code.value
     if estimate.prior_world is None or not estimate.verdict.publishable:
         return Row(*codes, 0, None, None, None, None, None, None, seconds)
-    return Row(*codes, *_compare(room, estimate), seconds)
+    return Row(*codes, *compare_in_metres(room, estimate), seconds)
 
 
 def _lengthen(frame: Frame) -> Frame:
@@ -102,16 +102,25 @@ def _lengthen(frame: Frame) -> Frame:
     return replace(frame, intrinsics=replace(lens, fx=_LONGER * lens.fx, fy=_LONGER * lens.fy))
 
 
-def _compare(room: Room, estimate: Reconstruction) -> tuple[int, float, float, float, float, float, float]:
+def compare_in_metres(
+    room: Room, estimate: Reconstruction, beside: int = 0
+) -> tuple[int, float, float, float, float, float, float]:
+    """How many cameras there are, and the last six errors of a Row: those of cameras held by depth.
+
+    The camera `beside`, in the order of the way among those that are placed, is taken to be where it is.
+    """
     given, registration = estimate.prior_world, estimate.registration
     assert given is not None and registration is not None
     cameras, names = registration.cameras, estimate.graph.names
     placed = sorted(cameras, key=lambda camera: names[camera.index])
     true = {name: room.cameras[int(name[5:8])][0] for name in names}
     bounds, own, theirs, ratios = estimate.bounds, [], [], []
-    to_first = np.linalg.inv(true[names[placed[0].index]])
+    here, to_first = placed[beside].T_world_camera, np.linalg.inv(true[names[placed[beside].index]])
+    first = np.eye(4)
+    first[:3, :3] = given.rotation @ here[:3, :3]
+    first[:3, 3] = given.scale * given.rotation @ here[:3, 3] + given.translation
     for camera in placed:
-        T, expected = camera.T_world_camera, to_first @ true[names[camera.index]]
+        T, expected = camera.T_world_camera, first @ to_first @ true[names[camera.index]]
         centre = given.scale * given.rotation @ T[:3, 3] + given.translation
         turn = np.degrees(Rotation.from_matrix((given.rotation @ T[:3, :3]).T @ expected[:3, :3]).magnitude())
         off, bound = float(np.linalg.norm(centre - expected[:3, 3])), bounds[names[camera.index]]

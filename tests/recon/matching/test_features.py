@@ -121,3 +121,15 @@ def test_the_motion_of_a_resized_copy_is_none():
     moved = pair.rescale(1.0, 2.0)
     assert pair_matching.median_motion_px(moved, 640, 640) == 0.0
     assert pair_matching.median_motion_px(replace(moved, points2=points + [5.0, 0.0]), 640, 640) == pytest.approx(8.0)
+
+
+def test_points_that_matches_know_keep_their_numbers_where_a_mask_hides_them():
+    """As those of a learned matcher, which are nobody's features: further features came after them."""
+    points = np.array([[10.0, 10.0], [90.0, 90.0], [12.0, 10.0], [92.0, 90.0]])
+    known = features.Features(points, np.eye(4, dtype=np.uint8), np.arange(4), np.ones(4))
+    mask = np.ones((100, 100), bool)
+    mask[:50, :50] = False
+    found = features.apply_mask(known, mask, first=2)
+    np.testing.assert_array_equal(found.points, points[[0, 1, 3]])
+    np.testing.assert_array_equal(found.point_of, [0, 1, 2])
+    np.testing.assert_array_equal(features.apply_mask(known, mask).points, points[[1, 3]])

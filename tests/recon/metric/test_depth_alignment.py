@@ -20,6 +20,7 @@ from splatnode.recon.metric.depth_alignment import (
     choose_alignment,
     find_exchanged_depth,
     make_depth_cloud,
+    place_beside,
     place_by_depth,
 )
 from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_evidence
@@ -27,7 +28,7 @@ from splatnode.recon.pipeline import estimate_frames, run
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import Clock
 from tests.support.depth_camera import DepthCamera
-from tests.support.plain_rooms import Room, make_room, photograph
+from tests.support.plain_rooms import Room, make_room, make_room_with_plain_view, photograph
 
 SEED, VIEWS = 1, 3
 WITHIN = 2.45  # standard deviations: 95 % of three independent errors are nearer
@@ -190,3 +191,59 @@ def test_photographs_alone_are_refused_and_depth_gives_metres():
         assert abs(apart - expected) < 0.02
     assert all(camera.given is None for camera in metric.cameras)  # nobody gave a pose
     assert len(metric.gaussians) > 0
+
+
+@cache
+def make_plain_view(seed: int, plain: int) -> tuple[Room, tuple[Frame, ...], dict[str, np.ndarray]]:
+    """A room of which one photograph shows plain walls, its frames, and what is known of the cameras of the others."""
+    place, rng = make_room_with_plain_view(seed, 6, plain), np.random.default_rng(seed)
+    shown, known = photograph(place, seed, DepthCamera(seed=seed)), {}
+    for index, frame in enumerate(shown):
+        T = place.cameras[index][0].copy()
+        T[:3, :3] = Rotation.from_rotvec(np.radians(rng.normal(0.0, 0.05, 3))).as_matrix() @ T[:3, :3]
+        T[:3, 3] += rng.normal(0.0, 0.003, 3)
+        if index != plain:
+            known[frame.name] = T
+    return place, tuple(shown), known
+
+
+def test_a_camera_before_plain_walls_is_placed_beside_those_that_are_known():
+    place, shown, known = make_plain_view(3, 3)
+    (placed,) = place_beside(shown, known)
+    T = place.cameras[3][0]
+    assert placed.name == shown[3].name
+    assert np.linalg.norm(placed.T_world_camera[:3, 3] - T[:3, 3]) < 3.0 * WITHIN * placed.sigma_m < 0.1
+    turn = Rotation.from_matrix(placed.T_world_camera[:3, :3].T @ T[:3, :3]).magnitude()
+    assert np.degrees(turn) < WITHIN * placed.sigma_deg < 1.0
+
+
+def test_a_camera_of_which_neighbours_tell_different_places_is_not_placed():
+    """Each of both alone would have it .7 to .9 m off, where it overlaps with more of a plain wall."""
+    _, shown, known = make_plain_view(0, 3)
+    assert place_beside(shown, known) == ()
+
+
+def test_beside_known_cameras_that_depth_contradicts_nothing_is_placed():
+    _, shown, known = make_plain_view(3, 3)
+    moved = {name: T.copy() for name, T in known.items()}
+    moved[shown[1].name][:3, 3] += [0.4, 0.4, 0.0]
+    assert place_beside(shown, moved) == ()
+    assert place_beside(shown, {shown[0].name: known[shown[0].name]}) == ()
+
+
+def test_an_answered_set_is_extended_by_a_photograph_of_plain_walls():
+    place, shown, _ = make_plain_view(2, 5)
+    without = replace(shown[5], depth=None)
+    alone, _ = estimate_frames([*shown[:5], without], preset("preview"), Clock())
+    assert alone.publishable_camera_names == {frame.name for frame in shown[:5]}
+    extended, _ = estimate_frames(shown, preset("preview"), Clock())
+    assert extended.publishable_camera_names == {frame.name for frame in shown}
+    assert "All 6 photographs were placed, 1 of them by what their depth images measured" in extended.verdict.message
+    world, registration = extended.prior_world, extended.registration
+    assert world is not None and registration is not None
+    centres = {
+        extended.graph.names[camera.index]: world.scale * camera.T_world_camera[:3, 3]
+        for camera in registration.cameras
+    }
+    apart = np.linalg.norm(centres[shown[5].name] - centres[shown[0].name])
+    assert abs(apart - np.linalg.norm(place.cameras[5][0][:3, 3] - place.cameras[0][0][:3, 3])) < 0.05

@@ -167,6 +167,43 @@ def test_depths_of_something_else_contradict_the_images():
     assert found.check.code in (DepthCode.CONTRADICTS, DepthCode.SHIFTED) and not found.is_usable
 
 
+def _six(**wrong: DepthCamera) -> list[DepthView]:
+    """Each photograph three times over, with depth images of their own; `wrong` ones by `v` and their number."""
+    found = []
+    for number in range(6):
+        view = views(wrong.get(f"v{number}", DepthCamera(seed=number)))[number % 2]
+        found.append(replace(view, name=f"view_{number}.png", points=view.points[::3]))
+    return found
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.1])
+def test_depth_of_some_images_that_contradicts_them_while_the_others_fit_is_left_untested(scale):
+    (found,) = fit_depth_images(_six(v1=DepthCamera(scale=scale), v4=DepthCamera(scale=scale, seed=1)))
+    assert found.check.code is DepthCode.UNTESTED and not found.is_usable and not has_too_few_points(found.check)
+    assert "those of view_1.png, view_4.png. Check that each" in found.check.message
+    first, second, *rest = _six()
+    other = [
+        replace(each, depth=make_depth_image(np.ascontiguousarray(each.depth.values[::-1]))) for each in (first, second)
+    ]
+    (found,) = fit_depth_images([*other, *rest])
+    assert found.check.code is DepthCode.UNTESTED and "view_0.png, view_1.png" in found.check.message
+
+
+def test_points_and_depths_that_are_only_noisy_fit():
+    (noisy,) = fit_depth_images(_six(**{f"v{i}": DepthCamera(noise_px=1.2, seed=i) for i in range(6)}))
+    assert noisy.check.code is DepthCode.FITS, "two thirds of the points agree, everywhere alike"
+    rng = np.random.default_rng(0)
+    mismatched = [
+        replace(each, points=each.points * np.exp(rng.normal(0.0, 0.5, (count, 1)) * (rng.random((count, 1)) < 0.4)))
+        for each in _six()
+        if (count := len(each.points))
+    ]
+    (found,) = fit_depth_images(mismatched)
+    assert found.check.code is DepthCode.FITS and found.metres_per_unit == pytest.approx(UNIT, rel=0.005)
+    (one,) = fit_depth_images(_six(v3=DepthCamera(scale=1.1)))
+    assert one.check.code is DepthCode.FITS, "a sixth of the points is no majority against the others"
+
+
 def test_few_points_judge_nothing():
     (found,) = fit_depth_images([replace(each, points=each.points[:10]) for each in views()])
     assert found.check.code is DepthCode.UNTESTED and "30 are needed" in found.check.message and not found.is_usable

@@ -239,6 +239,16 @@ def plain_rooms() -> str:
     return table(header, rows)
 
 
+def plain_view() -> str:
+    """Rooms of which one photograph shows plain walls."""
+    told = raw("plain_view")["summary"]
+    header = "rooms", "others placed", "plain view placed, too", "rooms with a wrong camera"
+    off = "largest error of a position", "largest error over bound"
+    centre, over = told["largest_centre_m"], told["largest_over_bound"]
+    row = told["rooms"], told["five_or_more"], told["plain_views_placed"], told["wrong"]
+    return table((*header, *off), [(*row, "–" if centre is None else f"{1000 * centre:.0f} mm", f"{over:.2f}")])
+
+
 def known_poses() -> str:
     """Poses that are given, with one of them false or none."""
     found, rows = raw("known_poses")["rows"], []
@@ -611,6 +621,7 @@ BLOCKS = (
     rgbd_real,
     odometry_walk,
     plain_rooms,
+    plain_view,
     known_poses,
     given_scenes,
     odometry_sets,
