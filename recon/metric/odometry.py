@@ -359,7 +359,7 @@ def align_to_poses(
 def _describe_noise(
     pairs: _CameraPairs, by: Similarity, position_m: Array, rotation_deg: Array, drift: float
 ) -> PoseNoise:
-    """What is told of the errors: a turn has grown at the end of the way that moves as much as the drift does."""
+    """Describes the errors as they were told: at the end of the way turns have grown to the drift, in radians."""
     steps = np.linalg.norm(np.diff(pairs.given[:, :3, 3], axis=0), axis=1)
     turns = np.radians(angles_deg(pairs.given[:-1, :3, :3], pairs.given[1:, :3, :3]))
     ahead = steps / max(float(steps.sum()), 1e-12)  # shares of the way, and of all turns

@@ -143,7 +143,7 @@ def _make_design(by: Similarity, scene: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Covariances:
-    """What errors of turns, for factors that are known, tell and do not tell of the shifts."""
+    """The covariances of turns, and of the shifts that they make, for factors that are known."""
 
     turns: Array  # (3 C, 3 C)
     both: Array  # (3 C, 3 C) of shifts with turns
