@@ -544,7 +544,10 @@ def give_own_lenses(
         problem, stretched = own[0], self_calibration.free_aspects(own[1].map, own[1].loss, config.own_lenses)
     if stretched is None:
         return own
-    stretched = extend(problem, stretched, config.incremental)
+    if len(stretched.registered) < len(problem.views):
+        # The last adjustment has dropped points: those of the tracks are triangulated anew.
+        stretched = adjust_quickly(problem, stretched, SETTLED_TOLERANCE, config.incremental)
+        stretched = extend(problem, stretched, config.incremental)
     again = run_final_adjustment(problem, stretched, images, config.finishing)
     if again is None:
         return own

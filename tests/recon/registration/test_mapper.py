@@ -393,3 +393,25 @@ def test_wrong_matches_do_not_hide_how_far_a_pair_moved():
     rays[8:, 1] += generator.choice([-1.0, 1.0], 17) * generator.uniform(0.05, 0.3, 17)
     assert mapping_problem._length(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
     assert mapping_problem._length(turned, direction, rays, 0.002, min_points=9) is None
+
+
+def test_views_are_placed_on_points_that_the_last_adjustment_has_not_renumbered(taken, pairs, monkeypatch):
+    """Where pixels are not square, views that are left are tried again; points were dropped by then."""
+    apart = {pair: found for pair, found in pairs.items() if 4 not in pair}
+    views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
+    extended = []
+
+    def free_aspects(partial: PartialMap, *_: object) -> PartialMap:
+        kept = partial.estimate.point_of >= 10
+        return replace(partial, estimate=bundle_adjustment.keep_observations(partial.estimate, kept))
+
+    def extend(problem: MapperInput, partial: PartialMap, config: object) -> PartialMap:
+        extended.append((len(partial.estimate.points), len(partial.track_of_point), len(partial.registered)))
+        return real(problem, partial, config)
+
+    real = incremental_mapper.extend
+    monkeypatch.setattr(self_calibration, "free_aspects", free_aspects)
+    monkeypatch.setattr(incremental_mapper, "extend", extend)
+    assert incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], apart, incremental_mapper.MapperConfig())
+    assert extended[-1][2] == 4, "one view is left"
+    assert all(points == tracks for points, tracks, _ in extended)
