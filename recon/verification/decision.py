@@ -336,6 +336,16 @@ def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
     return refuse(verification.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
 
 
+def check_own_lenses(case: EvidenceCase) -> Verdict | None:
+    """A camera got a lens of its own, and its matches contradict it all the same."""
+    own = [camera for camera in case.evidence.cameras if camera.own_lens]
+    weakest = min(own, key=lambda camera: camera.inlier_ratio, default=None)
+    if weakest is None or weakest.inlier_ratio >= case.config.min_own_lens_ratio:
+        return None
+    inliers = 100 * weakest.inlier_ratio
+    return refuse(verification.UNFIT_LENS, (weakest.name,), name=weakest.name, inliers=inliers)
+
+
 def check_mirrored_images(case: EvidenceCase) -> Verdict | None:
     """Some photographs match the others better when they are turned left to right."""
     found = case.evidence.reflection
@@ -746,6 +756,7 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
     check_weakest_link,
     check_connectivity,
     check_confirmed_points,
+    check_own_lenses,
     check_mirrored_images,
     check_mirrored_scene,
 )

@@ -73,6 +73,16 @@ def test_a_camera_that_no_third_one_confirms_is_refused_however_sure_it_seems():
     assert verdict(4, {2: {"confirmed": 15}}).code == Code.OK
 
 
+def test_a_lens_of_its_own_that_fits_few_matches_is_none():
+    """One image corrected for its keystone got a longer lens, which fits 82 % of its matches, 6 degrees off."""
+    unfit = {2: {"own_lens": True, "inlier_ratio": 0.82}}
+    given = refused(verdict(4, unfit), Code.AMBIGUOUS)
+    assert given.frames == names(2) and "2.png does not have the lens that it was taken for" in given.message
+    assert "only 82 % of its matches fit" in given.message and given.advice.endswith("2.png by --intrinsics.")
+    assert "taken for" not in verdict(4, {2: {"own_lens": True, "inlier_ratio": 0.86}}).message
+    assert "taken for" not in verdict(4, {2: {"inlier_ratio": 0.82}}).message
+
+
 @pytest.mark.parametrize("errors", [unsure(rotation=20.0), unsure(centre=0.3)])
 def test_what_is_known_of_one_camera_only_roughly_makes_nothing_of_the_others(errors):
     refused(verdict(4, {2: {"errors": errors}}), Code.AMBIGUOUS)
