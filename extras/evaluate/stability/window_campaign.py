@@ -531,7 +531,7 @@ def make_shares_figure(rows: Sequence[WindowRow]) -> Figure:
     figure = Figure(figsize=(width, height), dpi=150)
     for number, (method, mine) in enumerate(methods.items()):
         share = (width - 1.0) / len(methods) / width
-        axes = figure.add_axes((0.7 / width + number * share, 1.3 / height, share - 0.15 / width, 2.6 / height))
+        axes = figure.add_axes((0.7 / width + number * share, 1.3 / height, share - 0.15 / width, 2.5 / height))
         _draw_shares(axes, method, mine, labelled=number == 0)
     title = "Windows of 3, 6 and 12 consecutive photographs, by the angle between neighbouring views"
     figure.text(0.1 / width, 1.0 - 0.3 / height, title, color=_INK, fontsize=11 if len(methods) > 2 else 8.5)
@@ -565,7 +565,7 @@ def _draw_shares(axes: Axes, method: str, rows: Sequence[WindowRow], *, labelled
     right = sum(row.outcome in (WindowOutcome.RIGHT, WindowOutcome.RIGHT_PART) for row in rows)
     wrong = sum(row.outcome is WindowOutcome.WRONG for row in rows)
     name = _NAMES.get(method, method)
-    axes.set_title(f"{name}: {right} of {len(rows)} right, {wrong} wrong", loc="left", fontsize=9, color=_INK)
+    axes.set_title(f"{name}\n{right} of {len(rows)} right, {wrong} wrong", loc="left", fontsize=9, color=_INK)
     if labelled:
         axes.set_ylabel("share of the sets", fontsize=7.5, color=_MUTED)
 

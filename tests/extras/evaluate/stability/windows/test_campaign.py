@@ -260,7 +260,7 @@ def test_charts(tmp_path):
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("windows.png", "calibration.png"))
     assert window_campaign.draw(ROWS[7:], tmp_path) == ["windows.png"], "who claims nothing has no calibration"
     titles = [axes.get_title(loc="left") for axes in window_campaign.make_shares_figure(ROWS).axes]
-    assert titles == ["splatnode: 2 of 7 right, 1 wrong", "COLMAP: 0 of 2 right, 1 wrong"]
+    assert titles == ["splatnode\n2 of 7 right, 1 wrong", "COLMAP\n0 of 2 right, 1 wrong"]
     labels = [
         text.get_text()
         for axes in window_campaign.make_bounds_figure(ROWS).axes
