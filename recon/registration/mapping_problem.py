@@ -117,7 +117,7 @@ _MAX_NEIGHBOURS = 4  # registered views, those with most matches, that propose a
 _ITERATIONS = {"min_iterations": 200, "max_iterations": 5000, "seed": 0}  # of RANSAC: 5000 do for 10 % inliers
 # Focal lengths that are tried for a view that its lens does not fit, over that of the lens
 _FOCAL_FACTORS = (1.0, 0.4, 0.5, 0.63, 0.72, 0.8, 0.87, 0.93, 1.07, 1.15, 1.25, 1.38, 1.55, 1.75, 2.0, 2.5, 3.2)
-_FITTING = 0.9  # share of the points that fit, below which displaced principal points are tried
+_FITTING = 0.9  # share of the points that fit, below which displaced principal points are tried, and which they need
 _SHIFTS = (0.07, 0.14)  # of them, of the longer side
 _DIRECTIONS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7))
 _NEAR_FACTORS = (1.0, 0.9, 1.1)  # focal lengths that are tried with them, over the best without
@@ -189,7 +189,8 @@ def find_own_lens(problem: MapperInput, partial: PartialMap, view: int, config: 
     """The lens with which most of the map's points fit a pose of `view`, where it is not the common one.
 
     None where the common lens, which is tried first, fits nearly as many. Displaced principal points, as of crops and
-    keystone corrections, are tried where other focal lengths alone leave many points that do not fit.
+    keystone corrections, are tried where other focal lengths alone leave many points that do not fit; one counts with
+    which nearly all fit, for of so many hypotheses about few points some fit by chance.
     """
     correspondences = _correspondences(partial, problem.growing_tracks, view)
     limit = config.max_error_px * problem.scale[view]
@@ -206,11 +207,11 @@ def find_own_lens(problem: MapperInput, partial: PartialMap, view: int, config: 
     factor = max(zoomed, key=lambda each: zoomed[each])
     best, most = OwnLens(factor * common, middle), zoomed[factor]
     if most < _FITTING * len(everything):
-        side = problem.views[view].longer_side
+        side, focal = problem.views[view].longer_side, best.focal
         for size, direction, factor in itertools.product(_SHIFTS, _DIRECTIONS, _NEAR_FACTORS):
-            other = OwnLens(factor * best.focal, size * side * np.array(direction))
+            other = OwnLens(factor * focal, size * side * np.array(direction))
             fitting = count(other)
-            if fitting > _MORE_POINTS * zoomed[1.0] and fitting > most:
+            if fitting > max(_MORE_POINTS * zoomed[1.0], most, _FITTING * len(everything)):
                 best, most = other, fitting
     return best if most > _MORE_POINTS * zoomed[1.0] else None
 
