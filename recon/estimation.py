@@ -304,16 +304,23 @@ def _estimate_from_images(
 
 
 def find_lenses_inside_bars(graph: ViewGraph) -> frozenset[str]:
-    """The names of the images with a told lens and with black bars that others of the same lens lack.
+    """The names of the images with a told lens and with black bars that others of the same camera lack.
 
     A lens that is told may be that of the picture before it was shrunk into its bars. Where all images have the same
     bars, it is taken for that of the images as they are.
     """
-    pictures = {each.name: _measure_picture(each) for each in graph.keyframes if each.frame.intrinsics is not None}
-    found = np.array(list(pictures.values()))
-    if not len(found) or np.ptp(found, axis=0).max() <= _SAME_PICTURE:
-        return frozenset()
-    return frozenset(name for name, picture in pictures.items() if picture != _WHOLE)
+    of_camera: dict[tuple[str, str], dict[str, tuple[float, float, float, float]]] = {}
+    for keyframe in graph.keyframes:
+        if keyframe.frame.intrinsics is not None:
+            pictures = of_camera.setdefault((keyframe.frame.camera_id, keyframe.frame.camera), {})
+            pictures[keyframe.name] = _measure_picture(keyframe)
+    return frozenset(
+        name
+        for pictures in of_camera.values()
+        if np.ptp(list(pictures.values()), axis=0).max() > _SAME_PICTURE
+        for name, picture in pictures.items()
+        if picture != _WHOLE
+    )
 
 
 def _measure_picture(keyframe: Keyframe) -> tuple[float, float, float, float]:

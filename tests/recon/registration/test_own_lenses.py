@@ -197,5 +197,10 @@ def test_the_lens_that_is_told_of_an_image_shrunk_into_black_bars_is_not_used(se
 
 def test_a_lens_that_is_told_of_images_with_the_same_bars_is_used():
     boxed = [letterbox_image(photo, 0.75) for photo in photographs()[1:4]]
-    graph = view_graph(make_frames(set_intrinsics(boxed, "given")))
-    assert find_lenses_inside_bars(graph) == frozenset()
+    told = make_frames(set_intrinsics(boxed, "given"))
+    assert find_lenses_inside_bars(view_graph(told)) == frozenset()
+    # Those of another camera have none: it has a lens of its own.
+    beside = [replace(frame, camera_id="left") for frame in make_frames(set_intrinsics(photographs()[4:], "given"))]
+    assert find_lenses_inside_bars(view_graph([*told, *beside])) == frozenset()
+    same = [replace(frame, camera_id="") for frame in beside]
+    assert find_lenses_inside_bars(view_graph([*told, *same])) == frozenset(frame.name for frame in told)
