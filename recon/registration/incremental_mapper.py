@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -436,25 +436,42 @@ def build_map(
     """
     problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
     attempts: list[tuple[float, PartialMap]] = []
-    for first, focals in _starts(lenses, pairs, config.max_attempts):
+    for attempt in _attempt_maps(problem, config.max_attempts, config, run):
+        found_again = bool(attempts) and _is_same_map(max(attempts, key=_score)[1], attempt[1], config)
+        attempts.append(attempt)
+        if found_again and len(attempt[1].registered) == len(views):
+            break
+    found = _finish_best(problem, attempts, images, config, run)
+    if found is None:
+        return None
+    found = _try_other_hypotheses(problem, found, images, config, run)
+    return make_map(*found, config.incremental.triangulation.max_error_px, len(lenses))
+
+
+def _attempt_maps(
+    problem: MapperInput, limit: int, config: MapperConfig, run: RunContext
+) -> Iterator[tuple[float, PartialMap]]:
+    """Maps of at most `limit` first pairs and focal lengths, the likeliest first, with their scores."""
+    for first, focals in _starts(problem.lenses, problem.pairs, limit):
         run.pause()
         partial = grow(problem, focals, first, config.incremental)
-        if partial is None:
-            continue
-        found_again = bool(attempts) and _is_same_map(max(attempts, key=_score)[1], partial, config)
-        attempts.append((score(problem, partial, config.score_px), partial))
-        if found_again and len(partial.registered) == len(views):
-            break
+        if partial is not None:
+            yield _score_of(problem, partial, config), partial
+
+
+def _finish_best(
+    problem: MapperInput,
+    attempts: Sequence[tuple[float, PartialMap]],
+    images: Sequence[PatchImage],
+    config: MapperConfig,
+    run: RunContext,
+) -> tuple[MapperInput, FinalMap] | None:
+    """The best attempt after its last adjustment, with own lenses for its views; None where nothing is left of it."""
     if not attempts:
         return None
     run.pause()
-    _, best = max(attempts, key=_score)
-    finished = run_final_adjustment(problem, best, images, config.finishing)
-    if finished is None:
-        return None
-    found = give_own_lenses(problem, finished, images, config, run)
-    found = _try_other_hypotheses(problem, found, images, config, run)
-    return make_map(*found, config.incremental.triangulation.max_error_px, len(lenses))
+    finished = run_final_adjustment(problem, max(attempts, key=_score)[1], images, config.finishing)
+    return None if finished is None else give_own_lenses(problem, finished, images, config, run)
 
 
 def _try_other_hypotheses(
@@ -475,7 +492,9 @@ def _try_other_hypotheses(
             lens if focal is None else replace(lens, focals=(focal,), sigma=_HELD_SIGMA)
             for lens, focal in zip(problem.lenses, focals, strict=True)
         ]
-        other = _map_lenses(replace(problem, lenses=tuple(held)), images, config, run)
+        started = replace(problem, lenses=tuple(held))
+        attempts = list(_attempt_maps(started, _OTHER_ATTEMPTS, config, run))
+        other = _finish_best(started, attempts, images, config, run)
         if other is None:
             continue
         sigmas = other[1].map.prior.sigmas.copy()
@@ -492,37 +511,17 @@ def _try_other_hypotheses(
 
 def _list_other_focals(problem: MapperInput, log_focals: Array) -> list[list[float | None]]:
     """Focal lengths in pixels to be tried besides, one a lens; None for a lens that keeps its own."""
-    tried = []
-    for choose, limit in ((_get_likeliest, _FAR_FROM_VOTE), (_get_typical, _FAR_FROM_TYPICAL)):
+    typical = [lens.typical for lens in problem.lenses]
+    voted = [None if lens.typical is None else lens.focals[0] for lens in problem.lenses]
+    tried: list[list[float | None]] = []
+    for others, limit in ((voted, _FAR_FROM_VOTE), (typical, _FAR_FROM_TYPICAL)):
         focals = [
-            choose(lens) if lens.typical is not None and abs(log_focal - np.log(choose(lens))) > limit else None
-            for lens, log_focal in zip(problem.lenses, log_focals, strict=False)
+            focal if focal is not None and abs(log_focal - np.log(focal)) > limit else None
+            for focal, log_focal in zip(others, log_focals[: len(others)], strict=True)
         ]
         if any(focal is not None for focal in focals) and focals not in tried:
             tried.append(focals)
     return tried
-
-
-def _get_likeliest(lens: Lens) -> float:
-    return lens.focals[0]
-
-
-def _get_typical(lens: Lens) -> float:
-    return lens.typical or lens.focals[0]
-
-
-def _map_lenses(
-    problem: MapperInput, images: Sequence[PatchImage], config: MapperConfig, run: RunContext
-) -> tuple[MapperInput, FinalMap] | None:
-    """The best map of few attempts with the first focal length of each lens, and lenses of their own for its views."""
-    best: tuple[float, PartialMap] | None = None
-    for first, focals in _starts(problem.lenses, problem.pairs, _OTHER_ATTEMPTS):
-        run.pause()
-        partial = grow(problem, focals, first, config.incremental)
-        if partial is not None and (best is None or _score_of(problem, partial, config) > best[0]):
-            best = _score_of(problem, partial, config), partial
-    finished = None if best is None else run_final_adjustment(problem, best[1], images, config.finishing)
-    return None if finished is None else give_own_lenses(problem, finished, images, config, run)
 
 
 def give_own_lenses(

@@ -118,7 +118,7 @@ _ITERATIONS = {"min_iterations": 200, "max_iterations": 5000, "seed": 0}  # of R
 # Focal lengths that are tried for a view that its lens does not fit, over that of the lens
 _FOCAL_FACTORS = (1.0, 0.4, 0.5, 0.63, 0.72, 0.8, 0.87, 0.93, 1.07, 1.15, 1.25, 1.38, 1.55, 1.75, 2.0, 2.5, 3.2)
 _FITTING = 0.9  # share of the points that fit, below which displaced principal points are tried, and which they need
-_SHIFTS = (0.07, 0.14)  # of them, of the longer side
+_SHIFTS = (0.07, 0.14)  # by which principal points are displaced then, shares of the longer side
 _DIRECTIONS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7))
 _NEAR_FACTORS = (1.0, 0.9, 1.1)  # focal lengths that are tried with them, over the best without
 _OWN_FOCAL_TOLERANCE = 1.5  # of reprojection errors then: the map is finished
@@ -211,7 +211,7 @@ def find_own_lens(problem: MapperInput, partial: PartialMap, view: int, config: 
         for size, direction, factor in itertools.product(_SHIFTS, _DIRECTIONS, _NEAR_FACTORS):
             other = OwnLens(factor * focal, size * side * np.array(direction))
             fitting = count(other)
-            if fitting > max(_MORE_POINTS * zoomed[1.0], most, _FITTING * len(everything)):
+            if fitting > max(most, _FITTING * len(everything)):
                 best, most = other, fitting
     return best if most > _MORE_POINTS * zoomed[1.0] else None
 

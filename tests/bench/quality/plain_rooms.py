@@ -36,7 +36,12 @@ KINDS = {
     "lens": DepthCamera(),
 }
 _LONGER = 1.1  # focal length told over the true one, of `lens`
-WRONG = 2.5  # times a bound
+_WRONG = 2.5  # times a bound
+
+
+def is_far_beyond(*over_bounds: float | None) -> bool:
+    """Whether one of the errors, over their bounds, is that of a wrong camera; None is no error."""
+    return max(each or 0.0 for each in over_bounds) > _WRONG
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class Row:
     @property
     def is_wrong(self) -> bool:
         """Whether a camera is far beyond its bound."""
-        return max(self.rotation_over_bound or 0.0, self.centre_over_bound or 0.0) > WRONG
+        return is_far_beyond(self.rotation_over_bound, self.centre_over_bound)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ from splatnode.capture.process.terminal import say
 from splatnode.recon.config import preset
 from splatnode.recon.pipeline import estimate_frames
 from splatnode.recon.threads import Clock
-from tests.bench.quality.plain_rooms import VIEWS, WRONG, compare_in_metres
+from tests.bench.quality.plain_rooms import VIEWS, compare_in_metres, is_far_beyond
 from tests.support.depth_camera import DepthCamera
 from tests.support.plain_rooms import make_room_with_plain_view, photograph
 
@@ -43,7 +43,7 @@ class Row:
     @property
     def is_wrong(self) -> bool:
         """Whether a camera is far beyond its bound."""
-        return max(self.rotation_over_bound or 0.0, self.centre_over_bound or 0.0) > WRONG
+        return is_far_beyond(self.rotation_over_bound, self.centre_over_bound)
 
 
 def main() -> None:
