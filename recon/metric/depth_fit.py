@@ -129,6 +129,9 @@ _AGREEING_SIGMAS = 4.0
 _LEAST_PART, _FEW, _ALIKE = 15, 0.3, 0.6
 _FEW_OF_IMAGE, _MOST_OF_OTHERS = 0.5, 0.8
 _MOST_CONTRADICTING = 0.25
+# A depth image whose unit is off from that of most others by so much of its logarithm, and by so many standard
+# deviations, is none of them. Cameras that are a little wrong change units of single images by some hundredths
+_LEAST_OFF, _OFF_SIGMAS = 0.04, 4.5
 # How much of its logarithm a depth may be off by where cameras are rough: a focal length that nothing tells bends the
 # scene. Beyond, it is not the cameras: disparity in place of depth has 2
 _MOST_BENDING = 0.15
@@ -179,6 +182,7 @@ class _Samples:
     view_of: npt.NDArray[np.int64]  # (M,)
     pixels: Array  # (M, 2) of the depth image
     log_z: Array  # (M,) logarithm of the depth that the scene tells, metres
+    unit: float  # metres, of the scene's unit, by which it is that
 
     def look(self, shift: tuple[float, float], scale: float) -> tuple[Array, Array]:
         """(M,) logarithms of measured over told depth, `shift` pixels aside, and their sigmas; NaN where none is.
@@ -209,7 +213,10 @@ class _Samples:
 
 
 def fit_depth_images(views: Sequence[DepthView]) -> tuple[DepthFit, ...]:
-    """A fit for the depth images of each camera, in the order of their ids."""
+    """A fit for the depth images of each camera, in the order of their ids.
+
+    A few that contradict most others of their camera are left out of it: its `names` lack them, its check names them.
+    """
     cameras: dict[str, list[DepthView]] = {}
     for view in views:
         cameras.setdefault(view.camera_id, []).append(view)
@@ -232,17 +239,22 @@ def find_depth_lens(depth: DepthImage, lens: Intrinsics) -> Intrinsics:
 
 
 def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
-    names, unit = tuple(view.name for view in views), 1.0
-    step = max(1, -(-sum(len(view.points) for view in views) // _MOST_POINTS))
-    scale = max(max(view.depth.values.shape) for view in views) / REFERENCE_PX
-    aside = any(view.depth.T_camera_depth[3::4][:3] != (0.0, 0.0, 0.0) for view in views)
     map_parallel(lambda view: view.surface, views)
-    samples = _collect_samples(views, unit, step)
-    for _ in range(4 if aside else 1):  # where a depth camera stands beside, its pixels depend on the unit
-        ratio, _ = samples.look((0.0, 0.0), scale)
-        if np.isfinite(ratio).sum() >= LEAST_POINTS:
-            unit *= float(np.exp(np.nanmedian(ratio)))
-            samples = _collect_samples(views, unit, step)
+    samples, scale = _collect_common_samples(views)
+    odd = _find_odd_images(samples, scale)
+    if not odd:
+        return _fit_samples(camera_id, views, samples, scale)
+    which = ", ".join(f"{sanitize_name(views[number].name)} ({why})" for number, why in odd.items())
+    if 2 * len(odd) >= len(views):
+        return _explain_no_common_unit(camera_id, views, which, samples, scale)
+    kept = [view for number, view in enumerate(views) if number not in odd]
+    fit = _fit_samples(camera_id, kept, *_collect_common_samples(kept))
+    return replace(fit, check=replace(fit.check, message=f"{fit.check.message}; left out: {which}"))
+
+
+def _fit_samples(camera_id: str, views: Sequence[DepthView], samples: _Samples, scale: float) -> DepthFit:
+    """The fit of depth images that are all used, or none of them."""
+    names = tuple(view.name for view in views)
     ratio, sigma = samples.look((0.0, 0.0), scale)
     known = np.isfinite(ratio)
     if known.sum() < LEAST_POINTS:
@@ -256,9 +268,66 @@ def _fit_camera(camera_id: str, views: Sequence[DepthView]) -> DepthFit:
         bending, left = _find_bending(samples, scale)
         if bending and (check.code is not DepthCode.FITS or _test_parts(check, names, samples, left, sigma) == check):
             return _blame_cameras(check, names, bending)
-    check = parted
     noise = max(view.depth.noise.scale_sigma for view in views)
-    return DepthFit(camera_id, names, unit * float(np.exp(mean)), float(np.hypot(mean_sigma, noise)), check)
+    unit = samples.unit * float(np.exp(mean))
+    return DepthFit(camera_id, names, unit, float(np.hypot(mean_sigma, noise)), parted)
+
+
+def _collect_common_samples(views: Sequence[DepthView]) -> tuple[_Samples, float]:
+    """The samples in the unit that their median tells, and pixels of the depth image for one at REFERENCE_PX."""
+    step = max(1, -(-sum(len(view.points) for view in views) // _MOST_POINTS))
+    scale = max(max(view.depth.values.shape) for view in views) / REFERENCE_PX
+    aside = any(view.depth.T_camera_depth[3::4][:3] != (0.0, 0.0, 0.0) for view in views)
+    samples = _collect_samples(views, 1.0, step)
+    for _ in range(4 if aside else 1):  # where a depth camera stands beside, its pixels depend on the unit
+        ratio, _ = samples.look((0.0, 0.0), scale)
+        if np.isfinite(ratio).sum() >= LEAST_POINTS:
+            samples = _collect_samples(views, samples.unit * float(np.exp(np.nanmedian(ratio))), step)
+    return samples, scale
+
+
+def _find_odd_images(samples: _Samples, scale: float) -> dict[int, str]:
+    """The numbers of the views that contradict most others, and each time why; empty where no majority agrees.
+
+    Such a view measures all depths larger or smaller than the others do, or shows something else.
+    """
+    ratio, sigma = samples.look((0.0, 0.0), scale)
+    known = np.isfinite(ratio)
+    numbers = [i for i in range(len(samples.maps)) if (known & (samples.view_of == i)).sum() >= _LEAST_PART]
+    if len(numbers) < 2:
+        return {}
+    parts = [known & (samples.view_of == number) for number in numbers]
+    averages = np.array([_average(ratio[part], sigma[part]) for part in parts])
+    apart = np.abs(averages[:, None, 0] - averages[None, :, 0])
+    alike = apart <= np.maximum(_LEAST_OFF, _OFF_SIGMAS * np.hypot(averages[:, None, 1], averages[None, :, 1]))
+    most = int(np.argmax(alike.sum(1)))
+    common = float(np.median(averages[alike[most], 0]))
+    own = [
+        float((np.abs(ratio[part] - mean) < _AGREEING_SIGMAS * sigma[part]).mean())
+        for part, (mean, _) in zip(parts, averages, strict=True)
+    ]
+    if float(np.median(np.array(own)[alike[most]])) <= _MOST_OF_OTHERS:
+        return {}
+    found = {}
+    for number, mean, share, is_alike in zip(numbers, averages[:, 0], own, alike[most], strict=True):
+        off = float(np.expm1(mean - common))
+        if share < _FEW_OF_IMAGE:
+            found[number] = f"contradicts its photograph at {100 * (1 - share):.0f} % of the points"
+        elif not is_alike:
+            found[number] = f"its depths are {100 * abs(off):.0f} % {'larger' if off > 0 else 'smaller'} than others"
+    return found
+
+
+def _explain_no_common_unit(
+    camera_id: str, views: Sequence[DepthView], which: str, samples: _Samples, scale: float
+) -> DepthFit:
+    """The fit of depth images of which no majority has one unit."""
+    names, count = tuple(view.name for view in views), int(np.isfinite(samples.look((0.0, 0.0), scale)[0]).sum())
+    message = (
+        f"{name_depth_images(len(names), camera_id)} were left out: they have no common unit: {which}. Check "
+        "that each depth image goes with its photograph, and that all have the same unit"
+    )
+    return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
 
 
 def _test_parts(check: DepthCheck, names: Sequence[str], samples: _Samples, off: Array, sigma: Array) -> DepthCheck:
@@ -273,12 +342,8 @@ def _test_parts(check: DepthCheck, names: Sequence[str], samples: _Samples, off:
     middle = np.array([[depth.shape[1], depth.shape[0]] for depth, _ in samples.maps])[samples.view_of] / 2.0
     quarter = (samples.pixels > middle) @ np.array([1, 2])
     images = [known & (samples.view_of == number) for number in range(len(samples.maps))]
-    shares = [float(agrees[image].mean()) if image.sum() >= _LEAST_PART else 1.0 for image in images]
     contradicts = np.zeros(len(off), bool)
-    for number, image in enumerate(images):
-        others = shares[:number] + shares[number + 1 :]
-        if others and shares[number] < _FEW_OF_IMAGE and float(np.median(others)) > _MOST_OF_OTHERS:
-            contradicts |= image
+    for image in images:
         for part in (image & (quarter == place) for place in range(4)):
             if part.sum() >= _LEAST_PART and agrees[part].mean() < _FEW:
                 alike = np.abs(off[part] - np.median(off[part])) < _AGREEING_SIGMAS * sigma[part]
@@ -348,7 +413,7 @@ def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Sam
         pixels.append(seen[kept])
         log_z.append(np.log(points[kept, 2]))
     return _Samples(
-        [view.surface for view in views], np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z)
+        [view.surface for view in views], np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z), unit
     )
 
 

@@ -176,17 +176,41 @@ def _six(**wrong: DepthCamera) -> list[DepthView]:
     return found
 
 
-@pytest.mark.parametrize("scale", [0.9, 1.1])
-def test_depth_of_some_images_that_contradicts_them_while_the_others_fit_is_left_untested(scale):
-    (found,) = fit_depth_images(_six(v1=DepthCamera(scale=scale), v4=DepthCamera(scale=scale, seed=1)))
+@pytest.mark.parametrize("scale", [0.9, 1.06])
+@pytest.mark.parametrize("wrong", [(3,), (1, 4)])
+def test_depth_images_of_another_unit_than_most_others_are_left_out_alone(scale, wrong):
+    (found,) = fit_depth_images(_six(**{f"v{i}": DepthCamera(scale=scale, seed=i) for i in wrong}))
+    assert found.check.code is DepthCode.FITS and found.metres_per_unit == pytest.approx(UNIT, rel=0.003)
+    assert found.names == tuple(f"view_{i}.png" for i in range(6) if i not in wrong)
+    told = "10 % smaller" if scale < 1 else "6 % larger"
+    assert all(f"view_{i}.png (its depths are {told} than others)" in found.check.message for i in wrong)
+
+
+def test_depth_images_without_a_common_unit_are_all_left_out_and_not_called_misaligned():
+    (found,) = fit_depth_images(_six(**{f"v{i}": DepthCamera(scale=1.1, seed=i) for i in (1, 2, 4)}))
     assert found.check.code is DepthCode.UNTESTED and not found.is_usable and not has_too_few_points(found.check)
-    assert "those of view_1.png, view_4.png. Check that each" in found.check.message
+    assert "have no common unit" in found.check.message and "view_2.png (its depths are 10 %" in found.check.message
+
+
+def test_depth_images_of_something_else_are_left_out_alone():
     first, second, *rest = _six()
     other = [
         replace(each, depth=make_depth_image(np.ascontiguousarray(each.depth.values[::-1]))) for each in (first, second)
     ]
     (found,) = fit_depth_images([*other, *rest])
-    assert found.check.code is DepthCode.UNTESTED and "view_0.png, view_1.png" in found.check.message
+    assert found.check.code is DepthCode.FITS and found.names == tuple(f"view_{i}.png" for i in range(2, 6))
+    assert "left out: view_0.png (contradicts its photograph at" in found.check.message
+
+
+def test_depth_images_of_which_a_part_contradicts_the_rest_are_left_untested():
+    parts = []
+    for each in _six():
+        values = each.depth.values.copy()
+        values[:, : values.shape[1] // 2] = np.rint(1.2 * values[:, : values.shape[1] // 2])
+        parts.append(replace(each, depth=replace(each.depth, values=values)))
+    (found,) = fit_depth_images(parts[:4] + _six()[4:])
+    assert found.check.code is DepthCode.UNTESTED and not found.is_usable
+    assert "contradict them where the others fit" in found.check.message
 
 
 def test_points_and_depths_that_are_only_noisy_fit():
@@ -200,8 +224,6 @@ def test_points_and_depths_that_are_only_noisy_fit():
     ]
     (found,) = fit_depth_images(mismatched)
     assert found.check.code is DepthCode.FITS and found.metres_per_unit == pytest.approx(UNIT, rel=0.005)
-    (one,) = fit_depth_images(_six(v3=DepthCamera(scale=1.1)))
-    assert one.check.code is DepthCode.FITS, "a sixth of the points is no majority against the others"
 
 
 def test_few_points_judge_nothing():
