@@ -483,21 +483,26 @@ def accept(case: VerificationCase) -> Verdict:
     return replace(found, message=f"{found.message} {lenses}") if lenses else found
 
 
+_SAME_FOCAL = 0.01  # of a focal length: an own lens that differs by less is displaced, not longer
+
+
 def _describe_own_lenses(case: VerificationCase) -> str:
     """A sentence about images whose lens is not the one that they were taken to share, or that was given."""
-    names = case.graph.names
-    own = {names[camera.index]: camera.focal for camera in case.registration.cameras if camera.own_lens}
+    own = [camera for camera in case.registration.cameras if camera.own_lens]
     if not own:
         return ""
     others = [camera.focal for camera in case.registration.cameras if not camera.own_lens]
     beside = f"; the others have {np.median(others):.0f}" if others else ""
-    if len(own) == 1:
-        ((name, focal),) = own.items()
-        return f"{name} has a lens of its own, with a focal length of {focal:.0f} pixels{beside}."
-    least, most = min(own.values()), max(own.values())
-    return (
-        f"{len(own)} images have lenses of their own, with focal lengths of {least:.0f} to {most:.0f} pixels{beside}."
-    )
+    least, most = min(camera.focal for camera in own), max(camera.focal for camera in own)
+    if len(own) > 1:
+        focals = f"{least:.0f} to {most:.0f} pixels{beside}"
+        return f"{len(own)} images have lenses of their own, with focal lengths of {focals}."
+    frame = case.graph.keyframes[own[0].index].frame
+    if others and abs(most / np.median(others) - 1.0) < _SAME_FOCAL:
+        across, down = own[0].principal - np.array([frame.width, frame.height]) / 2.0
+        where = f"{across:+.0f} pixels across and {down:+.0f} down from the middle"
+        return f"{frame.name} has a lens of its own: its principal point is {where}."
+    return f"{frame.name} has a lens of its own, with a focal length of {most:.0f} pixels{beside}."
 
 
 def _find_unplaced_frames(case: VerificationCase) -> tuple[str, ...]:

@@ -94,6 +94,14 @@ def test_an_image_that_contradicts_what_is_told_gets_a_lens_of_its_own(setting):
     assert own(found) == [photos[2].name]
 
 
+def test_an_image_that_was_cropped_elsewhere_is_told_by_its_principal_point():
+    photos = [crop_image(photo, 0.85, 1.0 if index == 2 else 0.5, 0.5) for index, photo in enumerate(photographs())]
+    found = estimate(photos)
+    check_within_bounds(photos, found)
+    assert own(found) == [photos[2].name]
+    assert f"{photos[2].name} has a lens of its own: its principal point is -" in found.verdict.message
+
+
 def test_exif_that_cropped_images_contradict_is_not_used():
     """An editor that crops leaves EXIF as it was, which then tells too short a focal length of what is left."""
     crops = [crop_image(photo, 0.6, 0.5, 0.5) for photo in photographs()]
