@@ -254,10 +254,11 @@ class LensPrior:
             for k in range(_LENS):
                 chosen = members[free[members, k]]
                 if len(chosen):
-                    deviations = np.maximum(own[chosen, k], _MIN_OWN_SIGMA) ** 2
+                    weights = np.maximum(own[chosen, k], _MIN_OWN_SIGMA) ** -2.0
                     shared = self.common.sigmas[chosen[0], k] ** 2
-                    covariance = np.diag(deviations) + shared
-                    information[chosen[:, None], k, chosen[None], k] = np.linalg.inv(covariance)
+                    # The inverse of diag(1 / weights) + shared, whose sum may be singular to rounding (Sherman-Morrison)
+                    common = shared / (1.0 + shared * weights.sum()) * np.outer(weights, weights)
+                    information[chosen[:, None], k, chosen[None], k] = np.diag(weights) - common
         return information.reshape(count * _LENS, count * _LENS)
 
     @staticmethod

@@ -253,6 +253,12 @@ FLAT_PATCH = Refusal(
     "stand elsewhere, as posters, screens and vehicles do.",
     "Keep it out of the picture, or let more of what stands still into {name}.",
 )
+INSET = Refusal(
+    Code.MOVING_SCENE,
+    "What {name} shares with the others fills {percent:.0f} % of its picture, through an unusual lens of its own: it "
+    "may be a picture in its picture, as on a poster or a screen.",
+    "Leave it out, or take it again nearer to what the others show.",
+)
 MIRRORED_IN_DEPTH = Refusal(
     Code.AMBIGUOUS,
     "The photographs can be read in two ways, one the mirror image of the other in depth.",

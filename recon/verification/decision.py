@@ -337,7 +337,10 @@ def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
 
 
 def check_own_lenses(case: EvidenceCase) -> Verdict | None:
-    """A camera got a lens of its own, and its matches contradict it all the same."""
+    """A camera got a lens of its own, and its matches contradict it all the same, or it is that of a part."""
+    inset = next((camera for camera in case.evidence.cameras if camera.inset), None)
+    if inset is not None:
+        return refuse(verification.INSET, (inset.name,), name=inset.name, percent=100 * inset.coverage)
     own = [camera for camera in case.evidence.cameras if camera.own_lens]
     weakest = min(own, key=lambda camera: camera.inlier_ratio, default=None)
     if weakest is None or weakest.inlier_ratio >= case.config.min_own_lens_ratio:

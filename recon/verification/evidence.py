@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import combinations
@@ -377,6 +378,7 @@ class CameraEvidence:
     own_lens: bool  # its lens is not what it was taken for: it refutes the one that it shares, or that was given
     # Its focal length over the one that a calibration gives, where it refutes that; 1: it does not; 0: there is none
     refuted_focal: float = 0.0
+    inset: bool = False  # what it shares with the others fills a small part of it, through an unusual lens of its own
 
 
 @dataclass(frozen=True)
@@ -619,10 +621,40 @@ def _collect_camera_evidence(
             focal=focals[camera.index],
             own_lens=camera.own_lens or camera.displaced or abs(camera.aspect - 1.0) > refit.SQUARE,
             refuted_focal=_compute_refuted_focal(camera, keyframes[camera.index]),
+            inset=_is_inset(camera, keyframes[camera.index], registration),
         )
         for camera in registration.cameras
         if camera.index in sizes
     )
+
+
+_MAX_INSET = 0.3  # of a picture, that a picture in it fills; a photograph among shorter lenses' fills less of theirs
+_DISPLACED = 0.05  # of the longer side: a principal point that is so far from the middle is that of a part
+_USUAL = 0.5, 2.5  # focal lengths over the longer side, of nearly all cameras
+
+
+def _is_inset(camera: RegisteredCamera, keyframe: Keyframe, registration: Registration) -> bool:
+    """Whether a camera may see a picture in its picture, as a poster of the place: that has another lens.
+
+    Its points lie in a small box, through a lens that no other camera has, and that is displaced, or very long or
+    short. A picture in a picture whose lens is held to the middle comes out as very long.
+    """
+    shared = Counter(each.lens for each in registration.cameras)
+    if shared[camera.lens] > 1 or max(shared.values()) == 1:
+        return False
+    frame, side = keyframe.frame, longer_side(keyframe.frame)
+    shown = 1.0 if frame.mask is None else _compute_box_share(frame.mask)
+    pixels = registration.observed_pixels[registration.observed_by == camera.index]
+    if compute_coverage(keyframe, pixels) >= _MAX_INSET * shown:
+        return False
+    displaced = float(np.abs(camera.principal - principal_point(frame)).max()) / side
+    return displaced > _DISPLACED or not _USUAL[0] <= camera.focal / side <= _USUAL[1]
+
+
+def _compute_box_share(mask: npt.NDArray[np.bool_]) -> float:
+    """The share of the picture in the box around what a mask (H, W) shows, as between black bars."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return float(np.ptp(rows) + 1) * float(np.ptp(columns) + 1) / mask.size if len(rows) else 1.0
 
 
 def _compute_refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -28,9 +29,11 @@ from splatnode.recon.estimation import (
     estimate_cameras,
     find_lenses_inside_bars,
 )
+from splatnode.recon.fallbacks import run_fallbacks
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.registration import bundle_adjustment, self_calibration
 from splatnode.recon.registration.registration import register
+from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import view_graph
 
 pytestmark = pytest.mark.numerical
@@ -102,6 +105,22 @@ def test_an_image_that_was_cropped_elsewhere_is_told_by_its_principal_point():
     assert f"{photos[2].name} has a lens of its own: its principal point is -" in found.verdict.message
 
 
+def test_a_picture_of_the_place_that_hangs_elsewhere_is_no_camera():
+    """It fits as an image through a displaced lens, to the pixel."""
+    other = photographs(msgspec.structs.replace(PLACE, seed=PLACE.seed + 1))[0]
+    picture = cv2.resize(photographs()[3].image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    hung = other.image.copy()
+    hung[200 : 200 + picture.shape[0], 300 : 300 + picture.shape[1]] = picture
+    photos = [*photographs()[:3], replace(other, name="elsewhere.png", image=hung), *photographs()[4:]]
+    found = estimate(photos)
+    assert (found.verdict.code, found.verdict.frames) == (Code.MOVING_SCENE, ("elsewhere.png",))
+    assert "may be a picture in its picture" in found.verdict.message
+    left = run_fallbacks(found, (), ReconstructionConfig())
+    assert left.verdict.code is Code.OK_PARTIAL and left.camera_names == {photo.name for photo in photos} - {
+        "elsewhere.png"
+    }
+
+
 def test_exif_that_cropped_images_contradict_is_not_used():
     """An editor that crops leaves EXIF as it was, which then tells too short a focal length of what is left."""
     crops = [crop_image(photo, 0.6, 0.5, 0.5) for photo in photographs()]
@@ -166,6 +185,21 @@ def test_a_group_has_the_covariance_of_common_and_own():
     covariance = np.linalg.inv(prior.information[::6, ::6])
     assert np.allclose(covariance, own_sigma**2 * np.eye(count) + common_sigma**2)
     assert prior.free[:, 0].all() and not prior.free[:, 1:].any()
+
+
+def test_a_group_of_which_nothing_but_its_common_part_is_open_has_an_information():
+    """A sum of covariances that rounding makes singular ended the run."""
+    common = np.zeros((2, 6))
+    common[:, 0] = 150.0
+    prior = bundle_adjustment.LensPrior(
+        np.zeros(2),
+        np.zeros(2),
+        np.zeros((2, 2)),
+        np.zeros(2),
+        common=bundle_adjustment.CommonLensPrior(np.zeros(2, np.int64), common),
+    )
+    information = prior.information[::6, ::6]
+    assert np.isfinite(information).all() and information[0, 1] == pytest.approx(-information[0, 0], rel=1e-6)
 
 
 def test_what_is_not_refuted_widens_the_covariance():
