@@ -175,6 +175,8 @@ def make_depth_image(
 ) -> DepthImage:
     """A depth image of an array (H, W): whole numbers are millimetres, floats are metres, unless `unit_m` tells.
 
+    They are depths z along the camera's axis, not distances along the rays.
+
     `noise` may name a kind of `NOISES`. Raises ValueError, where `unit_m` does not tell also of values that have
     another unit.
     """

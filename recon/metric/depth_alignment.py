@@ -154,6 +154,40 @@ _FITS_BETTER, _FITS = 2.0, 0.5  # unexplained share of its own photograph over t
 _LEAST_LIGHT = 0.01  # standard deviation of the logarithm of brightness that surfaces leave unexplained
 
 
+# Depths whose planes are straight once distances along the rays are made depths of them. Pixels of the maps
+_BOW_RADIUS, _BOW_STEP, _BOW_WINDOWS = 20, 10, 20  # of a window, between two windows, and the fewest of them
+_STRAIGHT, _MOST_BOW = 0.01, 0.02  # distance from a plane, rms over the nearness: of one, and the largest that counts
+_BOWED, _GAIN = 0.6, 0.7  # the least power of the rays' lengths that straightens planes; the cost with over without
+
+
+def are_along_rays(clouds: Sequence[DepthCloud]) -> bool:
+    """Whether planes show that depth images hold distances along the ray instead of z: so simulators have them.
+
+    The nearness 1 / z of a plane is linear in the image. That of a distance is, once it is multiplied by the length of
+    the ray at depth 1.
+    """
+    powers, side = (0.0, 0.5, 1.0), 2 * _BOW_RADIUS + 1
+    bows: list[Array] = []  # (3, W) each
+    for cloud in clouds:
+        z = cloud.surface[:, 2].reshape(cloud.shape)
+        v, u = np.mgrid[: cloud.shape[0], : cloud.shape[1]] + 0.5
+        K, known = cloud.K, z > 0
+        length = np.sqrt(1.0 + ((u - K[0, 2]) / K[0, 0]) ** 2 + ((v - K[1, 2]) / K[1, 1]) ** 2)
+        nearness = np.where(known, 1.0 / np.maximum(z, 1e-9), 0.0)
+        planes = [fit_planes(nearness * length**power, known, side) for power in powers]
+        grid = np.s_[::_BOW_STEP, ::_BOW_STEP]
+        whole = planes[0].count[grid] > 0.8 * side**2
+        bows.append(np.stack([(each.rms / np.maximum(each.value, 1e-9))[grid][whole] for each in planes]))
+    found = np.concatenate(bows, axis=1) if bows else np.zeros((3, 0))
+    found = np.minimum(found[:, found.min(0) < _STRAIGHT], _MOST_BOW)
+    if found.shape[1] < _BOW_WINDOWS:
+        return False
+    without, half, with_all = (found**2).sum(1)
+    bend = without - 2.0 * half + with_all
+    best = 0.5 + 0.25 * (without - with_all) / bend if bend > 0 else float(with_all < without)
+    return bool(best > _BOWED and with_all < _GAIN * without)
+
+
 def find_exchanged_depth(clouds: Sequence[DepthCloud]) -> dict[int, int]:
     """The clouds, in the order of their frames, whose depth fits another one's photograph much better; and which one.
 
@@ -511,6 +545,9 @@ def _collect_clouds(frames: Sequence[Frame]) -> list[DepthCloud]:
     """The clouds of frames, in the order in which these were taken; a depth image of another photograph gives none."""
     ordered = sorted(frames, key=lambda frame: (frame.stamp_ns, frame.frame_id, frame.name))
     clouds = [cloud for frame in ordered if (cloud := make_depth_cloud(frame)) is not None]
+    if are_along_rays(clouds):
+        log.warning("depth images are distances along the rays, not depths along the camera's axis, and are not used")
+        return []
     exchanged = find_exchanged_depth(clouds)
     for k, other in exchanged.items():
         names = sanitize_text(clouds[k].name), sanitize_text(clouds[other].name)

@@ -132,6 +132,9 @@ _MOST_CONTRADICTING = 0.25
 # A depth image whose unit is off from that of most others by so much of its logarithm, and by so many standard
 # deviations, is none of them. Cameras that are a little wrong change units of single images by some hundredths
 _LEAST_OFF, _OFF_SIGMAS = 0.04, 4.5
+_MOST_NOISE = 0.12  # of a depth, in the median, that is told: beyond, nothing that is measured could contradict it
+# Times the logarithm of the ray's length over its z, that depths are off by where they are distances along the ray: 1
+_ALONG_RAY = 0.6, 1.4
 # How much of its logarithm a depth may be off by where cameras are rough: a focal length that nothing tells bends the
 # scene. Beyond, it is not the cameras: disparity in place of depth has 2
 _MOST_BENDING = 0.15
@@ -182,6 +185,7 @@ class _Samples:
     view_of: npt.NDArray[np.int64]  # (M,)
     pixels: Array  # (M, 2) of the depth image
     log_z: Array  # (M,) logarithm of the depth that the scene tells, metres
+    log_ray: Array  # (M,) logarithm of its distance over its depth
     unit: float  # metres, of the scene's unit, by which it is that
 
     def look(self, shift: tuple[float, float], scale: float) -> tuple[Array, Array]:
@@ -259,10 +263,15 @@ def _fit_samples(camera_id: str, views: Sequence[DepthView], samples: _Samples, 
     known = np.isfinite(ratio)
     if known.sum() < LEAST_POINTS:
         return _explain_few(views, int(known.sum()))
+    noise = float(np.median(_compute_told_noise(views, samples)[known]))
+    if noise > _MOST_NOISE:
+        return _explain_noise(camera_id, names, int(known.sum()), noise)
     mean, mean_sigma = _average(ratio[known], sigma[known])
     agreeing = float((np.abs(ratio[known] - mean) < _AGREEING_SIGMAS * sigma[known]).mean())
     shift, gain = _find_shift(samples, scale)
     check = _judge(camera_id, len(names), int(known.sum()), agreeing, shift, gain)
+    if _is_along_ray(samples, scale):
+        return _blame_rays(check, names)
     parted = _test_parts(check, names, samples, ratio - mean, sigma)
     if parted.code is not DepthCode.FITS:
         bending, left = _find_bending(samples, scale)
@@ -271,6 +280,56 @@ def _fit_samples(camera_id: str, views: Sequence[DepthView], samples: _Samples, 
     noise = max(view.depth.noise.scale_sigma for view in views)
     unit = samples.unit * float(np.exp(mean))
     return DepthFit(camera_id, names, unit, float(np.hypot(mean_sigma, noise)), parted)
+
+
+def _compute_told_noise(views: Sequence[DepthView], samples: _Samples) -> Array:
+    """(M,) the standard deviation of each depth by its camera's noise, as a share of the depth that the scene tells."""
+    z = np.exp(samples.log_z)
+    noises = np.stack([view.depth.noise.compute_sigma(z) for view in views])
+    return noises[samples.view_of, np.arange(len(z))] / z
+
+
+def _explain_noise(camera_id: str, names: tuple[str, ...], count: int, noise: float) -> DepthFit:
+    """The fit of depth images that by their own noise tell next to nothing."""
+    message = (
+        f"{name_depth_images(len(names), camera_id)} were left out: by their noise a depth is known to "
+        f"{100 * noise:.0f} % only, so that the images can test none. Check their unit, or tell their noise"
+    )
+    return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
+
+
+def _is_along_ray(samples: _Samples, scale: float) -> bool:
+    """Whether the points show that depths are distances along the ray instead of z: so simulators have them."""
+    ratio, sigma = samples.look((0.0, 0.0), scale)
+    known = np.isfinite(ratio)
+    factors = np.column_stack([np.ones(int(known.sum())), samples.log_ray[known]])
+    along = float(_fit_robustly(factors, ratio[known], sigma[known])[1])
+    if not _ALONG_RAY[0] <= along <= _ALONG_RAY[1]:
+        return False
+    turned = replace(samples, log_z=samples.log_z + samples.log_ray)
+    better = _compute_costs(samples, (0.0, 0.0), scale) - _compute_costs(turned, (0.0, 0.0), scale)
+    return _compute_gain(better, samples, scale) > _LEAST_GAIN
+
+
+def _blame_rays(check: DepthCheck, names: tuple[str, ...]) -> DepthFit:
+    """The fit of depth images that hold distances along the ray."""
+    message = (
+        f"{name_depth_images(len(names), check.camera_id)} are distances along the rays, not depths along the camera's "
+        "axis, so they were left out. Divide each by the length of its ray at depth 1"
+    )
+    found = DepthCheck(DepthCode.CONTRADICTS, message, check.camera_id, check.num_points)
+    return DepthFit(check.camera_id, names, 1.0, float("inf"), found)
+
+
+def _fit_robustly(factors: Array, values: Array, sigmas: Array) -> Array:
+    """(N,) the coefficients of the columns of `factors` (M, N) that fit `values` (M,), by Huber's weights."""
+    found, weights = np.zeros(factors.shape[1]), np.ones(len(factors))
+    for _ in range(_ROUNDS):
+        weighted = factors * (weights / sigmas**2)[:, None]
+        found = np.linalg.lstsq(factors.T @ weighted, weighted.T @ values, rcond=None)[0]
+        off = np.abs(values - factors @ found) / sigmas
+        weights = np.where(off > _CUT, 0.0, np.clip(_HUBER / np.maximum(off, 1e-12), 0.0, 1.0))
+    return found
 
 
 def _collect_common_samples(views: Sequence[DepthView]) -> tuple[_Samples, float]:
@@ -370,14 +429,10 @@ def _find_bending(samples: _Samples, scale: float) -> tuple[float, Array]:
     known = np.isfinite(ratio)
     log_z = samples.log_z - float(np.median(samples.log_z[known]))
     factors = np.column_stack([np.ones(int(known.sum())), log_z[known]])
-    found, weights, off = np.zeros(2), np.ones(len(factors)), np.zeros(len(factors))
-    for _ in range(_ROUNDS):
-        weighted = factors * (weights / sigma[known] ** 2)[:, None]
-        found = np.linalg.lstsq(factors.T @ weighted, weighted.T @ ratio[known], rcond=None)[0]
-        off = np.abs(ratio[known] - factors @ found) / sigma[known]
-        weights = np.where(off > _CUT, 0.0, np.clip(_HUBER / np.maximum(off, 1e-12), 0.0, 1.0))
+    found = _fit_robustly(factors, ratio[known], sigma[known])
+    off = np.abs(ratio[known] - factors @ found) / sigma[known]
     bending = float(found[1])
-    if not weights.any() or abs(bending) > _MOST_BENDING:
+    if abs(bending) > _MOST_BENDING:
         return 0.0, ratio
     straight = replace(samples, log_z=samples.log_z + bending * log_z)
     shift, gain = _find_shift(straight, scale)
@@ -402,7 +457,7 @@ def _blame_cameras(check: DepthCheck, names: tuple[str, ...], bending: float) ->
 
 def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Samples:
     """Every `step`-th point of each view."""
-    view_of, pixels, log_z = [], [], []
+    view_of, pixels, log_z, log_ray = [], [], [], []
     for number, view in enumerate(views):
         T_depth_camera = np.linalg.inv(view.depth.matrix)
         points = unit * view.points[::step] @ T_depth_camera[:3, :3].T + T_depth_camera[:3, 3]
@@ -412,9 +467,9 @@ def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Sam
         view_of.append(np.full(int(kept.sum()), number))
         pixels.append(seen[kept])
         log_z.append(np.log(points[kept, 2]))
-    return _Samples(
-        [view.surface for view in views], np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z), unit
-    )
+        log_ray.append(np.log(np.linalg.norm(points[kept], axis=1)) - log_z[-1])
+    surfaces, joined = [view.surface for view in views], map(np.concatenate, (view_of, pixels, log_z, log_ray))
+    return _Samples(surfaces, *joined, unit)
 
 
 def _average(values: Array, sigmas: Array) -> tuple[float, float]:
@@ -443,10 +498,14 @@ def _find_shift(samples: _Samples, scale: float) -> tuple[tuple[float, float], f
             costs = _compute_costs(samples, (float(across), float(down)), scale)
             if np.isfinite(costs).sum() >= max(LEAST_POINTS, _LEAST_SHARE * most) and np.nanmean(costs) < best_cost:
                 best, best_cost = (float(across), float(down)), float(np.nanmean(costs))
-    better = here - _compute_costs(samples, best, scale)
+    return best, _compute_gain(here - _compute_costs(samples, best, scale), samples, scale)
+
+
+def _compute_gain(better: Array, samples: _Samples, scale: float) -> float:
+    """By how many standard deviations costs are lower in the mean; `better` (M,) is by how much, NaN: not compared."""
     better = better[np.isfinite(better)]
     spread = float(better.std()) / np.sqrt(max(samples.count_cells(scale), 1)) if len(better) else 0.0
-    return best, float(better.mean()) / spread if spread > 0 else 0.0
+    return float(better.mean()) / spread if spread > 0 else 0.0
 
 
 def _compute_costs(samples: _Samples, shift: tuple[float, float], scale: float) -> Array:

@@ -139,6 +139,8 @@ def gather_evidence(
     return replace(came, sightings=tuple(detect_markers(known, config.marker_dictionary)))
 
 
+MOST_SCALE_ERROR = 0.1  # of the logarithm of a depth camera's unit, beside other sources, for it alone to be to blame
+
 # The unit by depth images: their depths over those of the scene's points, checked by the images and other sources.
 
 
@@ -197,6 +199,13 @@ def measure_by_depth(
     spread = math.hypot(measured.sigma, agreed.sigma)
     if abs(math.log1p(error)) <= MAX_DEVIATION * spread:
         return measured, check
+    if abs(math.log1p(error)) > MOST_SCALE_ERROR:  # no depth camera errs so much: which source does is not known
+        factor = max(1.0 + error, 1.0 / (1.0 + error))
+        message = (
+            f"{who} and {agreed.source} contradict each other by a factor of {factor:.3g}, so no metres are given. "
+            "Measure both again, and check their units"
+        )
+        return measured, replace(check, code=DepthCode.SCALE, message=message, scale_error=float(error))
     message = (
         f"{who} are {100 * abs(error):.1f} % too {'large' if error > 0 else 'small'} by {agreed.source} "
         f"({abs(math.log1p(error)) / spread:.1f} standard deviations), so they give no metres; their shape is used. "

@@ -256,7 +256,7 @@ class LensPrior:
                 if len(chosen):
                     weights = np.maximum(own[chosen, k], _MIN_OWN_SIGMA) ** -2.0
                     shared = self.common.sigmas[chosen[0], k] ** 2
-                    # The inverse of diag(1 / weights) + shared, whose sum may be singular to rounding (Sherman-Morrison)
+                    # The inverse of diag(1 / weights) + shared, which rounding may make singular (Sherman-Morrison)
                     common = shared / (1.0 + shared * weights.sum()) * np.outer(weights, weights)
                     information[chosen[:, None], k, chosen[None], k] = np.diag(weights) - common
         return information.reshape(count * _LENS, count * _LENS)

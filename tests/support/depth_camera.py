@@ -70,6 +70,14 @@ def photograph_depth(
     return replace(found, intrinsics=lens, T_camera_depth=tuple(T_camera_depth.ravel().tolist()))
 
 
+def measure_along_rays(depth: DepthImage, K: npt.NDArray[np.float64]) -> DepthImage:
+    """The same as distances along the rays, as simulators have them; `K` (3, 3) is of the depth image's pixels."""
+    height, width = depth.values.shape
+    x, y = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0], (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+    lengths = np.sqrt(1.0 + x[None] ** 2 + y[:, None] ** 2)
+    return replace(depth, values=np.rint(depth.values * lengths).clip(0, 65_535).astype(np.uint16))
+
+
 def whitewash(frames: Sequence[Frame], config: synthetic.Config) -> list[Frame]:
     """The photographs with plain walls: shaded, without anything to match but what stands before them."""
     found = []

@@ -27,7 +27,7 @@ from splatnode.recon.metric.metres import Evidence, apply_metric_scale, gather_e
 from splatnode.recon.pipeline import estimate_frames, run
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import Clock
-from tests.support.depth_camera import DepthCamera
+from tests.support.depth_camera import DepthCamera, measure_along_rays
 from tests.support.plain_rooms import Room, make_room, make_room_with_plain_view, photograph
 
 SEED, VIEWS = 1, 3
@@ -146,6 +146,15 @@ def test_cameras_are_not_placed_by_depth_images_of_another_moment(caplog):
     stuck = [replace(frame, depth=frames()[0].depth) for frame in frames()]
     assert place_by_depth(stuck) == ()
     assert "the depth image of room_001.png fits the photograph room_000.png much better" in caplog.text
+
+
+def test_no_camera_is_placed_by_distances_along_the_rays(caplog):
+    along = []
+    for frame in frames():
+        assert frame.depth is not None and frame.intrinsics is not None
+        height, width = frame.depth.values.shape
+        along.append(replace(frame, depth=measure_along_rays(frame.depth, frame.intrinsics.resized(width, height).K)))
+    assert not place_by_depth(along) and "distances along the rays" in caplog.text
 
 
 def test_a_frame_needs_depth_and_a_lens_that_was_told():

@@ -22,7 +22,7 @@ from splatnode.recon.metric.depth_fit import (
     warp_depth,
 )
 from splatnode.recon.metric.depth_fusion import fuse_depth
-from splatnode.recon.metric.measurement import Measurement, MetricConfig
+from splatnode.recon.metric.measurement import Measurement, MetricConfig, combine_measurements
 from splatnode.recon.metric.metres import (
     CameraDepth,
     Evidence,
@@ -35,7 +35,7 @@ from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import DepthCode
 from tests.recon.metric import test_stereo
 from tests.support import synthetic as support
-from tests.support.depth_camera import DepthCamera, add_depths, measure
+from tests.support.depth_camera import DepthCamera, add_depths, measure, measure_along_rays
 
 PLACE, UNIT = test_stereo.PLACE, test_stereo.UNIT
 GOOD = DepthCamera()
@@ -213,6 +213,27 @@ def test_depth_images_of_which_a_part_contradicts_the_rest_are_left_untested():
     assert "contradict them where the others fit" in found.check.message
 
 
+def test_distances_along_the_rays_are_no_depths():
+    (found,) = fit_depth_images(
+        [replace(each, depth=measure_along_rays(each.depth, each.lens.resized(320, 240).K)) for each in views()]
+    )
+    assert found.check.code is DepthCode.CONTRADICTS and not found.is_usable
+    assert "are distances along the rays" in found.check.message
+
+
+@pytest.mark.parametrize("least", [1, 30_000])
+def test_depths_that_by_their_noise_tell_nothing_are_untested(least):
+    """All agrees with what is known to a third of itself, and the mean of thousands would be published as exact."""
+    rng = np.random.default_rng(0)
+    drawn = [
+        replace(each, depth=make_depth_image(rng.integers(least, 60_000, (240, 320)).astype(np.uint16)))
+        for each in views()
+    ]
+    (found,) = fit_depth_images(drawn)
+    assert found.check.code is DepthCode.UNTESTED and not found.is_usable and not has_too_few_points(found.check)
+    assert "by their noise a depth is known to" in found.check.message
+
+
 def test_points_and_depths_that_are_only_noisy_fit():
     (noisy,) = fit_depth_images(_six(**{f"v{i}": DepthCamera(noise_px=1.2, seed=i) for i in range(6)}))
     assert noisy.check.code is DepthCode.FITS, "two thirds of the points agree, everywhere alike"
@@ -278,6 +299,16 @@ def test_a_scale_error_of_three_percent_is_named_by_another_source():
     assert check.code is DepthCode.SCALE and "too small" in check.message
     (said,), (check,) = measured(DepthCamera(), (marker,))
     assert isinstance(said, Measurement) and check.code is DepthCode.FITS
+
+
+@pytest.mark.parametrize("factor", [0.8, 10.0])
+def test_of_two_sources_that_no_calibration_reconciles_none_gives_metres(factor):
+    other = Measurement(factor * UNIT, 0.01, "0.5 m between a.png and b.png")
+    (said,), (check,) = measured(DepthCamera(), (other,))
+    assert isinstance(said, Measurement) and check.code is DepthCode.SCALE
+    assert "so no metres are given" in check.message
+    combined = combine_measurements([other, said])
+    assert isinstance(combined, str) and "contradicts" in combined
 
 
 def test_without_points_nothing_is_measured():
