@@ -12,6 +12,7 @@ import numpy as np
 from splatnode.capture.frame import LEAST_SIGMA, DroppedFrame, Frame, GivenPose, Stamp, make_given_pose
 from splatnode.capture.lenses import undistort_frame
 from splatnode.capture.process.system import raise_shortage
+from splatnode.recon import verification
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.keyframes import (
@@ -23,7 +24,7 @@ from splatnode.recon.keyframes import (
     mask_bars,
     resize_image,
 )
-from splatnode.recon.locating.localize import collect_landmarks
+from splatnode.recon.locating.localize import collect_landmarks, find_sheared_image
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_beside, place_by_depth
@@ -339,9 +340,27 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
     evidence = verify(graph, seen, config.verification, run)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
+    verdict = _refuse_sheared(graph, seen, verdict)
     if registration is not None and registration.rig is not None:
         verdict = describe_rig(verdict, graph, registration.rig)
     return Reconstruction(graph, registration if verdict.publishable else seen, evidence, verdict)
+
+
+# What an image that is sheared among others may be taken for, where there are enough of them to tell which one it is
+_OF_SHEARED = Code.AMBIGUOUS, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY
+_MOST_ALIKE = 3  # cameras with which a sheared one may agree by bending the scene
+
+
+def _refuse_sheared(graph: ViewGraph, registration: Registration | None, verdict: Verdict) -> Verdict:
+    """The refusal of a sheared image, in place of an answer with it, or of what it looks like; else `verdict`."""
+    if registration is None:
+        return verdict
+    is_told = verdict.code in _OF_SHEARED and len(registration.cameras) > _MOST_ALIKE
+    sheared = find_sheared_image(graph, registration) if verdict.publishable or is_told else None
+    if sheared is None:
+        return verdict
+    name, shear = sheared
+    return verification.refuse(verification.SHEARED, (name,), name=name, percent=100.0 * abs(shear))
 
 
 def _estimate_without_exif(found: Reconstruction, config: ReconstructionConfig, run: RunContext) -> Reconstruction:

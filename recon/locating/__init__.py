@@ -76,6 +76,9 @@ class Located:
     metric: bool  # lengths are metres
     lens: LensSource = LensSource.SCENE  # with which it was placed
     distortion: tuple[float, float] = (0.0, 0.0)  # k1, k2 of that lens; (0, 0): a pinhole
+    # Pixels across for one down from the middle, by which the photograph is sheared, as by a rolling shutter while the
+    # camera turns; all else is of the photograph without it
+    shear: float = 0.0
 
     @property
     def sentence(self) -> str:
@@ -93,6 +96,9 @@ class Located:
         if self.lens is not LensSource.FREE:
             return ""
         focal, percent = self.K[0, 0], self.claim.focal_percent
+        if self.shear:
+            shear = f"{100 * abs(self.shear):.1f} %, as by a rolling shutter while the camera turns"
+            return f"; it is sheared by {shear}, which is taken out; focal length {focal:.4g} pixels"
         return f"; its lens is its own, no known one: focal length {focal:.4g} pixels, known to {percent:.2g} %"
 
 
@@ -113,6 +119,7 @@ class NotLocated:
 
 QUERY_BYTES = 16 << 20  # of an image
 QUERY_LIMITS = Limits(header_bytes=64 << 10, arrays=1, dimensions=1, total_bytes=QUERY_BYTES)
+Shear = Annotated[float, msgspec.Meta(ge=-1, le=1)]
 Covariance = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=36, max_length=36)]
 
 
@@ -139,6 +146,7 @@ class LocationRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     metric: bool
     lens_source: LensSource
     radial: tuple[Finite, Finite]
+    shear: Shear = 0.0  # pixels across for one down, which is taken out
 
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where nothing can be seen through it."""
@@ -196,6 +204,7 @@ def make_outcome_records(found: Located | NotLocated) -> dict[str, LocationRecor
             metric=found.metric,
             lens_source=found.lens,
             radial=(float(found.distortion[0]), float(found.distortion[1])),
+            shear=float(found.shear),
         )
     }
 
@@ -218,4 +227,5 @@ def parse_outcome(answer: LocateAnswer) -> Located | NotLocated | None:
         record.metric,
         record.lens_source,
         record.radial,
+        record.shear,
     )

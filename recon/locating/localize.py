@@ -217,6 +217,62 @@ _AMPLE_NFA, _AMPLE_POINTS = -30.0, 100  # log10, and points that agree: so surel
 _OF_STRETCHED, _MORE_STRETCHED = (Reason.ELSEWHERE, Reason.INCONSISTENT, Reason.LENS), 1.25
 
 
+# Points of an image that two others see, by which its shear is measured; of more, an even choice
+LEAST_CONFIRMED, _MOST_CONFIRMED = 60, 400
+# By which an image is sheared, and differs from most others; of right windows of six scenes no image reaches half of it
+MOST_SHEAR = 0.01
+_SETTLED = pose_refinement.PoseSearchConfig(rounds=2)
+
+
+def find_sheared_image(graph: ViewGraph, registration: Registration) -> tuple[str, float] | None:
+    """The name and the shear of the registered image that is sheared most, where it stands out among the others.
+
+    What all images have alike, as of one pan, does not count.
+    """
+    shears = _measure_shears(graph, registration)
+    middle = float(np.median(list(shears.values()))) if shears else 0.0
+    found = [(name, shear) for name, shear in shears.items() if min(abs(shear), abs(shear - middle)) > MOST_SHEAR]
+    return max(found, key=lambda each: abs(each[1]), default=None)
+
+
+def _measure_shears(graph: ViewGraph, registration: Registration) -> dict[str, float]:
+    """The shears of registered images, by name, as `verification.measure_shear` has them; few points measure none."""
+    shears: dict[str, float] = {}
+    times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
+    for camera in registration.cameras:
+        frame = graph.keyframes[camera.index].frame
+        (mine,) = np.nonzero(
+            (registration.observed_by == camera.index) & (times_seen[registration.observed_point] >= 3)
+        )
+        if len(mine) < LEAST_CONFIRMED:
+            continue
+        mine = mine[:: -(-len(mine) // _MOST_CONFIRMED)]
+        count = len(mine)
+        points, numbers = registration.points[registration.observed_point[mine]], np.arange(count)
+        known = Correspondences(
+            pixels=registration.observed_pixels[mine] - principal_point(frame),
+            feature_of=numbers,
+            points=points,
+            covariances=np.zeros((count, 3, 3)),
+            landmark_of=registration.observed_point[mine],
+            photograph_of=np.zeros(count, np.int64),
+            seen_along=points - camera.T_world_camera[:3, 3],
+        )
+        size = frame.width, frame.height
+        judged = QueryContext(known, *size, registration.rms_px, 1.0, _SETTLED)
+        rotation = camera.T_world_camera[:3, :3].T
+        lens = pose_refinement.Lens(
+            float(np.sqrt(np.prod(camera.focals))),
+            (float(camera.radial[0]), float(camera.radial[1])),
+            camera.principal - principal_point(frame),
+            *(0.0, 0.0, 0.0),
+            log_aspect=float(np.log(camera.focals[0] / camera.focals[1])),
+        )
+        model = CameraModel(rotation, -rotation @ camera.T_world_camera[:3, 3], lens)
+        shears[graph.keyframes[camera.index].name] = verification.measure_shear(judged, model)
+    return shears
+
+
 class LocalizationConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Localization of a query image in a saved scene, or the reason why it cannot be said."""
 
@@ -339,10 +395,15 @@ def make_localization(
 ) -> Localization | NotLocated:
     """The camera of the photograph, which no check refuses, with what is claimed of it; a refusal where it is mirrored.
 
-    The last check is here, since it compares all features once more.
+    The last check is here, since it compares all features once more. A shear of the image, as by a rolling shutter
+    while the camera turns, is taken out: the camera, and what is claimed of it, are those of the image without it.
     """
     assert case.posed is not None  # a check refuses it
     frame, mirror = photograph.frame, config.checks.mirror
+    shear = verification.measure_shear(case.by, case.posed.fit.camera)
+    straight = verification.straighten(case, shear) if abs(shear) > config.checks.least_shear else None
+    case, shear = (case, 0.0) if straight is None else (straight, shear)
+    assert case.posed is not None
     if frame.intrinsics is not None:
         refusal = verification.check_stated_focal(case.posed.fit.camera.lens, frame.intrinsics.fx, config.checks)
         if refusal is not None:
@@ -360,7 +421,7 @@ def make_localization(
     K = np.diag([*camera.lens.focals, 1.0])
     K[:2, 2] = principal_point(frame) + camera.lens.shift
     count, metric = int(case.posed.agreeing.sum()), landmarks.metric
-    at = Located(camera.T_world_camera, K, covariance, claim, count, metric, case.source, camera.lens.radial)
+    at = Located(camera.T_world_camera, K, covariance, claim, count, metric, case.source, camera.lens.radial, shear)
     apart = compute_rms_radius(landmarks.Ts_world_camera[:, :3, 3])
     return Localization(at, camera, case.inliers, (frame.width, frame.height), apart)
 
@@ -564,5 +625,5 @@ def _record(found: Located | NotLocated | DroppedFrame, frame: Frame | DroppedFr
     assert isinstance(frame, Frame)  # it was located
     arrays = {name: getattr(found, name).tolist() for name in ("T_world_camera", "K", "covariance")}
     size = {"width": frame.width, "height": frame.height}
-    lens = {"lens": found.lens.value, "distortion": list(found.distortion)}
+    lens = {"lens": found.lens.value, "distortion": list(found.distortion), "shear": found.shear}
     return {"placed": True, **arrays, **size, **lens, "claim": asdict(found.claim), "points": found.num_points}

@@ -378,6 +378,12 @@ def _whiten_residuals(
     return rows, errors
 
 
+def compute_whitened_errors(camera: CameraModel, known: Correspondences, noise_px: float) -> Array:
+    """(M,) the reprojection errors in their own standard deviations."""
+    covariances = np.ascontiguousarray(known.covariances.transpose(1, 2, 0))
+    return np.hypot(*_whiten_residuals(camera, known, covariances, noise_px)[1])
+
+
 def _median(values: Array) -> float:
     """As NumPy's of (M,), in a fraction of its time for few."""
     middle = (len(values) - 1) // 2, len(values) // 2

@@ -345,6 +345,7 @@ class LocalizationCheckConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     max_shift: float = 0.5  # of the principal point, over the longer side: it is in the picture, or was before a crop
     max_log_aspect: float = 0.7  # of the focal length across over that down: 2
     max_radial: float = 0.5  # the first coefficient of a lens that bends lines; beyond, it is a fisheye
+    least_shear: float = 0.003  # pixels across for one down, from which on it is taken out of an image
     max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (extras/evaluate/stability/trial.py)
     max_centre_percent: float = 10.0  # likewise
 
@@ -406,6 +407,60 @@ def check_stated_focal(lens: Lens, stated_focal: float, config: LocalizationChec
         f"its points ask for a focal length of {lens.focal:.4g} pixels, where {stated_focal:.4g} are stated.",
         "Give the lens of this image, or none.",
     )
+
+
+_SHEAR_STEP, _MOST_SHEAR = 0.01, 0.1  # of the shears that are tried: pixels across for one down
+_COST_SIGMAS = 3.0  # of a residual, from which on it counts less
+
+
+def measure_shear(judged: QueryContext, camera: CameraModel) -> float:
+    """Measures the pixels across for one down by which an image is sheared, as by a rolling shutter in a turn.
+
+    Focal length, aspect, principal point and distortion imitate a shear in part, and the pose slides along. So with
+    each shear taken out all of them are found anew from `camera` on, and the one with the least cost of all
+    correspondences counts.
+    """
+    cameras, costs = {0: camera}, dict[int, float]()
+
+    def cost(number: int, near: int) -> float:
+        if number not in costs:
+            costs[number], cameras[number] = _fit_sheared(judged, number * _SHEAR_STEP, cameras[near])
+        return costs[number]
+
+    best, last = 0, round(_MOST_SHEAR / _SHEAR_STEP)
+    cost(0, 0)
+    way = 1 if cost(1, 0) < cost(-1, 0) else -1
+    while abs(best) < last and cost(best + way, best) < costs[best]:
+        best += way
+    before, at, after = cost(best - 1, best), costs[best], cost(best + 1, best)
+    bend = before - 2.0 * at + after
+    aside = 0.5 * (before - after) / bend if bend > 0 and math.isfinite(bend) else 0.0
+    return _SHEAR_STEP * (best + float(np.clip(aside, -0.5, 0.5)))
+
+
+def straighten(case: PoseHypothesis, shear: float) -> PoseHypothesis | None:
+    """The case with a shear taken out of the image, and a lens of its own; None where no camera fits."""
+    assert case.posed is not None
+    straight = _take_out_shear(case.by, shear)
+    posed = straight.refine_pose(
+        case.posed.fit.camera, pose_refinement.free_lens(case.posed.fit.camera.lens, case.by.side)
+    )
+    return None if posed is None else PoseHypothesis(straight, posed, case.log10_nfa, LensSource.FREE)
+
+
+def _take_out_shear(judged: QueryContext, shear: float) -> QueryContext:
+    pixels = judged.known.pixels - np.outer(shear * judged.known.pixels[:, 1], [1.0, 0.0])
+    return replace(judged, known=replace(judged.known, pixels=pixels))
+
+
+def _fit_sheared(judged: QueryContext, shear: float, camera: CameraModel) -> tuple[float, CameraModel]:
+    """The robust cost of all correspondences, with this shear taken out, and the camera; infinite where none fits."""
+    straight = _take_out_shear(judged, shear)
+    posed = straight.refine_pose(camera, pose_refinement.free_lens(camera.lens, judged.side))
+    if posed is None:
+        return math.inf, camera
+    squared = pose_refinement.compute_whitened_errors(posed.fit.camera, straight.known, judged.noise_px) ** 2
+    return float(np.log1p(squared / _COST_SIGMAS**2).sum()), posed.fit.camera
 
 
 def check_mirrored(gain: float, config: LocalizationCheckConfig) -> NotLocated | None:

@@ -468,7 +468,8 @@ def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Sam
         pixels.append(seen[kept])
         log_z.append(np.log(points[kept, 2]))
         log_ray.append(np.log(np.linalg.norm(points[kept], axis=1)) - log_z[-1])
-    surfaces, joined = [view.surface for view in views], map(np.concatenate, (view_of, pixels, log_z, log_ray))
+    surfaces = [view.surface for view in views]
+    joined = np.concatenate(view_of), np.concatenate(pixels), np.concatenate(log_z), np.concatenate(log_ray)
     return _Samples(surfaces, *joined, unit)
 
 
@@ -502,7 +503,7 @@ def _find_shift(samples: _Samples, scale: float) -> tuple[tuple[float, float], f
 
 
 def _compute_gain(better: Array, samples: _Samples, scale: float) -> float:
-    """By how many standard deviations costs are lower in the mean; `better` (M,) is by how much, NaN: not compared."""
+    """Computes how many standard deviations costs are lower in the mean; `better` (M,): by how much, NaN: not compared."""
     better = better[np.isfinite(better)]
     spread = float(better.std()) / np.sqrt(max(samples.count_cells(scale), 1)) if len(better) else 0.0
     return float(better.mean()) / spread if spread > 0 else 0.0

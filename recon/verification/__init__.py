@@ -231,6 +231,11 @@ UNFIT_LENS = Refusal(
     "{name} does not have the lens that it was taken for, and with another only {inliers:.0f} % of its matches fit.",
     "Keep zoom and focus as they are and do not crop, or give the lens of {name} by --intrinsics.",
 )
+SHEARED = Refusal(
+    Code.AMBIGUOUS,
+    "{name} is sheared by at least {percent:.1f} % beside the others, as by a rolling shutter while the camera turns.",
+    "Leave it out, or take it again with the camera at rest.",
+)
 WEAKLY_JOINED = Refusal(
     Code.AMBIGUOUS,
     "The photographs fall into two parts that only {points} points join, and {inliers:.0f} % of the matches between "

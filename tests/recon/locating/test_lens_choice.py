@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -78,6 +79,25 @@ def test_an_image_that_was_made_square_is_not_placed_with_square_pixels(index, s
     query = query_warps.squeeze(image, camera[1], index, share)
     found = localize_image(known_place().landmarks, query.image)
     assert_right(query, found, camera)
+
+
+@pytest.mark.parametrize("shear", [0.01, -0.04])
+def test_the_shear_of_a_rolling_shutter_is_taken_out(shear):
+    """Focal length, aspect and principal point imitate it, and the pose slides along: up to 8 bounds off."""
+    image, camera = photograph(2)
+    height, width = image.shape[:2]
+    sheared = np.array([[1.0, shear, -shear * height / 2.0], [0.0, 1.0, 0.0]])
+    found = localize_image(
+        known_place().landmarks, np.asarray(cv2.warpAffine(image, sheared, (width, height)), np.uint8)
+    )
+    assert_right(Query(image, camera[1]), found, camera)
+    assert isinstance(found, Located) and found.shear == pytest.approx(shear, abs=0.002)
+    assert f"sheared by {100 * abs(found.shear):.1f} %" in found.sentence
+
+
+def test_an_image_without_shear_has_none():
+    _, found, _ = warped(2, "zoom 1.3")
+    assert isinstance(found, Located) and found.shear == 0.0
 
 
 def test_a_lens_that_bends_lines_is_estimated():

@@ -121,6 +121,22 @@ def test_a_picture_of_the_place_that_hangs_elsewhere_is_no_camera():
     }
 
 
+def test_a_sheared_image_is_named_and_left_out():
+    """As by a rolling shutter while the camera turns: it was published far off, or another cause was named."""
+    image = photographs()[3].image
+    height, width = image.shape[:2]
+    sheared = np.array([[1.0, 0.03, -0.015 * height], [0.0, 1.0, 0.0]])
+    warped = np.asarray(cv2.warpAffine(image, sheared, (width, height)), np.uint8)
+    photos = [replace(photo, image=warped) if index == 3 else photo for index, photo in enumerate(photographs())]
+    found = estimate(photos)
+    assert (found.verdict.code, found.verdict.frames) == (Code.AMBIGUOUS, (photos[3].name,))
+    assert "is sheared by at least" in found.verdict.message
+    left = run_fallbacks(found, (), ReconstructionConfig())
+    assert left.verdict.code is Code.OK_PARTIAL and left.camera_names == {photo.name for photo in photos} - {
+        photos[3].name
+    }
+
+
 def test_exif_that_cropped_images_contradict_is_not_used():
     """An editor that crops leaves EXIF as it was, which then tells too short a focal length of what is left."""
     crops = [crop_image(photo, 0.6, 0.5, 0.5) for photo in photographs()]
