@@ -53,6 +53,7 @@ class DepthNoise:
         for what, number in (("a_m", self.a_m), ("b_per_m", self.b_per_m), ("scale_sigma", self.scale_sigma)):
             if not 0 <= number <= _MOST_SIGMA:
                 raise ValueError(f"the noise of a depth image must have {what} of 0 to {_MOST_SIGMA:g}, got {number:g}")
+            object.__setattr__(self, what, float(number))  # NumPy's, which no message takes
         if self.a_m + self.b_per_m < _LEAST_SIGMA:
             raise ValueError("the noise of a depth image must be above 1 nm: give a_m, b_per_m or both")
 

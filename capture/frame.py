@@ -409,6 +409,9 @@ class Intrinsics:
                 f"distortion must be {what}, got {len(self.distortion)} numbers for the model {self.model}. "
                 "Calibrate with cv2.calibrateCamera, or cv2.fisheye.calibrate and model: fisheye."
             )
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):  # NumPy's numbers, as of a K, go into no message
+            object.__setattr__(self, name, (int if name in ("width", "height") else float)(getattr(self, name)))
+        object.__setattr__(self, "distortion", tuple(map(float, self.distortion)))
         if self.source not in SOURCES:
             raise ValueError(f"the source of intrinsics must be one of {', '.join(SOURCES)}, got {self.source[:40]!a}")
 

@@ -503,7 +503,7 @@ def _find_shift(samples: _Samples, scale: float) -> tuple[tuple[float, float], f
 
 
 def _compute_gain(better: Array, samples: _Samples, scale: float) -> float:
-    """Computes how many standard deviations costs are lower in the mean; `better` (M,): by how much, NaN: not compared."""
+    """Computes how many standard deviations costs are lower in the mean, by `better` (M,); NaN: not compared."""
     better = better[np.isfinite(better)]
     spread = float(better.std()) / np.sqrt(max(samples.count_cells(scale), 1)) if len(better) else 0.0
     return float(better.mean()) / spread if spread > 0 else 0.0

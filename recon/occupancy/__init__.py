@@ -293,6 +293,8 @@ THICKNESS = 0.015  # of the distance: points that near to a plane are on it
 LEAST_SHARE = 0.08  # of the surface that was seen
 MOST_BELOW = 0.02  # of the surface that was seen may lie below the floor
 LEAST_BELOW_CAMERAS = 0.1  # of the distance, by which every camera is above it
+GIVEN = "given"  # by the user: a direction of up that stays as it is
+MOST_LEANING = 1.5  # degrees of a floor in a frame whose z axis is up: 3 m away it is 8 cm off
 _TRIALS, _SAMPLE = 4000, 4000
 _POLISHED = (1.0, 0.5, 0.5)  # of THICKNESS: what is so near to the plane found so far is what the next is fitted to
 
@@ -305,6 +307,11 @@ class Floor:
     offset: float
     share: float  # of the surface that was seen
     tilt_deg: float = math.inf  # standard deviation of the normal, by how far its points spread and how thick they lie
+
+    def compute_leaning_deg(self, up: Array) -> float:
+        """Returns the angle between its normal and `up` (3,); 0 where it is so small that both may be the same."""
+        angle = float(np.degrees(np.arccos(np.clip(self.normal @ up, -1.0, 1.0))))
+        return angle if angle > max(MOST_LEANING, 2.0 * self.tilt_deg) else 0.0
 
     def height(self, point: Array, up: Array) -> float:
         """How far above the floor a point (3,) is, along `up` (3,)."""
@@ -408,8 +415,8 @@ def make_level_frame(
 ) -> Upright | None:
     """The map's frame with the x and y of a result whose frame has z up; None where it has not, or none can tell.
 
-    A base's and an upright frame have. That of given poses has where a floor is level in it. `points` (M, 3) are of
-    surfaces, `unit` is their median distance.
+    A base's and an upright frame have, unless a floor leans in it. That of given poses has where a floor is level in
+    it. `points` (M, 3) are of surfaces, `unit` is their median distance.
     """
     if frame.name is FrameName.FIRST_CAMERA:
         return None
@@ -417,25 +424,29 @@ def make_level_frame(
     floor = find_floor(points, Ts[:, :3, 3], z, unit, TILT_OF_GIVEN)
     if floor is None and frame.name is FrameName.ODOMETRY:
         return None
+    if floor is not None and floor.compute_leaning_deg(z):
+        return None  # z = 0 would be the floor below the first camera alone: obstacles elsewhere would lie in it
     T = np.eye(4)
     T[2, 3] = Ts[0, 2, 3] - (0.0 if floor is None else floor.height(Ts[0, :3, 3], z))
     return Upright(T, f"the z axis of the result's frame, {frame.name.value}", floor is not None)
 
 
 def upright(
-    Ts_world_camera: Sequence[Array], points: Array, given: Array | None, unit: float, source: str = "given"
+    Ts_world_camera: Sequence[Array], points: Array, given: Array | None, unit: float, source: str = GIVEN
 ) -> Upright:
     """The frame of a map of surface points (M, 3) that cameras (4, 4) saw from a median distance `unit`.
 
-    `given` (3,) is the direction of up in the world, if gravity or a tracker tells it, as `source` says. Else it is
-    the normal of the floor, and without one what keeps the cameras level. Raises ValueError where `given` is no
-    direction.
+    `given` (3,) is the direction of up in the world, if gravity or a tracker tells it, as `source` says. Else, or where
+    a floor leans in that, it is the normal of the floor, and without one what keeps the cameras level. What a user gave
+    stays. Raises ValueError where `given` is no direction.
     """
     Ts = np.stack(Ts_world_camera)
     guess, how = level(Ts)
     if given is not None:
         guess, how = _unit(given), source
     floor = find_floor(points, Ts[:, :3, 3], guess, unit, TILT if given is None else TILT_OF_GIVEN)
+    if floor is not None and given is not None and source != GIVEN and (leaning := floor.compute_leaning_deg(guess)):
+        guess, how = floor.normal, f"the floor, which leans by {leaning:.1f} degrees by {source}"
     if floor is not None and given is None:
         guess, how = floor.normal, f"the floor, a plane through {100 * floor.share:.0f} % of the surface that was seen"
     return Upright(_frame(Ts[0], guess, floor), how, floor is not None)
@@ -599,7 +610,7 @@ def occupancy_map(
     """
     seen = _load_depth_observations(snapshot)
     points, unit = _sample(seen)
-    told, how = _up(snapshot) if up is None else (up, "given")
+    told, how = _up(snapshot) if up is None else (up, GIVEN)
     Ts = [camera.T_world_camera for camera in snapshot.cameras]
     own = make_level_frame(Ts, points, unit, snapshot.scale.frame) if up is None else None
     frame = own or upright(Ts, points, told, unit, how)

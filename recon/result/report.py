@@ -72,7 +72,10 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "cameras": [make_camera_dict(camera) for camera in snapshot.cameras],
         "given_poses": _list_given_poses(snapshot.cameras),
         "frames_used": [camera.name for camera in snapshot.cameras],
-        "frames_dropped": [{"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped],
+        "frames_dropped": [
+            *({"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped),
+            *({"name": name, "reason": _UNPLACED} for name in _list_unplaced(snapshot)),
+        ],
         "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
         "moving": {name: round(share, 4) for name, share in snapshot.moving.items()},
         "gains": {name: [round(gain, 4) for gain in gains] for name, gains in snapshot.gains.items()},
@@ -235,6 +238,15 @@ def write_result_folder(
         further[RIG] = format_rig(snapshot.rig.mounts, snapshot.scale.metric).encode()
     write_result(snapshot, out, report, preview=preview, further=further)
     return report
+
+
+_UNPLACED = "it has no camera in the scene, as the verdict says"
+
+
+def _list_unplaced(snapshot: Snapshot) -> list[str]:
+    """The images of a published verdict that have no camera, in their order."""
+    known = {each.name for each in (*snapshot.cameras, *snapshot.dropped)}
+    return [name for name in snapshot.verdict.frames if name not in known] if snapshot.verdict.publishable else []
 
 
 def print_summary(snapshot: Snapshot, out: Path) -> None:

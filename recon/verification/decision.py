@@ -478,7 +478,8 @@ def accept(case: VerificationCase) -> Verdict:
     left_out = _find_unplaced_frames(case)
     rough = _describe_roughness(case)
     if rough:
-        message = f"{_summarize_placement(case)}, roughly: {rough}."
+        missing = f" No place was found for {', '.join(left_out)}." if left_out else ""
+        message = f"{_summarize_placement(case)}, roughly: {rough}.{missing}"
         found = Verdict(Code.OK_ROUGH, message, _advise_remedy(case), left_out, publishable=True)
     else:
         found = _accept_partial(case, left_out) if left_out else _accept_all(case)
@@ -542,9 +543,7 @@ def _accept_partial(case: VerificationCase, left_out: tuple[str, ...]) -> Verdic
     if any(len(part) > 1 for part in apart):
         return Verdict(
             Code.SPLIT,
-            f"{summary}; others show a place of their own: "
-            + "; ".join(", ".join(names[i] for i in part) for part in apart)
-            + ".",
+            f"{summary}; others show a place of their own: {'; '.join(', '.join(names[i] for i in p) for p in apart)}.",
             "Add photographs that connect the places, or take them one after the other.",
             left_out,
             publishable=True,

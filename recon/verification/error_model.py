@@ -392,6 +392,9 @@ def decide_posed(graph: ViewGraph, registration: Registration, given: GivenWorld
     return _naming(verdict, graph, given, placed)
 
 
+_LEAST_TRAVEL_PERCENT = 0.01  # of how far the camera moved, that is told
+
+
 def _rough(registration: Registration, worst: Bounds, config: DecisionConfig) -> str:
     """Says what is known less well than an exact scene knows it; empty where nothing is."""
     # What the given world leaves open for all cameras alike bends no scene.
@@ -399,9 +402,11 @@ def _rough(registration: Registration, worst: Bounds, config: DecisionConfig) ->
     travel_percent = 100.0 * float(np.nan_to_num(shape, nan=np.inf))
     if travel_percent <= config.exact_travel_percent and worst.rotation_deg <= config.exact_rotation_deg:
         return ""
+    # Two cameras are at their places whatever their errors, but for a similarity
+    travel = f" ({travel_percent:.2g} % of how far the camera moved)" if travel_percent >= _LEAST_TRAVEL_PERCENT else ""
     return (
-        f"positions are known to {worst.centre_percent:.2g} % of the distance to the scene ({travel_percent:.2g} % of "
-        f"how far the camera moved), directions to {worst.rotation_deg:.2g} degrees"
+        f"positions are known to {worst.centre_percent:.2g} % of the distance to the scene{travel}, directions to "
+        f"{worst.rotation_deg:.2g} degrees"
     )
 
 

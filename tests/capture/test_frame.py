@@ -81,3 +81,11 @@ def test_what_keeps_no_bounds_is_no_frame_and_is_left_out_with_the_reason(change
 def test_frame_size():
     frame = Frame(0, "a.jpg", 0, np.zeros((4, 5, 3), np.uint8), None)
     assert (frame.width, frame.height) == (5, 4)
+
+
+def test_intrinsics_of_numpy_numbers_are_plain_ones():
+    """As of a matrix K: no message takes NumPy's."""
+    K = np.array([[500.0, 0, 320], [0, 501.0, 240], [0, 0, 1]])
+    made = Intrinsics(np.int64(640), np.int64(480), K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given", tuple(np.zeros(4)))
+    numbers = made.width, made.height, made.fx, made.fy, made.cx, made.cy, *made.distortion
+    assert [type(number) for number in numbers] == [int, int, *[float] * 8]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from splatnode.capture.diorama import look_at
-from splatnode.recon.occupancy import find_floor, level, upright
+from splatnode.recon.occupancy import find_floor, level, make_level_frame, upright
+from splatnode.recon.result.verdict import FrameName, ReferenceFrame
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -84,3 +86,26 @@ def test_a_camera_that_looks_straight_down_has_a_frame():
     frame = upright([T], room(np.random.default_rng(0), 3000, 0, 0), UP, 1.5)
     assert frame.on_floor and np.allclose(frame.T_world_map[:3, 2], UP) and abs(frame.T_world_map[2, 3]) < 0.01
     assert np.allclose(frame.T_world_map[:3, 0], [0, 1, 0])  # its upper side
+
+
+def test_where_the_floor_leans_in_what_tells_up_heights_count_from_it():
+    """Below the first camera alone z would be 0 on it: a map called obstacles farther on free."""
+    points, Ts = room(np.random.default_rng(0), 3000, 6000, 9000), cameras(1.5, 1.6, 1.4)
+    leaning = np.array([np.sin(np.radians(4.5)), 0.0, np.cos(np.radians(4.5))])
+    told, given = upright(Ts, points, leaning, 3.0, "gravity"), upright(Ts, points, leaning, 3.0)
+    assert told.T_world_map[:3, 2] @ UP > np.cos(np.radians(0.3)) and told.on_floor
+    assert told.source.startswith("the floor, which leans by 4.") and told.source.endswith(" degrees by gravity")
+    assert np.allclose(given.T_world_map[:3, 2], leaning) and given.source == "given"
+    level_one = upright(Ts, points, np.array([0.01, 0.0, 1.0]), 3.0, "gravity")
+    assert level_one.source == "gravity"
+
+
+@pytest.mark.parametrize("name", [FrameName.ODOMETRY, FrameName.BASE])
+def test_a_frame_in_which_the_floor_leans_is_not_that_of_the_map(name):
+    points, Ts = room(np.random.default_rng(0), 3000, 6000, 9000), cameras(1.5, 1.6, 1.4)
+    turn = Rotation.from_euler("y", 4.5, degrees=True).as_matrix()
+    T = np.eye(4)
+    T[:3, :3] = turn
+    own = make_level_frame(Ts, points, 3.0, ReferenceFrame(name))
+    assert own is not None and own.on_floor and own.is_of_result
+    assert make_level_frame([T @ each for each in Ts], points @ turn.T, 3.0, ReferenceFrame(name)) is None

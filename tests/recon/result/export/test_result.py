@@ -60,6 +60,17 @@ def test_report_tells_what_happened():
     assert report["versions"]["numpy"] == np.__version__
 
 
+def test_an_image_that_the_verdict_leaves_out_is_among_the_dropped_ones():
+    snapshot = make_snapshot()
+    verdict = replace(snapshot.verdict, frames=("0001.jpg", "0003.jpg"))
+    report = build_report(replace(snapshot, verdict=verdict), seed=1, preset="fast", peak_rss_mb=100.0)
+    reason = "it has no camera in the scene, as the verdict says"
+    assert report["frames_dropped"] == [
+        {"name": "0001.jpg", "reason": "blurred"},
+        {"name": "0003.jpg", "reason": reason},
+    ]
+
+
 def test_refused_scene_is_not_published_and_replaces_an_earlier_one(tmp_path):
     write(make_snapshot(), tmp_path)
     (tmp_path / "transforms.json").write_text("edited by the user")
