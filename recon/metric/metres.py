@@ -401,7 +401,9 @@ def _find_upright(snapshot: Snapshot, _config: MetricConfig, _evidence: Evidence
     if up is None or up.sigma_deg > UNSURE_DEG:
         up = floor or up
     elif floor is not None and (apart := measure_angle_deg(up, floor)) > CONTRADICTED_DEG:
-        up = replace(up, source=f"{up.source}, which {floor.source} contradicts by {apart:.0f} degrees: check its sign")
+        source = f"{up.source}, which {floor.source} contradicts by {apart:.0f} degrees: check its sign"
+        T_frame_world = make_upright_frame(snapshot.cameras[0].T_world_camera, np.array(up.direction))
+        return _Found(T_frame_world, source, apart)  # either may be wrong: up is known no better
     if up is None or up.sigma_deg > MOST_DEG:
         known = "no image has gravity" if up is None else f"gravity is known to {up.sigma_deg:.2g} degrees alone"
         return _Missing(

@@ -150,6 +150,7 @@ def test_a_floor_tells_where_up_is_however_the_world_is_turned(turn):
     down = tuple((first[:3, :3].T @ UP).tolist())  # what an accelerometer at rest says: up, taken for down
     turned = apply_metric_scale(known, asked("upright", metric=False, gravity=down))
     assert "contradicts by 180 degrees: check its sign" in (turned.scale.frame.source or "")
+    assert turned.scale.frame.sigma_deg == pytest.approx(180.0, abs=3.0), "one of them is wrong"
     unconfirmed = replace(known, gaussians=replace(seen, source_frame=np.full(count, -1)))
     assert apply_metric_scale(unconfirmed, asked("upright", metric=False)).verdict.code is Code.FRAME_UNKNOWN
 
