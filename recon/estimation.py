@@ -24,7 +24,7 @@ from splatnode.recon.keyframes import (
     mask_bars,
     resize_image,
 )
-from splatnode.recon.locating.localize import collect_landmarks, find_sheared_image
+from splatnode.recon.locating.localize import collect_landmarks, measure_shears
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.metric.depth_alignment import place_beside, place_by_depth
@@ -170,6 +170,7 @@ class Reconstruction:
     evidence: Evidence | None  # None where there is nothing to verify
     verdict: Verdict
     pointmaps: Mapping[str, Pointmap] = field(default_factory=dict)  # by keyframe; none until depth is estimated
+    shears: Mapping[str, float] = field(default_factory=dict)  # pixels across for one down, by image, where measured
 
     @property
     def publishable(self) -> bool:
@@ -202,6 +203,7 @@ class Reconstruction:
         found = shape_bounds(predict_bounds(self.evidence, FITTED.select_model(self.evidence).claims), covariances)
         if self.registration.rig is not None:
             found |= compute_placed_bounds(self.graph, self.registration, self.registration.rig, found)
+        found = {name: _allow_for_shear(each, self.shears.get(name, 0.0)) for name, each in found.items()}
         wider = PROVISIONALLY_WIDER if self.verdict.provisional else 1.0
         return {name: bounds.widen(wider) for name, bounds in found.items()}
 
@@ -340,10 +342,13 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
     evidence = verify(graph, seen, config.verification, run)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
-    verdict = _refuse_sheared(graph, seen, verdict)
+    is_told = verdict.code in _OF_SHEARED and seen is not None and len(seen.cameras) > _MOST_ALIKE
+    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or is_told) else {}
+    verdict = _name_sheared(verdict, shears) if is_told else verdict
     if registration is not None and registration.rig is not None:
         verdict = describe_rig(verdict, graph, registration.rig)
-    return Reconstruction(graph, registration if verdict.publishable else seen, evidence, verdict)
+    kept = registration if verdict.publishable else seen
+    return Reconstruction(graph, kept, evidence, verdict, shears=shears)
 
 
 # What an image that is sheared among others may be taken for, where there are enough of them to tell which one it is
@@ -351,16 +356,29 @@ _OF_SHEARED = Code.AMBIGUOUS, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY
 _MOST_ALIKE = 3  # cameras with which a sheared one may agree by bending the scene
 
 
-def _refuse_sheared(graph: ViewGraph, registration: Registration | None, verdict: Verdict) -> Verdict:
-    """The refusal of a sheared image, in place of an answer with it, or of what it looks like; else `verdict`."""
-    if registration is None:
+_MOST_SHEAR = 0.01  # by which an image that is named is sheared, and differs from most others
+_LEAST_SHEAR = 0.003  # below, bounds allow for it
+_SHEAR_DEG = 57.3  # of a camera's direction for a shear of 1: a turn about the axis takes up half of it
+
+
+def _name_sheared(verdict: Verdict, shears: Mapping[str, float]) -> Verdict:
+    """The refusal of the image that is sheared most, where it stands out, in place of what it looks like.
+
+    What all images have alike, as of one pan, does not count.
+    """
+    middle = float(np.median(list(shears.values()))) if shears else 0.0
+    found = [(name, shear) for name, shear in shears.items() if min(abs(shear), abs(shear - middle)) > _MOST_SHEAR]
+    if not found:
         return verdict
-    is_told = verdict.code in _OF_SHEARED and len(registration.cameras) > _MOST_ALIKE
-    sheared = find_sheared_image(graph, registration) if verdict.publishable or is_told else None
-    if sheared is None:
-        return verdict
-    name, shear = sheared
+    name, shear = max(found, key=lambda each: abs(each[1]))
     return verification.refuse(verification.SHEARED, (name,), name=name, percent=100.0 * abs(shear))
+
+
+def _allow_for_shear(bounds: Bounds, shear: float) -> Bounds:
+    """The bounds of a camera whose image is sheared: the rows are of different directions."""
+    if abs(shear) < _LEAST_SHEAR:
+        return bounds
+    return replace(bounds, rotation_deg=float(np.hypot(bounds.rotation_deg, _SHEAR_DEG * shear)))
 
 
 def _estimate_without_exif(found: Reconstruction, config: ReconstructionConfig, run: RunContext) -> Reconstruction:

@@ -219,24 +219,12 @@ _OF_STRETCHED, _MORE_STRETCHED = (Reason.ELSEWHERE, Reason.INCONSISTENT, Reason.
 
 # Points of an image that two others see, by which its shear is measured; of more, an even choice
 LEAST_CONFIRMED, _MOST_CONFIRMED = 60, 400
-# By which an image is sheared, and differs from most others; of right windows of six scenes no image reaches half of it
-MOST_SHEAR = 0.01
+_SIGMAS = 1.0  # of a shear: it widens bounds, and names what was refused
 _SETTLED = pose_refinement.PoseSearchConfig(rounds=2)
 
 
-def find_sheared_image(graph: ViewGraph, registration: Registration) -> tuple[str, float] | None:
-    """The name and the shear of the registered image that is sheared most, where it stands out among the others.
-
-    What all images have alike, as of one pan, does not count.
-    """
-    shears = _measure_shears(graph, registration)
-    middle = float(np.median(list(shears.values()))) if shears else 0.0
-    found = [(name, shear) for name, shear in shears.items() if min(abs(shear), abs(shear - middle)) > MOST_SHEAR]
-    return max(found, key=lambda each: abs(each[1]), default=None)
-
-
-def _measure_shears(graph: ViewGraph, registration: Registration) -> dict[str, float]:
-    """The shears of registered images, by name, as `verification.measure_shear` has them; few points measure none."""
+def measure_shears(graph: ViewGraph, registration: Registration) -> dict[str, float]:
+    """Measures the shears of registered images, by name, as `verification.measure_shear`; few points measure none."""
     shears: dict[str, float] = {}
     times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
     for camera in registration.cameras:
@@ -269,7 +257,7 @@ def _measure_shears(graph: ViewGraph, registration: Registration) -> dict[str, f
             log_aspect=float(np.log(camera.focals[0] / camera.focals[1])),
         )
         model = CameraModel(rotation, -rotation @ camera.T_world_camera[:3, 3], lens)
-        shears[graph.keyframes[camera.index].name] = verification.measure_shear(judged, model)
+        shears[graph.keyframes[camera.index].name] = verification.measure_shear(judged, model, _SIGMAS)
     return shears
 
 

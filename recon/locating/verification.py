@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.recon.keyframes import REFERENCE_SIDE
 from splatnode.recon.locating import NORMAL_95, LensSource, LocalizationBounds, NotLocated, Reason, pose_refinement
 from splatnode.recon.locating.pose_refinement import (
+    CORRELATED,
     POSE,
     CameraFit,
     CameraModel,
@@ -411,14 +412,15 @@ def check_stated_focal(lens: Lens, stated_focal: float, config: LocalizationChec
 
 _SHEAR_STEP, _MOST_SHEAR = 0.01, 0.1  # of the shears that are tried: pixels across for one down
 _COST_SIGMAS = 3.0  # of a residual, from which on it counts less
+_SIGMA_GAIN = CORRELATED / _COST_SIGMAS**2  # of the cost, for a standard deviation: CORRELATED points count as one
 
 
-def measure_shear(judged: QueryContext, camera: CameraModel) -> float:
+def measure_shear(judged: QueryContext, camera: CameraModel, sigmas: float = 3.0) -> float:
     """Measures the pixels across for one down by which an image is sheared, as by a rolling shutter in a turn.
 
     Focal length, aspect, principal point and distortion imitate a shear in part, and the pose slides along. So with
     each shear taken out all of them are found anew from `camera` on, and the one with the least cost of all
-    correspondences counts.
+    correspondences counts; 0 where it lowers the cost by less than so many standard deviations do.
     """
     cameras, costs = {0: camera}, dict[int, float]()
 
@@ -435,7 +437,9 @@ def measure_shear(judged: QueryContext, camera: CameraModel) -> float:
     before, at, after = cost(best - 1, best), costs[best], cost(best + 1, best)
     bend = before - 2.0 * at + after
     aside = 0.5 * (before - after) / bend if bend > 0 and math.isfinite(bend) else 0.0
-    return _SHEAR_STEP * (best + float(np.clip(aside, -0.5, 0.5)))
+    aside = float(np.clip(aside, -0.5, 0.5))
+    gain = costs[0] - at + (0.5 * bend * aside**2 if aside else 0.0)
+    return _SHEAR_STEP * (best + aside) if gain >= sigmas**2 * _SIGMA_GAIN else 0.0
 
 
 def straighten(case: PoseHypothesis, shear: float) -> PoseHypothesis | None:

@@ -13,8 +13,20 @@ from tests.api.conftest import SMALL
 QUICK = {"optimize": {"iterations": 5}}
 TRUE = [T for T, _ in synthetic.scene_cameras(SMALL)]
 APART = float(np.linalg.norm(TRUE[3][:3, 3] - TRUE[0][:3, 3]))
-MOUNT = np.array([[0.0, 0.0, 1.0, 0.3], [-1.0, 0.0, 0.0, 0.1], [0.0, -1.0, 0.0, 1.2], [0.0, 0.0, 0.0, 1.0]])
 UP = np.array([0.0, 0.0, 1.0])
+
+
+def _mount() -> np.ndarray:
+    """T_base_camera (4, 4) of the first camera on a base that stands level: x ahead of it, z up."""
+    ahead = TRUE[0][:3, 2] - (TRUE[0][:3, 2] @ UP) * UP
+    x = ahead / np.linalg.norm(ahead)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(UP, x), UP]) @ TRUE[0][:3, :3]
+    T[:3, 3] = 0.3, 0.1, 1.2
+    return T
+
+
+MOUNT = _mount()
 
 
 def test_images_of_a_camera_on_a_base_and_what_is_written_of_them(arrays, tmp_path):

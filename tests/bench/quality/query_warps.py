@@ -91,6 +91,13 @@ def bend(image: Image, K: Array, _number: int, k1: float) -> Query:
     return Query(np.asarray(warped, np.uint8), K)
 
 
+def shear(image: Image, K: Array, _number: int, by: float) -> Query:
+    """The image with its rows shifted, `by` pixels across for one down: as by a rolling shutter in a turn."""
+    height, width = image.shape[:2]
+    moved = np.array([[1.0, by, -by * (K[1, 2] - 0.5)], [0.0, 1.0, 0.0]])
+    return Query(np.asarray(cv2.warpAffine(image, moved, (width, height), flags=cv2.INTER_CUBIC), np.uint8), K)
+
+
 def blur(image: Image, K: Array, _number: int, share: float) -> Query:
     """Motion blur across `share` of the width."""
     length = max(3, round(share * image.shape[1]))
@@ -120,6 +127,7 @@ WARPS: Mapping[str, Warp] = {
     "squeeze 0.75": partial(squeeze, share=0.75),
     "bend -0.15": partial(bend, k1=-0.15),
     "bend 0.1": partial(bend, k1=0.1),
+    **{f"shear {by}": partial(shear, by=by) for by in (0.01, -0.02, 0.04)},
     "blur 0.02": partial(blur, share=0.02),
     "collage": collage,
 }

@@ -19,6 +19,7 @@ QUERIES = {
     "black borders, at 75 %": ["letterbox 0.75"],
     "stretched by 1.1, squeezed to 75 %": ["stretch 1.1", "squeeze 0.75"],
     "bent by k1 −.15, .1": ["bend -0.15", "bend 0.1"],
+    "sheared by 1, 2, 4 %, as by a rolling shutter": ["shear 0.01", "shear -0.02", "shear 0.04"],
     "motion blur, 2 % of the width": ["blur 0.02"],
     "collage: halves changed places": ["collage"],
     "unchanged; without, with EXIF, with the lens": ["clean", "clean exif", "clean given"],
