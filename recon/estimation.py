@@ -342,9 +342,9 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
     evidence = verify(graph, seen, config.verification, run)
     give_back_memory()
     verdict = explain_refusal(decide(graph, seen, evidence, config.decision), graph)
-    is_told = verdict.code in _OF_SHEARED and seen is not None and len(seen.cameras) > _MOST_ALIKE
-    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or is_told) else {}
-    verdict = _name_sheared(verdict, shears) if is_told else verdict
+    may_be_sheared = verdict.code in _OF_SHEARED and seen is not None and len(seen.cameras) > _MOST_ALIKE
+    shears = measure_shears(graph, seen) if seen is not None and (verdict.publishable or may_be_sheared) else {}
+    verdict = _name_sheared(verdict, shears) if may_be_sheared else verdict
     if registration is not None and registration.rig is not None:
         verdict = describe_rig(verdict, graph, registration.rig)
     kept = registration if verdict.publishable else seen
@@ -354,11 +354,8 @@ def _register_and_verify(graph: ViewGraph, config: ReconstructionConfig, run: Ru
 # What an image that is sheared among others may be taken for, where there are enough of them to tell which one it is
 _OF_SHEARED = Code.AMBIGUOUS, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY
 _MOST_ALIKE = 3  # cameras with which a sheared one may agree by bending the scene
-
-
 _MOST_SHEAR = 0.01  # by which an image that is named is sheared, and differs from most others
 _LEAST_SHEAR = 0.003  # below, bounds allow for it
-_SHEAR_DEG = 57.3  # of a camera's direction for a shear of 1: a turn about the axis takes up half of it
 
 
 def _name_sheared(verdict: Verdict, shears: Mapping[str, float]) -> Verdict:
@@ -375,10 +372,10 @@ def _name_sheared(verdict: Verdict, shears: Mapping[str, float]) -> Verdict:
 
 
 def _allow_for_shear(bounds: Bounds, shear: float) -> Bounds:
-    """The bounds of a camera whose image is sheared: the rows are of different directions."""
+    """The bounds of a camera whose image is sheared: a turn about the axis by half of the angle takes up most of it."""
     if abs(shear) < _LEAST_SHEAR:
         return bounds
-    return replace(bounds, rotation_deg=float(np.hypot(bounds.rotation_deg, _SHEAR_DEG * shear)))
+    return replace(bounds, rotation_deg=float(np.hypot(bounds.rotation_deg, np.degrees(shear))))
 
 
 def _estimate_without_exif(found: Reconstruction, config: ReconstructionConfig, run: RunContext) -> Reconstruction:

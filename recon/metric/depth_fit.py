@@ -263,15 +263,15 @@ def _fit_samples(camera_id: str, views: Sequence[DepthView], samples: _Samples, 
     known = np.isfinite(ratio)
     if known.sum() < LEAST_POINTS:
         return _explain_few(views, int(known.sum()))
-    noise = float(np.median(_compute_told_noise(views, samples)[known]))
-    if noise > _MOST_NOISE:
-        return _explain_noise(camera_id, names, int(known.sum()), noise)
+    count, told = int(known.sum()), float(np.median(_compute_told_noise(views, samples)[known]))
+    if told > _MOST_NOISE:
+        return _explain_noise(camera_id, names, count, told)
+    if _is_along_ray(samples, scale):
+        return _explain_rays(camera_id, names, count)
     mean, mean_sigma = _average(ratio[known], sigma[known])
     agreeing = float((np.abs(ratio[known] - mean) < _AGREEING_SIGMAS * sigma[known]).mean())
     shift, gain = _find_shift(samples, scale)
-    check = _judge(camera_id, len(names), int(known.sum()), agreeing, shift, gain)
-    if _is_along_ray(samples, scale):
-        return _blame_rays(check, names)
+    check = _judge(camera_id, len(names), count, agreeing, shift, gain)
     parted = _test_parts(check, names, samples, ratio - mean, sigma)
     if parted.code is not DepthCode.FITS:
         bending, left = _find_bending(samples, scale)
@@ -295,7 +295,12 @@ def _explain_noise(camera_id: str, names: tuple[str, ...], count: int, noise: fl
         f"{name_depth_images(len(names), camera_id)} were left out: by their noise a depth is known to "
         f"{100 * noise:.0f} % only, so that the images can test none. Check their unit, or tell their noise"
     )
-    return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
+    return _leave_out(DepthCode.UNTESTED, message, camera_id, names, count)
+
+
+def _leave_out(code: DepthCode, message: str, camera_id: str, names: tuple[str, ...], num_points: int) -> DepthFit:
+    """The fit of depth images that count for nothing, for the reason that the message tells."""
+    return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(code, message, camera_id, num_points))
 
 
 def _is_along_ray(samples: _Samples, scale: float) -> bool:
@@ -311,14 +316,13 @@ def _is_along_ray(samples: _Samples, scale: float) -> bool:
     return _compute_gain(better, samples, scale) > _LEAST_GAIN
 
 
-def _blame_rays(check: DepthCheck, names: tuple[str, ...]) -> DepthFit:
+def _explain_rays(camera_id: str, names: tuple[str, ...], count: int) -> DepthFit:
     """The fit of depth images that hold distances along the ray."""
     message = (
-        f"{name_depth_images(len(names), check.camera_id)} are distances along the rays, not depths along the camera's "
+        f"{name_depth_images(len(names), camera_id)} are distances along the rays, not depths along the camera's "
         "axis, so they were left out. Divide each by the length of its ray at depth 1"
     )
-    found = DepthCheck(DepthCode.CONTRADICTS, message, check.camera_id, check.num_points)
-    return DepthFit(check.camera_id, names, 1.0, float("inf"), found)
+    return _leave_out(DepthCode.CONTRADICTS, message, camera_id, names, count)
 
 
 def _fit_robustly(factors: Array, values: Array, sigmas: Array) -> Array:
@@ -386,7 +390,7 @@ def _explain_no_common_unit(
         f"{name_depth_images(len(names), camera_id)} were left out: they have no common unit: {which}. Check "
         "that each depth image goes with its photograph, and that all have the same unit"
     )
-    return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
+    return _leave_out(DepthCode.UNTESTED, message, camera_id, names, count)
 
 
 def _test_parts(check: DepthCheck, names: Sequence[str], samples: _Samples, off: Array, sigma: Array) -> DepthCheck:
@@ -432,7 +436,7 @@ def _find_bending(samples: _Samples, scale: float) -> tuple[float, Array]:
     found = _fit_robustly(factors, ratio[known], sigma[known])
     off = np.abs(ratio[known] - factors @ found) / sigma[known]
     bending = float(found[1])
-    if abs(bending) > _MOST_BENDING:
+    if (off > _CUT).all() or abs(bending) > _MOST_BENDING:
         return 0.0, ratio
     straight = replace(samples, log_z=samples.log_z + bending * log_z)
     shift, gain = _find_shift(straight, scale)
@@ -451,8 +455,7 @@ def _blame_cameras(check: DepthCheck, names: tuple[str, ...], bending: float) ->
         f"far {100 * abs(np.expm1(-bending * np.log(2.0))):.0f} % too {'far' if bending < 0 else 'near'}, as a wrong "
         "focal length makes it. Give the lens (--intrinsics FILE; Python: intrinsics=)"
     )
-    untested = DepthCheck(DepthCode.UNTESTED, message, check.camera_id, check.num_points)
-    return DepthFit(check.camera_id, names, 1.0, float("inf"), untested)
+    return _leave_out(DepthCode.UNTESTED, message, check.camera_id, names, check.num_points)
 
 
 def _collect_samples(views: Sequence[DepthView], unit: float, step: int) -> _Samples:
@@ -561,7 +564,7 @@ def _explain_few(views: Sequence[DepthView], count: int) -> DepthFit:
     message = f"{who} have a depth at {count} points of the images; {LEAST_POINTS} are needed to use them"
     if (doubt := next(doubts, None)) is not None:
         message += f": {doubt}"
-    return DepthFit(camera_id, names, 1.0, float("inf"), DepthCheck(DepthCode.UNTESTED, message, camera_id, count))
+    return _leave_out(DepthCode.UNTESTED, message, camera_id, names, count)
 
 
 def describe_doubtful_units(frames: Iterable[Frame | DroppedFrame]) -> str:

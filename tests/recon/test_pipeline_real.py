@@ -49,7 +49,8 @@ def real(shared: Path, name: str, views: int | None = None, step: int = 1) -> tu
 )
 def test_real_cameras_are_near_the_truth(shared, name, rotation_deg, centre_pct):
     _, found, verdict = real(shared, name, views=6)
-    assert verdict.code in (Code.OK, Code.OK_ROUGH)  # how narrow bounds are, bench fit decides
+    # Bounds of llff_fern, whose photographs are taken side by side, are near the limit of what is called rough
+    assert verdict.code == Code.OK or (name, verdict.code) == ("llff_fern", Code.OK_ROUGH)
     assert found.rotation_deg <= rotation_deg and found.rotation_pair_deg <= 2 * rotation_deg
     assert found.centre_pct <= centre_pct
 
