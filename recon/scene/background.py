@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import cv2
@@ -183,6 +183,9 @@ def _frames(directions: Array) -> Array:
 # a far background, which lies beyond all cameras, or it would be a wall before those that look at the scene from its
 # other side. Where points of another colour fall on it, something nearer stands before them: it gets a depth
 # close to the camera.
+#
+# The way of the cameras is free: whoever carried them went along it. A depth that would put a surface onto it, seen by
+# one view alone and often from the other side of the scene, would veil every new view from there.
 
 Mask = npt.NDArray[np.bool_]
 
@@ -191,6 +194,9 @@ GAP_PX = 5  # gaps of this size between the points of another view count as cove
 NEAREST_PERCENTILE = 2.0  # of a view's known depths: its nearest depth, of which this part may be wrong
 DATA_WEIGHT = 10.0  # of a known inverse depth of confidence 1, against smoothness of weight 1 between neighbours
 MIN_LINK = 1e-3  # weight of smoothness across the strongest edge: nothing is cut off from all known depths
+PATH_NEIGHBOURS = 2  # other cameras, the nearest ones, to which the path goes on from each camera
+PATH_STEP = 1.2  # factor by which a depth on the path grows until it lies beside or beyond it,
+MAX_PATH_STEPS = 12  # at most so often: then it is left open, as no guess
 MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or farther than all known ones of its view
 
 
@@ -206,6 +212,8 @@ class DepthCompletionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     # An unknown background lies outside the sphere around the middle of the cameras whose radius is so many times the
     # distance of the farthest one
     surround: float = 2.0
+    # No unknown surface is nearer to the path of the cameras than this many times the nearest known depth there
+    clearance: Internal[float] = 1.0
     confidence: float = 0.1  # that filled depths get
     most_partners: int = 16  # other views that a view is compared with, at most: those that share most with it
     reduction: int = 4  # the smooth depth is found at 1 / `reduction` of the resolution
@@ -228,6 +236,7 @@ def complete(
     partners = priors.find_overlapping(known, config.most_partners)
     smooth = map_parallel(partial(_smooth, config=config), known, images)
     beyond = _leave_cameras(known, config.surround)
+    path = _find_free_path(known, config.clearance)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         others = [(completed[i], blurred[i]) for i in partners[j]]
@@ -242,7 +251,8 @@ def complete(
         filling = smooth[j]
         if filling is None or not hole.any():
             continue
-        for guess in _propose_fills(pointmaps[j], known[j], (filling, beyond[j]), covered, occluder, config):
+        guesses = filling, beyond[j]
+        for guess in _propose_fills(pointmaps[j], known[j], guesses, hole, covered, occluder, path, config):
             guess = guess.apply_mask(hole)
             guess = guess.apply_mask(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
             filled = guess.depth > 0
@@ -260,18 +270,76 @@ def _propose_fills(
     doubtful: Pointmap,
     known: Pointmap,
     guesses: tuple[Float32, Float32],
+    hole: Mask,
     covered: Mask,
     occluder: Mask,
+    path: _FreePath,
     config: DepthCompletionConfig,
 ) -> Iterator[Pointmap]:
-    """The point maps that a hole may be filled from, the best first; `guesses` are smooth depths, and those beyond."""
+    """The point maps that a `hole` (h, w) may be filled from, the best first.
+
+    `guesses` are smooth depths, and those beyond. What is filled meanwhile may be taken out of `hole`.
+    """
     smooth, beyond = guesses
     near, far = np.percentile(known.depth[known.depth > 0], [NEAREST_PERCENTILE, 100.0])
-    yield doubtful
+    yield _leave_path(doubtful.apply_mask(hole), path)
     facing = _facing_camera(known)
-    yield replace(facing, depth=smooth).apply_mask(~covered)
+    yield _leave_path(replace(facing, depth=smooth).apply_mask(hole & ~covered), path)
     yield replace(facing, depth=np.maximum(beyond, np.float32(config.background_depth * far))).apply_mask(~covered)
     yield replace(facing, depth=np.full_like(smooth, config.foreground_depth * near)).apply_mask(occluder)
+
+
+@dataclass(frozen=True, eq=False)
+class _FreePath:
+    """The space that the cameras went through: all points within a radius of the segments between neighbours."""
+
+    starts: Array  # (S, 3) world
+    ends: Array  # (S, 3) world
+    radii: Array  # (S,)
+
+    def contains(self, points: Array) -> Mask:
+        """(M,) whether world points (M, 3) lie there."""
+        along = self.ends - self.starts
+        squared_length = (along**2).sum(1)
+        dot = points @ along.T - (self.starts * along).sum(1)  # (M, S), as is all that follows
+        share = np.clip(dot / np.maximum(squared_length, 1e-18), 0.0, 1.0)
+        to_start = (points**2).sum(1)[:, None] - 2.0 * points @ self.starts.T + (self.starts**2).sum(1)
+        return (to_start - share * (2.0 * dot - share * squared_length) < self.radii**2).any(1)
+
+
+def _find_free_path(pointmaps: Sequence[Pointmap], clearance: float) -> _FreePath:
+    """The path of the cameras, as wide as the nearest known depth of its two cameras leaves, times `clearance`.
+
+    A segment leads from each camera to its PATH_NEIGHBOURS nearest ones. The nearest depth is NEAREST_PERCENTILE of
+    the known ones; 0 where none is known.
+    """
+    centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
+    known = [pointmap.depth[pointmap.depth > 0] for pointmap in pointmaps]
+    nearest = np.array([np.percentile(depth, NEAREST_PERCENTILE) if len(depth) else 0.0 for depth in known])
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(distances, np.inf)
+    neighbours = np.argsort(distances, axis=1, kind="stable")[:, : min(PATH_NEIGHBOURS, len(centres) - 1)]
+    pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(neighbours.tolist()) for j in row})
+    first, second = np.array(pairs, int).reshape(-1, 2).T
+    return _FreePath(centres[first], centres[second], clearance * np.minimum(nearest[first], nearest[second]))
+
+
+def _leave_path(guess: Pointmap, path: _FreePath) -> Pointmap:
+    """The point map with the depths of points on the path moved away from the camera until they have left it."""
+    rows, columns = np.nonzero(guess.depth)
+    rays = _compute_rays(guess.K, *guess.depth.shape[::-1])[rows, columns] @ guess.T_world_camera[:3, :3].T
+    depths, centre = guess.depth[rows, columns], guess.T_world_camera[:3, 3]
+    left = np.arange(len(depths))
+    for _ in range(MAX_PATH_STEPS):
+        left = left[path.contains(centre + depths[left, None] * rays[left])]
+        if not len(left):
+            break
+        depths[left] *= np.float32(PATH_STEP)
+    else:
+        depths[left] = 0.0
+    moved = guess.depth.copy()
+    moved[rows, columns] = depths
+    return replace(guess, depth=moved).apply_mask(moved > 0)
 
 
 def _leave_cameras(pointmaps: Sequence[Pointmap], surround: float) -> list[Float32]:

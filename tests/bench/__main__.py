@@ -48,6 +48,7 @@ BENCHMARKS = {
         "fisheyes",
         "light",
         "drift",
+        "free_path",
         "told_lenses",
         "told_light",
         "vignetting",

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from splatnode.recon.priors import Pointmap
 from splatnode.recon.scene.background import (
     DepthCompletionConfig,
+    _find_free_path,
     _leave_cameras,
     complete,
     smooth_depth,
@@ -38,6 +40,18 @@ def wall(depth: float = 2.0, x: float = 0.0, confidence: float = 0.8) -> Pointma
 
 def slanted() -> Pointmap:
     return plane_pointmap(np.eye(4), (0.36, 0.48, -0.8), (0, 0, 2), WIDTH, HEIGHT)
+
+
+def looking(T_world_camera: np.ndarray, depth: float) -> Pointmap:
+    """The wall at that depth before a camera that stands anywhere."""
+    return replace(wall(depth), T_world_camera=T_world_camera, frame_id=1)
+
+
+def facing_each_other(distance: float) -> np.ndarray:
+    """T_world_camera of a camera so far before that at the origin, and turned to it."""
+    opposite = np.diag([-1.0, 1.0, -1.0, 1.0])
+    opposite[2, 3] = distance
+    return opposite
 
 
 @pytest.mark.parametrize("pointmap", [wall(), slanted()], ids=["facing", "slanted"])
@@ -137,15 +151,42 @@ def test_the_background_lies_outside_the_sphere_around_the_cameras():
 
 
 def test_of_cameras_that_look_at_each_other_it_lies_behind_the_other():
-    opposite = np.diag([-1.0, 1.0, -1.0, 1.0])
-    opposite[2, 3] = 4.0
-    both = [wall(), replace(wall(), T_world_camera=opposite, frame_id=1)]
+    both = [wall(), looking(facing_each_other(4.0), 2.0)]
     assert all(depth.min() > 4.0 for depth in _leave_cameras(both, DepthCompletionConfig().surround))
 
 
 def test_cameras_beside_each_other_leave_the_background_where_it_was():
     near = _leave_cameras([wall(), wall(x=0.3)], DepthCompletionConfig().surround)
     assert max(depth.max() for depth in near) < 1.5 * 2.0
+
+
+def test_no_guess_lies_where_another_camera_stands():
+    """A hole in a wall at 4, before which another camera, 4.2 away, sees nothing nearer than 1.5."""
+    near, far = wall(4.0), looking(facing_each_other(4.2), 1.5)
+    config = DepthCompletionConfig(most_partners=0)  # what hides surfaces of the other view is another matter
+    filled, _ = complete([without(near, HOLE), far], [GREY, GREY], config)
+    path = _find_free_path([near, far], 1.0)
+    assert path.contains(near.points[HOLE]).all()
+    assert not path.contains(filled.points[HOLE]).any()
+    assert filled.depth[HOLE].min() > 4.2  # behind the other camera, not before it
+    assert filled.depth[HOLE].max() < 4.2 + 1.3 * 1.5  # no farther than need be
+    touching = msgspec.structs.replace(config, clearance=0.0)
+    as_before, _ = complete([without(near, HOLE), far], [GREY, GREY], touching)
+    np.testing.assert_allclose(as_before.depth[HOLE], 4.0, rtol=0.01)
+
+
+def test_the_path_leads_from_camera_to_camera_and_is_as_wide_as_what_is_nearest_there():
+    row = [replace(wall(2.0, x=x), frame_id=i) for i, x in enumerate((0.0, 4.0, 8.0, 12.0))]
+    path = _find_free_path(row, 1.0)
+    points = np.array([[2.0, 0.0, 1.9], [2.0, 0.0, 2.1], [-1.9, 0.0, 0.0], [-2.1, 0.0, 0.0], [14.1, 0.0, 0.0]])
+    assert path.contains(points).tolist() == [True, False, True, False, False]
+    assert not _find_free_path(row, 0.0).contains(points).any()
+
+
+def test_a_camera_that_knows_no_depth_makes_no_path():
+    blind = without(wall(x=1.0), np.ones((HEIGHT, WIDTH), bool))
+    assert not _find_free_path([wall(), blind], 1.0).contains(np.array([[0.5, 0.0, 0.0]])).any()
+    assert not _find_free_path([wall()], 1.0).contains(np.zeros((1, 3))).any()
 
 
 def test_a_view_that_knows_nothing_stays_empty():
