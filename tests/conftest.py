@@ -13,6 +13,9 @@ from hypothesis import settings
 
 from tests.support.long_tests import LIST, is_long, parse_long_tests
 
+# As the command line does, before NumPy comes: matrices are small, and the threads of several processes collide.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 pytest_plugins = ["tests.support.processor_times", "tests.support.reuse", "tests.support.skip_check"]
 
 ROOT = Path(__file__).resolve().parent.parent

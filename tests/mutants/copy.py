@@ -116,7 +116,12 @@ class Copy:
 
     def _environment(self) -> Mapping[str, str]:
         shared = os.environ.get("SPLATNODE_SHARED", str(self._root.parent / "shared"))
-        own = {"PYTHONPATH": str(self.folder), "SPLATNODE_SHARED": shared, "PYTEST_ADDOPTS": ""}
+        own = {
+            "PYTHONPATH": str(self.folder),
+            "SPLATNODE_SHARED": shared,
+            "PYTEST_ADDOPTS": "",
+            "PYTHONPYCACHEPREFIX": "",
+        }
         return {**os.environ, **own}
 
     def _write(self, path: Path, text: str) -> None:
