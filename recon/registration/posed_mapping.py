@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from splatnode.recon.geometry import align_cameras, angles_deg, compute_rms_radius, cross_matrix
 from splatnode.recon.keyframes import Keyframe
@@ -160,7 +160,7 @@ class Residual:
     @property
     def sigmas(self) -> float:
         """The deviation of a normal variable that is as unlikely."""
-        return float(norm.isf(max(self.probability, _SMALLEST) / 2.0))
+        return float(-ndtri(max(self.probability, _SMALLEST) / 2.0))
 
 
 def residuals(
@@ -184,7 +184,7 @@ def residuals(
         variances, directions = np.linalg.eigh((of_residual + of_residual.T) / 2.0)
         counts = variances > _TOLD
         squared = float(((directions.T @ error)[counts] ** 2 / variances[counts]).sum())
-        probability = float(chi2.sf(squared, counts.sum())) if counts.any() else 1.0
+        probability = float(chdtrc(counts.sum(), squared)) if counts.any() else 1.0
         # An observation with the covariance I that is taken away moves x by C (I - C)^-1 (x - g)
         told = directions[:, counts]
         moved = known @ told @ ((told.T @ error) / variances[counts])

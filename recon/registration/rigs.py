@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from splatnode.capture.frame import Stamp
 from splatnode.capture.rig import FrameSet, Rig, RigCamera, form_frame_sets
@@ -139,7 +139,7 @@ def compare(one: tuple[Array, Array, Array], other: tuple[Array, Array, Array]) 
     """The probability that two poses, each with a covariance, differ as much by chance."""
     turn = Rotation.from_matrix(one[0] @ other[0].T).as_rotvec()
     error = np.concatenate([turn, one[1] - other[1]])
-    return float(chi2.sf(error @ np.linalg.solve(one[2] + other[2], error), 6))
+    return float(chdtrc(6, error @ np.linalg.solve(one[2] + other[2], error)))
 
 
 def is_mounted(poses: RelativePoses, distance: float) -> bool:
@@ -337,7 +337,7 @@ def _between(told: Told, first: str, camera: str, reference: str) -> tuple[Array
 
 def _turn_probability(seen: tuple[Array, Array, Array], given: tuple[Array, Array, Array]) -> float:
     turn = Rotation.from_matrix(seen[0] @ given[0].T).as_rotvec()
-    return float(chi2.sf(turn @ np.linalg.solve((seen[2] + given[2])[:3, :3], turn), 3))
+    return float(chdtrc(3, turn @ np.linalg.solve((seen[2] + given[2])[:3, :3], turn)))
 
 
 def _fit(seen: Told, given: Told, names: Sequence[str]) -> tuple[float, float, float] | None:
@@ -371,7 +371,7 @@ def _fit(seen: Told, given: Told, names: Sequence[str]) -> tuple[float, float, f
         if abs(step) < 1e-9:
             break
     left = max(1, 6 * len(cameras) - 1)
-    return scale, float(information**-0.5), float(chi2.sf(squared, left))
+    return scale, float(information**-0.5), float(chdtrc(left, squared))
 
 
 # Rigs: cameras that took their images together stand as they always do, by what is given or by all frame sets.
