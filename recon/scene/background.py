@@ -231,12 +231,12 @@ def complete(
 
     What one of `masks` (h, w) hides has no colour that tells: it is filled only where no other view's points fall.
     """
-    known = [pointmap.apply_mask(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+    known = _mask_doubtful(pointmaps, config)
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
     partners = priors.find_overlapping(known, config.most_partners)
     smooth = map_parallel(partial(_smooth, config=config), known, images)
     beyond = _leave_cameras(known, config.surround)
-    path = _find_free_path(known, config.clearance)
+    path = find_free_path(pointmaps, config)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         others = [(completed[i], blurred[i]) for i in partners[j]]
@@ -266,6 +266,10 @@ def complete(
     return completed
 
 
+def _mask_doubtful(pointmaps: Sequence[Pointmap], config: DepthCompletionConfig) -> list[Pointmap]:
+    return [pointmap.apply_mask(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+
+
 def _propose_fills(
     doubtful: Pointmap,
     known: Pointmap,
@@ -273,7 +277,7 @@ def _propose_fills(
     hole: Mask,
     covered: Mask,
     occluder: Mask,
-    path: _FreePath,
+    path: FreePath,
     config: DepthCompletionConfig,
 ) -> Iterator[Pointmap]:
     """The point maps that a `hole` (h, w) may be filled from, the best first.
@@ -290,7 +294,7 @@ def _propose_fills(
 
 
 @dataclass(frozen=True, eq=False)
-class _FreePath:
+class FreePath:
     """The space that the cameras went through: all points within a radius of the segments between neighbours."""
 
     starts: Array  # (S, 3) world
@@ -307,12 +311,13 @@ class _FreePath:
         return (to_start - share * (2.0 * dot - share * squared_length) < self.radii**2).any(1)
 
 
-def _find_free_path(pointmaps: Sequence[Pointmap], clearance: float) -> _FreePath:
-    """The path of the cameras, as wide as the nearest known depth of its two cameras leaves, times `clearance`.
+def find_free_path(pointmaps: Sequence[Pointmap], config: DepthCompletionConfig) -> FreePath:
+    """Finds the path of the cameras: `config.clearance` times as wide as what is nearest to its two cameras allows.
 
     A segment leads from each camera to its PATH_NEIGHBOURS nearest ones. The nearest depth is NEAREST_PERCENTILE of
     the known ones; 0 where none is known.
     """
+    pointmaps = _mask_doubtful(pointmaps, config)
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     known = [pointmap.depth[pointmap.depth > 0] for pointmap in pointmaps]
     nearest = np.array([np.percentile(depth, NEAREST_PERCENTILE) if len(depth) else 0.0 for depth in known])
@@ -321,10 +326,10 @@ def _find_free_path(pointmaps: Sequence[Pointmap], clearance: float) -> _FreePat
     neighbours = np.argsort(distances, axis=1, kind="stable")[:, : min(PATH_NEIGHBOURS, len(centres) - 1)]
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(neighbours.tolist()) for j in row})
     first, second = np.array(pairs, int).reshape(-1, 2).T
-    return _FreePath(centres[first], centres[second], clearance * np.minimum(nearest[first], nearest[second]))
+    return FreePath(centres[first], centres[second], config.clearance * np.minimum(nearest[first], nearest[second]))
 
 
-def _leave_path(guess: Pointmap, path: _FreePath) -> Pointmap:
+def _leave_path(guess: Pointmap, path: FreePath) -> Pointmap:
     """The point map with the depths of points on the path moved away from the camera until they have left it."""
     rows, columns = np.nonzero(guess.depth)
     rays = _compute_rays(guess.K, *guess.depth.shape[::-1])[rows, columns] @ guess.T_world_camera[:3, :3].T

@@ -21,8 +21,8 @@ from splatnode.recon.registration.registration import (
     corner_shift,
     undistort_keyframes,
 )
-from splatnode.recon.result.snapshot import decode_frame_id
-from splatnode.recon.scene import Gaussians, Scene, TrainingView, concatenate, initialization
+from splatnode.recon.result.snapshot import SHELL, decode_frame_id, find_confirmed
+from splatnode.recon.scene import Gaussians, Scene, TrainingView, background, concatenate, initialization
 from splatnode.recon.scene import exposure as scene_exposure
 from splatnode.recon.scene.exposure import compute_exposure_priors
 
@@ -41,7 +41,8 @@ def grow(
 
     `registration` and `pointmaps`, of which each of its cameras has one by name, are in the scene's world. A further
     view seeds Gaussians where none of its neighbours sees a surface better, as when a scene begins, and is brought to
-    the scene's light first. The far shell stays. `config.max_gaussians` does not count here; see `limit_gaussians`.
+    the scene's light first. Guesses on the path of its camera go. The far shell stays. `config.max_gaussians` does not
+    count here; see `limit_gaussians`.
     """
     known = {view.name for view in scene.views}
     registered = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
@@ -74,7 +75,16 @@ def grow(
     before = tuple(_update_consistent_depth(view, begun.views) for view in scene.views)
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)
     fresh = begun.gaussians.subset(torch.isin(decode_frame_id(begun.gaussians.source_frame), ids))
-    return replace(scene, views=before + views, gaussians=concatenate([scene.gaussians, fresh]))
+    stay = ~_find_guesses(scene.gaussians, background.find_free_path(seen, config.completion))
+    return replace(scene, views=before + views, gaussians=concatenate([scene.gaussians.subset(stay), fresh]))
+
+
+def _find_guesses(gaussians: Gaussians, path: background.FreePath) -> torch.Tensor:
+    """(N,) which Gaussians on that path no two views confirm."""
+    source = gaussians.source_frame.numpy()
+    guessed = ~find_confirmed(source) & (source != SHELL)
+    guessed[guessed] = path.contains(gaussians.means.detach().numpy()[guessed].astype(np.float64))
+    return torch.from_numpy(guessed)
 
 
 def remove_views(scene: Scene, names: Collection[str]) -> Scene:

@@ -11,9 +11,9 @@ import pytest
 from splatnode.recon.priors import Pointmap
 from splatnode.recon.scene.background import (
     DepthCompletionConfig,
-    _find_free_path,
     _leave_cameras,
     complete,
+    find_free_path,
     smooth_depth,
 )
 from tests.support.synthetic import plane_pointmap, without
@@ -165,7 +165,7 @@ def test_no_guess_lies_where_another_camera_stands():
     near, far = wall(4.0), looking(facing_each_other(4.2), 1.5)
     config = DepthCompletionConfig(most_partners=0)  # what hides surfaces of the other view is another matter
     filled, _ = complete([without(near, HOLE), far], [GREY, GREY], config)
-    path = _find_free_path([near, far], 1.0)
+    path = find_free_path([near, far], config)
     assert path.contains(near.points[HOLE]).all()
     assert not path.contains(filled.points[HOLE]).any()
     assert filled.depth[HOLE].min() > 4.2  # behind the other camera, not before it
@@ -177,16 +177,16 @@ def test_no_guess_lies_where_another_camera_stands():
 
 def test_the_path_leads_from_camera_to_camera_and_is_as_wide_as_what_is_nearest_there():
     row = [replace(wall(2.0, x=x), frame_id=i) for i, x in enumerate((0.0, 4.0, 8.0, 12.0))]
-    path = _find_free_path(row, 1.0)
+    path = find_free_path(row, DepthCompletionConfig())
     points = np.array([[2.0, 0.0, 1.9], [2.0, 0.0, 2.1], [-1.9, 0.0, 0.0], [-2.1, 0.0, 0.0], [14.1, 0.0, 0.0]])
     assert path.contains(points).tolist() == [True, False, True, False, False]
-    assert not _find_free_path(row, 0.0).contains(points).any()
+    assert not find_free_path(row, DepthCompletionConfig(clearance=0.0)).contains(points).any()
 
 
 def test_a_camera_that_knows_no_depth_makes_no_path():
     blind = without(wall(x=1.0), np.ones((HEIGHT, WIDTH), bool))
-    assert not _find_free_path([wall(), blind], 1.0).contains(np.array([[0.5, 0.0, 0.0]])).any()
-    assert not _find_free_path([wall()], 1.0).contains(np.zeros((1, 3))).any()
+    assert not find_free_path([wall(), blind], DepthCompletionConfig()).contains(np.array([[0.5, 0.0, 0.0]])).any()
+    assert not find_free_path([wall()], DepthCompletionConfig()).contains(np.zeros((1, 3))).any()
 
 
 def test_a_view_that_knows_nothing_stays_empty():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from splatnode.capture.frame import ExposureSettings
-from splatnode.recon.result.snapshot import decode_frame_id
+from splatnode.recon.result.snapshot import decode_frame_id, encode_unconfirmed
 from splatnode.recon.scene import background, exposure
 from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limit_gaussians, remove_views
 from splatnode.recon.scene.initialization import SceneInitializationConfig
@@ -53,6 +53,19 @@ def test_a_further_view_that_shares_too_little_has_the_light_that_its_camera_tel
         else:
             assert joined.exposure is not None and joined.exposure.gains == pytest.approx((expected,) * 3, rel=0.05)
             assert joined.image.mean() == pytest.approx(image.mean() / expected, rel=0.05)
+
+
+def test_guesses_where_a_further_camera_stands_go_and_what_two_views_saw_stays():
+    graph = graph_of(4)
+    scene = scene_of(3, graph)
+    there = torch.tensor([3 * STEP, 0.0, 0.1])  # just before the camera that comes
+    moved, guess = scene.gaussians.means.clone(), scene.gaussians.source_frame.clone()
+    moved[:2], guess[0], guess[1] = there, encode_unconfirmed(0), 0
+    scene = replace(scene, gaussians=replace(scene.gaussians, means=moved, source_frame=guess))
+    grown = grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT)
+    at = (grown.gaussians.means - there).norm(dim=1) < 1e-6
+    assert grown.gaussians.source_frame[at].tolist() == [0]
+    assert torch.equal(grown.gaussians.means[: len(moved) - 1], moved[1:])
 
 
 def test_without_a_further_view_nothing_changes():
