@@ -210,7 +210,7 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--interpolate-start",
         action="store_true",
-        help="seek a held-out view's pose from between its neighbours, not from the true one: 300 steps, three sizes",
+        help="seek a held-out view's pose from between its neighbours, not from the true one: 500 steps, three sizes",
     )
     parser.add_argument(
         "--color-correct",

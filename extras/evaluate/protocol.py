@@ -453,7 +453,7 @@ class Settings:
     best_gain: bool = False
 
 
-INTERPOLATED_START = Settings(alignment_steps=300, alignment_levels=3, start="interpolated")
+INTERPOLATED_START = Settings(alignment_steps=500, alignment_levels=3, start="interpolated")
 
 
 @dataclass(frozen=True)
