@@ -184,8 +184,9 @@ def _frames(directions: Array) -> Array:
 # other side. Where points of another colour fall on it, something nearer stands before them: it gets a depth
 # close to the camera.
 #
-# The way of the cameras is free: whoever carried them went along it. A depth that would put a surface onto it, seen by
-# one view alone and often from the other side of the scene, would veil every new view from there.
+# The path of the cameras is free: whoever carried them went along it. A depth that would put a surface onto it, seen by
+# one view alone and often from the other side of the scene, would veil every new view from there. The path is as wide
+# as known surfaces allow, so that a floor below it stays.
 
 Mask = npt.NDArray[np.bool_]
 
@@ -195,6 +196,7 @@ NEAREST_PERCENTILE = 2.0  # of a view's known depths: its nearest depth, of whic
 DATA_WEIGHT = 10.0  # of a known inverse depth of confidence 1, against smoothness of weight 1 between neighbours
 MIN_LINK = 1e-3  # weight of smoothness across the strongest edge: nothing is cut off from all known depths
 PATH_NEIGHBOURS = 2  # other cameras, the nearest ones, to which the path goes on from each camera
+PATH_STRIDE = 4  # pixels between the known points that tell how wide the path is
 PATH_STEP = 1.2  # factor by which a depth on the path grows until it lies beside or beyond it,
 MAX_PATH_STEPS = 12  # at most so often: then it is left open, as no guess
 MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or farther than all known ones of its view
@@ -212,7 +214,7 @@ class DepthCompletionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=T
     # An unknown background lies outside the sphere around the middle of the cameras whose radius is so many times the
     # distance of the farthest one
     surround: float = 2.0
-    # No unknown surface is nearer to the path of the cameras than this many times the nearest known depth there
+    # No unknown surface is nearer to the path of the cameras than this many times the nearest known one
     clearance: Internal[float] = 1.0
     confidence: float = 0.1  # that filled depths get
     most_partners: int = 16  # other views that a view is compared with, at most: those that share most with it
@@ -303,30 +305,51 @@ class FreePath:
 
     def contains(self, points: Array) -> Mask:
         """(M,) whether world points (M, 3) lie there."""
-        along = self.ends - self.starts
-        squared_length = (along**2).sum(1)
-        dot = points @ along.T - (self.starts * along).sum(1)  # (M, S), as is all that follows
-        share = np.clip(dot / np.maximum(squared_length, 1e-18), 0.0, 1.0)
-        to_start = (points**2).sum(1)[:, None] - 2.0 * points @ self.starts.T + (self.starts**2).sum(1)
-        return (to_start - share * (2.0 * dot - share * squared_length) < self.radii**2).any(1)
+        return (_squared_distances(points, self.starts, self.ends) < self.radii**2).any(1)
+
+
+def _squared_distances(points: Array, starts: Array, ends: Array) -> Array:
+    """(M, S) squared distances of points (M, 3) from segments with these ends (S, 3)."""
+    along = ends - starts
+    squared_length = (along**2).sum(1)
+    dot = points @ along.T - (starts * along).sum(1)
+    share = np.clip(dot / np.maximum(squared_length, 1e-18), 0.0, 1.0)
+    to_start = (points**2).sum(1)[:, None] - 2.0 * points @ starts.T + (starts**2).sum(1)
+    return to_start - share * (2.0 * dot - share * squared_length)
 
 
 def find_free_path(pointmaps: Sequence[Pointmap], config: DepthCompletionConfig) -> FreePath:
-    """Finds the path of the cameras: `config.clearance` times as wide as what is nearest to its two cameras allows.
+    """Finds the path of the cameras: `config.clearance` times as wide as what its cameras know allows.
 
-    A segment leads from each camera to its PATH_NEIGHBOURS nearest ones. The nearest depth is NEAREST_PERCENTILE of
-    the known ones; 0 where none is known.
+    A segment leads from each camera to its PATH_NEIGHBOURS nearest ones. It is as wide as the known points of each of
+    its two cameras are away from it, but for NEAREST_PERCENTILE of them; 0 where a camera knows none.
     """
-    pointmaps = _mask_doubtful(pointmaps, config)
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
-    known = [pointmap.depth[pointmap.depth > 0] for pointmap in pointmaps]
-    nearest = np.array([np.percentile(depth, NEAREST_PERCENTILE) if len(depth) else 0.0 for depth in known])
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     neighbours = np.argsort(distances, axis=1, kind="stable")[:, : min(PATH_NEIGHBOURS, len(centres) - 1)]
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(neighbours.tolist()) for j in row})
+    known = [_thin_points(pointmap) for pointmap in _mask_doubtful(pointmaps, config)]
+
+    def measure_width(pair: tuple[int, int]) -> float:
+        start, end = centres[[pair[0]]], centres[[pair[1]]]
+        if not all(len(known[each]) for each in pair):
+            return 0.0
+        squared = min(
+            float(np.percentile(_squared_distances(known[each], start, end), NEAREST_PERCENTILE)) for each in pair
+        )
+        return max(squared, 0.0) ** 0.5
+
     first, second = np.array(pairs, int).reshape(-1, 2).T
-    return FreePath(centres[first], centres[second], config.clearance * np.minimum(nearest[first], nearest[second]))
+    return FreePath(
+        centres[first], centres[second], config.clearance * np.array([measure_width(each) for each in pairs])
+    )
+
+
+def _thin_points(pointmap: Pointmap) -> Array:
+    """(M, 3) the world points of every PATH_STRIDE-th pixel along each axis whose depth is known."""
+    rows, columns = np.nonzero(pointmap.depth[::PATH_STRIDE, ::PATH_STRIDE])
+    return pointmap.points[::PATH_STRIDE, ::PATH_STRIDE][rows, columns].astype(np.float64)
 
 
 def _leave_path(guess: Pointmap, path: FreePath) -> Pointmap:

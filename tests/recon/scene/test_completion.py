@@ -54,6 +54,12 @@ def facing_each_other(distance: float) -> np.ndarray:
     return opposite
 
 
+def move_ahead(z: float) -> np.ndarray:
+    T = np.eye(4)
+    T[2, 3] = z
+    return T
+
+
 @pytest.mark.parametrize("pointmap", [wall(), slanted()], ids=["facing", "slanted"])
 def test_a_hole_in_a_plane_is_filled_on_the_plane(pointmap):
     config = DepthCompletionConfig()
@@ -161,18 +167,30 @@ def test_cameras_beside_each_other_leave_the_background_where_it_was():
 
 
 def test_no_guess_lies_where_another_camera_stands():
-    """A hole in a wall at 4, before which another camera, 4.2 away, sees nothing nearer than 1.5."""
-    near, far = wall(4.0), looking(facing_each_other(4.2), 1.5)
+    """A hole in a wall at 4, behind which another camera stands that looks to the side."""
+    aside = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 4.2], [0.0, 0.0, 0.0, 1.0]])
+    near, other = wall(4.0), looking(aside, 1.5)
     config = DepthCompletionConfig(most_partners=0)  # what hides surfaces of the other view is another matter
-    filled, _ = complete([without(near, HOLE), far], [GREY, GREY], config)
-    path = find_free_path([near, far], config)
-    assert path.contains(near.points[HOLE]).all()
-    assert not path.contains(filled.points[HOLE]).any()
+    holed = without(near, HOLE)
+    path = find_free_path([holed, other], config)
+    assert path.contains(near.points[HOLE].astype(float)).all()
+    filled, _ = complete([holed, other], [GREY, GREY], config)
+    assert not path.contains(filled.points[HOLE].astype(float)).any()
     assert filled.depth[HOLE].min() > 4.2  # behind the other camera, not before it
-    assert filled.depth[HOLE].max() < 4.2 + 1.3 * 1.5  # no farther than need be
+    assert filled.depth[HOLE].max() < 1.2 * (4.2 + path.radii.max())  # no farther than need be
     touching = msgspec.structs.replace(config, clearance=0.0)
-    as_before, _ = complete([without(near, HOLE), far], [GREY, GREY], touching)
+    as_before, _ = complete([holed, other], [GREY, GREY], touching)
     np.testing.assert_allclose(as_before.depth[HOLE], 4.0, rtol=0.01)
+
+
+def test_a_floor_below_the_path_stays():
+    """Two cameras, one behind the other, half a metre above a floor that each knows but for a hole."""
+    floor = [plane_pointmap(T, (0.0, -1.0, 0.0), (0.0, 0.5, 0.0), WIDTH, HEIGHT) for T in (np.eye(4), move_ahead(0.7))]
+    seen = [np.where(each.depth < 8.0, each.depth, 0.0).astype(np.float32) for each in floor]
+    known = [replace(each, depth=depth, frame_id=i) for i, (each, depth) in enumerate(zip(floor, seen, strict=True))]
+    hole = box(slice(40, 46), slice(26, 38)) & (known[0].depth > 0)
+    filled, _ = complete([without(known[0], hole), known[1]], [GREY, GREY], DepthCompletionConfig(most_partners=0))
+    np.testing.assert_allclose(filled.depth[hole], known[0].depth[hole], rtol=0.1)
 
 
 def test_the_path_leads_from_camera_to_camera_and_is_as_wide_as_what_is_nearest_there():
