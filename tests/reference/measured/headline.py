@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tests.reference.measured import race
-from tests.reference.measured.raw import average_over_sets, ends, percent, raw, require, table, thousands
+from tests.reference.measured.raw import ends, percent, raw, require, table
+from tests.reference.measured.scenes import describe_mean
 
 
 def headline() -> str:
@@ -72,10 +73,10 @@ def _bounds() -> list[tuple[str, str, str]]:
 
 def _presets() -> list[tuple[str, str, str]]:
     ours, theirs = (
-        f"{average_over_sets(rows, lambda row: row['psnr']):.1f} dB, "
-        f"{thousands(average_over_sets(rows, lambda row: row['num_gaussians']))} Gaussians, "
-        f"{average_over_sets(rows, lambda row: row['seconds']['total']):.0f} s"
-        for rows in (ends("bench_7sets", method=method) for method in ("balanced", "instantsplat-xl"))
+        f"{quality.split(' / ')[0]} dB, {count} Gaussians, {seconds} s"
+        for quality, count, seconds in (
+            describe_mean(ends("bench_7sets", method=method)) for method in ("balanced", "instantsplat-xl")
+        )
     )
     return [
         (
