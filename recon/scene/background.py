@@ -305,10 +305,10 @@ class FreePath:
 
     def contains(self, points: Array) -> Mask:
         """(M,) whether world points (M, 3) lie there."""
-        return (_squared_distances(points, self.starts, self.ends) < self.radii**2).any(1)
+        return (_square_distances(points, self.starts, self.ends) < self.radii**2).any(1)
 
 
-def _squared_distances(points: Array, starts: Array, ends: Array) -> Array:
+def _square_distances(points: Array, starts: Array, ends: Array) -> Array:
     """(M, S) squared distances of points (M, 3) from segments with these ends (S, 3)."""
     along = ends - starts
     squared_length = (along**2).sum(1)
@@ -336,7 +336,7 @@ def find_free_path(pointmaps: Sequence[Pointmap], config: DepthCompletionConfig)
         if not all(len(known[each]) for each in pair):
             return 0.0
         squared = min(
-            float(np.percentile(_squared_distances(known[each], start, end), NEAREST_PERCENTILE)) for each in pair
+            float(np.percentile(_square_distances(known[each], start, end), NEAREST_PERCENTILE)) for each in pair
         )
         return max(squared, 0.0) ** 0.5
 
