@@ -7,11 +7,11 @@ is between the marks of a page is made by `python -m tests.reference`: see tests
 from __future__ import annotations
 
 import re
-from statistics import mean
 
 from tests.conftest import ROOT
 from tests.reference.measured import race
 from tests.reference.measured.raw import ends, part, raw
+from tests.reference.measured.scenes import describe_mean
 
 MEASUREMENT, README = "docs/measurement.md", "README.md"
 
@@ -96,8 +96,7 @@ def test_a_simulated_batch():
 
 
 def test_what_a_thousand_recordings_take():
-    own = [row["seconds"]["total"] for row in ends("bench_7sets", method="balanced")]
-    seconds = round(mean(own))
+    seconds = int(describe_mean(ends("bench_7sets", method="balanced"))[2])
     hours = 1000 * seconds / 3600
     says(
         f"| {seconds} s |",
