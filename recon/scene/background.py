@@ -305,7 +305,8 @@ class FreePath:
 
     def contains(self, points: Array) -> Mask:
         """(M,) whether world points (M, 3) lie there."""
-        return (_square_distances(points, self.starts, self.ends) < self.radii**2).any(1)
+        nearer = _square_distances(points, self.starts, self.ends) < self.radii**2
+        return np.asarray(nearer.any(1), bool)
 
 
 def _square_distances(points: Array, starts: Array, ends: Array) -> Array:
