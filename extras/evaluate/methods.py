@@ -410,5 +410,5 @@ def estimate_frame_depths(frames: Sequence[Frame], seed: int) -> tuple[FrameWith
 
 def _fill_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     settings = background.DepthCompletionConfig()
-    known = pointmap.apply_mask(pointmap.confidence >= settings.min_confidence)
+    known = background.mask_doubtful(pointmap, settings)
     return np.where(known.depth > 0, known.depth, background.smooth_depth(known, image, settings)).astype(np.float32)

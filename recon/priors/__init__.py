@@ -43,6 +43,10 @@ class Pointmap:
         """(h, w, 3) world points; the camera's centre where the depth is unknown."""
         return compute_world_points(self.depth, self.T_world_camera, self.K)
 
+    def thin_points(self, step: int) -> npt.NDArray[np.float32]:
+        """(M, 3) the world points of every `step`-th pixel along each axis whose depth is known."""
+        return self.points[::step, ::step][self.depth[::step, ::step] > 0]
+
     def apply_mask(self, keep: npt.NDArray[np.bool_]) -> Pointmap:
         """The point map with depth and confidence 0, which is unknown, outside the mask `keep` (h, w).
 
@@ -89,10 +93,7 @@ def find_overlapping(pointmaps: Sequence[Pointmap], most: int) -> list[list[int]
     """
     if len(pointmaps) <= most + 1:
         return [[i for i in range(len(pointmaps)) if i != j] for j in range(len(pointmaps))]
-    thinned = [
-        pointmap.points[::OVERLAP_STEP, ::OVERLAP_STEP][pointmap.depth[::OVERLAP_STEP, ::OVERLAP_STEP] > 0]
-        for pointmap in pointmaps
-    ]
+    thinned = [pointmap.thin_points(OVERLAP_STEP) for pointmap in pointmaps]
     inside = np.array([[_count_inside(points, pointmap) for pointmap in pointmaps] for points in thinned])
     shared = inside + inside.T
     np.fill_diagonal(shared, -1)

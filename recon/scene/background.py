@@ -186,19 +186,22 @@ def _frames(directions: Array) -> Array:
 #
 # The path of the cameras is free: whoever carried them went along it. A depth that would put a surface onto it, seen by
 # one view alone and often from the other side of the scene, would veil every new view from there. The path is as wide
-# as known surfaces allow, so that a floor below it stays.
+# as known surfaces allow, so that a floor below it hardly moves.
 
 Mask = npt.NDArray[np.bool_]
 
 BLUR_PX = 5  # side of the blur before colours are compared: a pixel's noise and half a pixel's offset should not count
 GAP_PX = 5  # gaps of this size between the points of another view count as covered
-NEAREST_PERCENTILE = 2.0  # of a view's known depths: its nearest depth, of which this part may be wrong
+NEAREST_PERCENTILE = 2.0  # of a view's known depths, or distances: what is nearest, of which this part may be wrong
 DATA_WEIGHT = 10.0  # of a known inverse depth of confidence 1, against smoothness of weight 1 between neighbours
 MIN_LINK = 1e-3  # weight of smoothness across the strongest edge: nothing is cut off from all known depths
 PATH_NEIGHBOURS = 2  # other cameras, the nearest ones, to which the path goes on from each camera
 PATH_STRIDE = 4  # pixels between the known points that tell how wide the path is
-PATH_STEP = 1.2  # factor by which a depth on the path grows until it lies beside or beyond it,
-MAX_PATH_STEPS = 12  # at most so often: then it is left open, as no guess
+# Only what lies nearer to the path than so many times its distance from the camera that guesses it is moved: a wall
+# beside the path goes on, unknown, nearer to its own camera than all that is known there.
+PATH_SHARE = 0.5
+PATH_STEP = 1.2  # factor by which a depth on the path grows until it lies beside or beyond it
+MAX_PATH_STEPS = 12  # at most so often: a depth that is on the path even then is no guess
 MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or farther than all known ones of its view
 
 
@@ -233,12 +236,12 @@ def complete(
 
     What one of `masks` (h, w) hides has no colour that tells: it is filled only where no other view's points fall.
     """
-    known = _mask_doubtful(pointmaps, config)
+    known = [mask_doubtful(pointmap, config) for pointmap in pointmaps]
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
     partners = priors.find_overlapping(known, config.most_partners)
     smooth = map_parallel(partial(_smooth, config=config), known, images)
     beyond = _leave_cameras(known, config.surround)
-    path = find_free_path(pointmaps, config)
+    path = find_free_path(known, config.clearance)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         others = [(completed[i], blurred[i]) for i in partners[j]]
@@ -253,8 +256,9 @@ def complete(
         filling = smooth[j]
         if filling is None or not hole.any():
             continue
-        guesses = filling, beyond[j]
-        for guess in _propose_fills(pointmaps[j], known[j], guesses, hole, covered, occluder, path, config):
+        doubtful = replace(pointmaps[j], depth=_leave_path(pointmaps[j].depth * hole, pointmaps[j], path))
+        guesses = _leave_path(filling * (hole & ~covered), known[j], path), beyond[j]
+        for guess in _propose_fills(doubtful, known[j], guesses, covered, occluder, config):
             guess = guess.apply_mask(hole)
             guess = guess.apply_mask(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
             filled = guess.depth > 0
@@ -268,29 +272,25 @@ def complete(
     return completed
 
 
-def _mask_doubtful(pointmaps: Sequence[Pointmap], config: DepthCompletionConfig) -> list[Pointmap]:
-    return [pointmap.apply_mask(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+def mask_doubtful(pointmap: Pointmap, config: DepthCompletionConfig) -> Pointmap:
+    """Masks depths of less confidence than `config` wants of known ones."""
+    return pointmap.apply_mask(pointmap.confidence >= config.min_confidence)
 
 
 def _propose_fills(
     doubtful: Pointmap,
     known: Pointmap,
     guesses: tuple[Float32, Float32],
-    hole: Mask,
     covered: Mask,
     occluder: Mask,
-    path: FreePath,
     config: DepthCompletionConfig,
 ) -> Iterator[Pointmap]:
-    """The point maps that a `hole` (h, w) may be filled from, the best first.
-
-    `guesses` are smooth depths, and those beyond. What is filled meanwhile may be taken out of `hole`.
-    """
+    """The point maps that a hole may be filled from, the best first; `guesses` are smooth depths, and those beyond."""
     smooth, beyond = guesses
     near, far = np.percentile(known.depth[known.depth > 0], [NEAREST_PERCENTILE, 100.0])
-    yield _leave_path(doubtful.apply_mask(hole), path)
+    yield doubtful
     facing = _facing_camera(known)
-    yield _leave_path(replace(facing, depth=smooth).apply_mask(hole & ~covered), path)
+    yield replace(facing, depth=smooth).apply_mask(~covered)
     yield replace(facing, depth=np.maximum(beyond, np.float32(config.background_depth * far))).apply_mask(~covered)
     yield replace(facing, depth=np.full_like(smooth, config.foreground_depth * near)).apply_mask(occluder)
 
@@ -303,10 +303,16 @@ class FreePath:
     ends: Array  # (S, 3) world
     radii: Array  # (S,)
 
-    def contains(self, points: Array) -> Mask:
-        """(M,) whether world points (M, 3) lie there."""
-        nearer = _square_distances(points, self.starts, self.ends) < self.radii**2
-        return np.asarray(nearer.any(1), bool)
+    def contains(self, points: Array, centres: Array | None = None) -> Mask:
+        """(M,) whether world points (M, 3) lie there.
+
+        Of points that cameras at `centres`, (M, 3) or (3,), guessed, only those count that are nearer to the path than
+        PATH_SHARE of their distance from that camera.
+        """
+        radii = self.radii
+        if centres is not None:
+            radii = np.minimum(radii, PATH_SHARE * np.linalg.norm(points - centres, axis=1)[:, None])
+        return np.asarray((_square_distances(points, self.starts, self.ends) < radii**2).any(1), bool)
 
 
 def _square_distances(points: Array, starts: Array, ends: Array) -> Array:
@@ -319,56 +325,53 @@ def _square_distances(points: Array, starts: Array, ends: Array) -> Array:
     return to_start - share * (2.0 * dot - share * squared_length)
 
 
-def find_free_path(pointmaps: Sequence[Pointmap], config: DepthCompletionConfig) -> FreePath:
-    """Finds the path of the cameras: `config.clearance` times as wide as what its cameras know allows.
+def find_free_path(known: Sequence[Pointmap], clearance: float) -> FreePath:
+    """Finds the path of the cameras: `clearance` times as wide as the `known` depths of its cameras allow.
 
     A segment leads from each camera to its PATH_NEIGHBOURS nearest ones. It is as wide as the known points of each of
     its two cameras are away from it, but for NEAREST_PERCENTILE of them; 0 where a camera knows none.
     """
-    centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
+    centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in known])
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(distances, np.inf)
     neighbours = np.argsort(distances, axis=1, kind="stable")[:, : min(PATH_NEIGHBOURS, len(centres) - 1)]
     pairs = sorted({(min(i, j), max(i, j)) for i, row in enumerate(neighbours.tolist()) for j in row})
-    known = [_thin_points(pointmap) for pointmap in _mask_doubtful(pointmaps, config)]
-
-    def measure_width(pair: tuple[int, int]) -> float:
-        start, end = centres[[pair[0]]], centres[[pair[1]]]
-        if not all(len(known[each]) for each in pair):
-            return 0.0
-        squared = min(
-            float(np.percentile(_square_distances(known[each], start, end), NEAREST_PERCENTILE)) for each in pair
-        )
-        return max(squared, 0.0) ** 0.5
-
     first, second = np.array(pairs, int).reshape(-1, 2).T
-    return FreePath(
-        centres[first], centres[second], config.clearance * np.array([measure_width(each) for each in pairs])
-    )
+    starts, ends = centres[first], centres[second]
+    points = [pointmap.thin_points(PATH_STRIDE).astype(np.float64) for pointmap in known]
+    squared = [
+        min(_find_nearest_squared(points[each], starts[[segment]], ends[[segment]]) for each in pair)
+        for segment, pair in enumerate(pairs)
+    ]
+    return FreePath(starts, ends, clearance * np.sqrt(np.array(squared)))
 
 
-def _thin_points(pointmap: Pointmap) -> Array:
-    """(M, 3) the world points of every PATH_STRIDE-th pixel along each axis whose depth is known."""
-    rows, columns = np.nonzero(pointmap.depth[::PATH_STRIDE, ::PATH_STRIDE])
-    return pointmap.points[::PATH_STRIDE, ::PATH_STRIDE][rows, columns].astype(np.float64)
+def _find_nearest_squared(points: Array, start: Array, end: Array) -> float:
+    """NEAREST_PERCENTILE of the squared distances of points (M, 3) from one segment (1, 3); 0 without points."""
+    if not len(points):
+        return 0.0
+    return max(0.0, float(np.percentile(_square_distances(points, start, end), NEAREST_PERCENTILE)))
 
 
-def _leave_path(guess: Pointmap, path: FreePath) -> Pointmap:
-    """The point map with the depths of points on the path moved away from the camera until they have left it."""
-    rows, columns = np.nonzero(guess.depth)
-    rays = _compute_rays(guess.K, *guess.depth.shape[::-1])[rows, columns] @ guess.T_world_camera[:3, :3].T
-    depths, centre = guess.depth[rows, columns], guess.T_world_camera[:3, 3]
-    left = np.arange(len(depths))
+def _leave_path(depth: Float32, camera: Pointmap, path: FreePath) -> Float32:
+    """(h, w) the depths that `camera` guesses, those of points on the path moved away until they have left it.
+
+    0 stays 0: unknown. It is also what a depth becomes that MAX_PATH_STEPS do not suffice for.
+    """
+    rows, columns = np.nonzero(depth)
+    rays = _compute_rays(camera.K, *depth.shape[::-1])[rows, columns] @ camera.T_world_camera[:3, :3].T
+    moved, centre = depth[rows, columns], camera.T_world_camera[:3, 3]
+    inside = np.arange(len(moved))
     for _ in range(MAX_PATH_STEPS):
-        left = left[path.contains(centre + depths[left, None] * rays[left])]
-        if not len(left):
+        inside = inside[path.contains(centre + moved[inside, None] * rays[inside], centre)]
+        if not len(inside):
             break
-        depths[left] *= np.float32(PATH_STEP)
+        moved[inside] *= np.float32(PATH_STEP)
     else:
-        depths[left] = 0.0
-    moved = guess.depth.copy()
-    moved[rows, columns] = depths
-    return replace(guess, depth=moved).apply_mask(moved > 0)
+        moved[inside] = 0.0
+    left = depth.copy()
+    left[rows, columns] = moved
+    return left
 
 
 def _leave_cameras(pointmaps: Sequence[Pointmap], surround: float) -> list[Float32]:

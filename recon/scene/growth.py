@@ -21,7 +21,7 @@ from splatnode.recon.registration.registration import (
     corner_shift,
     undistort_keyframes,
 )
-from splatnode.recon.result.snapshot import SHELL, decode_frame_id, find_confirmed
+from splatnode.recon.result.snapshot import decode_frame_id, encode_unconfirmed
 from splatnode.recon.scene import Gaussians, Scene, TrainingView, background, concatenate, initialization
 from splatnode.recon.scene import exposure as scene_exposure
 from splatnode.recon.scene.exposure import compute_exposure_priors
@@ -75,16 +75,20 @@ def grow(
     before = tuple(_update_consistent_depth(view, begun.views) for view in scene.views)
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)
     fresh = begun.gaussians.subset(torch.isin(decode_frame_id(begun.gaussians.source_frame), ids))
-    stay = ~_find_guesses(scene.gaussians, background.find_free_path(seen, config.completion))
+    certain = [background.mask_doubtful(pointmap, config.completion) for pointmap in seen]
+    path = background.find_free_path(certain, config.completion.clearance)
+    stay = ~_find_guesses(scene, path)
     return replace(scene, views=before + views, gaussians=concatenate([scene.gaussians.subset(stay), fresh]))
 
 
-def _find_guesses(gaussians: Gaussians, path: background.FreePath) -> torch.Tensor:
+def _find_guesses(scene: Scene, path: background.FreePath) -> torch.Tensor:
     """(N,) which Gaussians on that path no two views confirm."""
-    source = gaussians.source_frame.numpy()
-    guessed = ~find_confirmed(source) & (source != SHELL)
-    guessed[guessed] = path.contains(gaussians.means.detach().numpy()[guessed].astype(np.float64))
-    return torch.from_numpy(guessed)
+    source, points = scene.gaussians.source_frame.numpy(), scene.gaussians.means.detach().double().numpy()
+    found = np.zeros(len(source), bool)
+    for view in scene.views:
+        own = np.flatnonzero(source == encode_unconfirmed(view.frame_id))
+        found[own] = path.contains(points[own], view.T_world_camera[:3, 3].double().numpy())
+    return torch.from_numpy(found)
 
 
 def remove_views(scene: Scene, names: Collection[str]) -> Scene:

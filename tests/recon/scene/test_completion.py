@@ -172,7 +172,7 @@ def test_no_guess_lies_where_another_camera_stands():
     near, other = wall(4.0), looking(aside, 1.5)
     config = DepthCompletionConfig(most_partners=0)  # what hides surfaces of the other view is another matter
     holed = without(near, HOLE)
-    path = find_free_path([holed, other], config)
+    path = find_free_path([holed, other], config.clearance)
     assert path.contains(near.points[HOLE].astype(float)).all()
     filled, _ = complete([holed, other], [GREY, GREY], config)
     assert not path.contains(filled.points[HOLE].astype(float)).any()
@@ -183,28 +183,48 @@ def test_no_guess_lies_where_another_camera_stands():
     np.testing.assert_allclose(as_before.depth[HOLE], 4.0, rtol=0.01)
 
 
-def test_a_floor_below_the_path_stays():
-    """Two cameras, one behind the other, half a metre above a floor that each knows but for a hole."""
-    floor = [plane_pointmap(T, (0.0, -1.0, 0.0), (0.0, 0.5, 0.0), WIDTH, HEIGHT) for T in (np.eye(4), move_ahead(0.7))]
-    seen = [np.where(each.depth < 8.0, each.depth, 0.0).astype(np.float32) for each in floor]
+def test_a_floor_below_the_path_hardly_moves():
+    """Two cameras, one 3 metres before the other, half a metre above a floor that each knows but for a hole."""
+    floor = [plane_pointmap(T, (0.0, -1.0, 0.0), (0.0, 0.5, 0.0), WIDTH, HEIGHT) for T in (np.eye(4), move_ahead(3.0))]
+    seen = [np.where((each.depth > 0) & (each.depth < 8.0), each.depth, np.float32(0.0)) for each in floor]
     known = [replace(each, depth=depth, frame_id=i) for i, (each, depth) in enumerate(zip(floor, seen, strict=True))]
-    hole = box(slice(40, 46), slice(26, 38)) & (known[0].depth > 0)
-    filled, _ = complete([without(known[0], hole), known[1]], [GREY, GREY], DepthCompletionConfig(most_partners=0))
-    np.testing.assert_allclose(filled.depth[hole], known[0].depth[hole], rtol=0.1)
+    hole = box(slice(40, 46), slice(26, 38))
+    assert known[0].depth[hole].min() > 0 and known[0].depth[hole].max() < 3.0  # before it reaches the second camera
+
+    def fill_floor(clearance: float) -> np.ndarray:
+        config = DepthCompletionConfig(most_partners=0, clearance=clearance)
+        filled, _ = complete([without(known[0], hole), known[1]], [GREY, GREY], config)
+        return filled.depth[hole] / known[0].depth[hole]
+
+    np.testing.assert_allclose(fill_floor(0.0), 1.0, rtol=0.1)
+    assert fill_floor(1.0).min() > 0.9 and fill_floor(1.0).max() < 1.3
+    assert fill_floor(3.0).max() > 2.0  # as wide as the nearest depth along the view
+
+
+def test_a_wall_beside_the_path_goes_on_nearer_than_what_is_known():
+    """A wall at 2 of which one of two cameras knows only what is far to the side."""
+    both = [wall(2.0), wall(2.0, x=0.3)]
+    hole = box(slice(0, HEIGHT), slice(0, 56))
+    config = DepthCompletionConfig(most_partners=0, clearance=2.0)
+    holed = without(both[0], hole)
+    path = find_free_path([holed, both[1]], config.clearance)
+    assert path.contains(both[0].points[hole].astype(float)).any()
+    filled, _ = complete([holed, both[1]], [GREY, GREY], config)
+    np.testing.assert_allclose(filled.depth[hole], 2.0, rtol=0.01)
 
 
 def test_the_path_leads_from_camera_to_camera_and_is_as_wide_as_what_is_nearest_there():
     row = [replace(wall(2.0, x=x), frame_id=i) for i, x in enumerate((0.0, 4.0, 8.0, 12.0))]
-    path = find_free_path(row, DepthCompletionConfig())
+    path = find_free_path(row, 1.0)
     points = np.array([[2.0, 0.0, 1.9], [2.0, 0.0, 2.1], [-1.9, 0.0, 0.0], [-2.1, 0.0, 0.0], [14.1, 0.0, 0.0]])
     assert path.contains(points).tolist() == [True, False, True, False, False]
-    assert not find_free_path(row, DepthCompletionConfig(clearance=0.0)).contains(points).any()
+    assert not find_free_path(row, 0.0).contains(points).any()
 
 
 def test_a_camera_that_knows_no_depth_makes_no_path():
     blind = without(wall(x=1.0), np.ones((HEIGHT, WIDTH), bool))
-    assert not find_free_path([wall(), blind], DepthCompletionConfig()).contains(np.array([[0.5, 0.0, 0.0]])).any()
-    assert not find_free_path([wall()], DepthCompletionConfig()).contains(np.zeros((1, 3))).any()
+    assert not find_free_path([wall(), blind], 1.0).contains(np.array([[0.5, 0.0, 0.0]])).any()
+    assert not find_free_path([wall()], 1.0).contains(np.zeros((1, 3))).any()
 
 
 def test_a_view_that_knows_nothing_stays_empty():
