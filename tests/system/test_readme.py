@@ -11,7 +11,7 @@ import re
 from tests.conftest import ROOT
 from tests.reference.measured import race
 from tests.reference.measured.raw import ends, part, raw
-from tests.reference.measured.scenes import describe_mean
+from tests.reference.measured.scenes import average_recipe
 
 MEASUREMENT, README = "docs/measurement.md", "README.md"
 
@@ -96,7 +96,7 @@ def test_a_simulated_batch():
 
 
 def test_what_a_thousand_recordings_take():
-    seconds = int(describe_mean(ends("bench_7sets", method="balanced"))[2])
+    seconds = round(average_recipe(ends("bench_7sets", method="balanced"))["seconds"])
     hours = 1000 * seconds / 3600
     says(
         f"| {seconds} s |",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tests.reference.measured import race
-from tests.reference.measured.raw import ends, percent, raw, require, table
-from tests.reference.measured.scenes import describe_mean
+from tests.reference.measured.raw import ends, percent, raw, require, table, thousands
+from tests.reference.measured.scenes import average_recipe
 
 
 def headline() -> str:
@@ -73,10 +73,8 @@ def _bounds() -> list[tuple[str, str, str]]:
 
 def _presets() -> list[tuple[str, str, str]]:
     ours, theirs = (
-        f"{quality.split(' / ')[0]} dB, {count} Gaussians, {seconds} s"
-        for quality, count, seconds in (
-            describe_mean(ends("bench_7sets", method=method)) for method in ("balanced", "instantsplat-xl")
-        )
+        f"{means['psnr']:.1f} dB, {thousands(means['num_gaussians'])} Gaussians, {means['seconds']:.0f} s"
+        for means in (average_recipe(ends("bench_7sets", method=method)) for method in ("balanced", "instantsplat-xl"))
     )
     return [
         (

@@ -64,18 +64,19 @@ def recipes() -> str:
     for method in METHODS:
         found = ends("bench_7sets", method=method)
         name = f"`{method}`" if found else f"`{method}`, older code"
-        rows.append((name, *describe_mean(found or ends("bench_7sets_before", method=method))))
+        means = average_recipe(found or ends("bench_7sets_before", method=method))
+        cost = thousands(means["num_gaussians"]), f"{means['seconds']:.0f}"
+        rows.append((name, scores(means, "lpips_alex"), *cost))
     return table(("", "PSNR / SSIM / LPIPS", "Gaussians", "s"), rows)
 
 
-def describe_mean(rows: list[dict[str, Any]]) -> tuple[str, str, str]:
-    """Returns scores, Gaussians, seconds as tables have them: means over sets; seconds where all methods have them."""
-    keys = ("psnr", "ssim", "lpips_alex")
-    quality = scores({key: average_over_sets(rows, lambda row, key=key: row[key]) for key in keys}, "lpips_alex")
+def average_recipe(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Returns means over sets: scores, Gaussians, and seconds of the sets in which all methods were timed alone."""
+    keys = ("psnr", "ssim", "lpips_alex", "num_gaussians")
+    means = {key: average_over_sets(rows, lambda row, key=key: row[key]) for key in keys}
     busy = {row["scene"] for row in ends("bench_7sets") if row["seconds"]["total"] is None}
     timed = [row for row in rows if row["scene"] not in busy]
-    seconds = average_over_sets(timed, lambda row: row["seconds"]["total"])
-    return quality, thousands(average_over_sets(rows, lambda row: row["num_gaussians"])), f"{seconds:.0f}"
+    return {**means, "seconds": average_over_sets(timed, lambda row: row["seconds"]["total"])}
 
 
 def recipe_losses() -> str:
