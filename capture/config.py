@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import former_names, keyframe_selection, reader
+from splatnode.capture import keyframe_selection, reader
 from splatnode.capture.frame import DroppedFrame, Frame, KeepAlive, Stamp, reduce_image, rigid_problem
 from splatnode.capture.keyframe_selection import Limits
 from splatnode.capture.masks import mask_frames, open_single_mask
@@ -31,6 +31,7 @@ from splatnode.capture.messaging.messages import (
 from splatnode.capture.messaging.network import CaptureId, Network
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Plugin
+from splatnode.capture.process.former_names import CAPTURE_KEYS
 from splatnode.capture.process.text import LONGEST_NAME, sanitize_text
 
 # Previews: small JPEG images of what the camera sees now. Some may be lost on the way.
@@ -119,7 +120,7 @@ class Camera(Plugin):
 class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Configures what a program of one's own sends in place of a camera: as CaptureConfig has it, without a camera."""
 
-    former_keys = former_names.KEYS
+    former_keys = CAPTURE_KEYS
 
     quality: Limits = Limits()
     selection: keyframe_selection.Config = keyframe_selection.Config()
@@ -136,7 +137,7 @@ class ProgramConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """All that can be configured in the capture room, with defaults and units."""
 
-    former_keys = former_names.KEYS
+    former_keys = CAPTURE_KEYS
 
     camera: Camera  # where frames come from: the kinds have options of their own, below
     quality: Limits = Limits()  # which frames are usable, and no copies

@@ -10,8 +10,9 @@ from msgspec import Meta
 
 from splatnode.capture.process import plugins
 from splatnode.capture.process.config import Internal, Plugin, build_config, merge_config, replace_former_names
+from splatnode.capture.process.former_names import RECONSTRUCTION_KEYS
 from splatnode.capture.rig import TOLERANCE_S
-from splatnode.recon import former_names, keyframes
+from splatnode.recon import keyframes
 from splatnode.recon.matching import view_graph as matching
 from splatnode.recon.metric import measurement as metric
 from splatnode.recon.optimize import ensemble, photometric_losses, training
@@ -61,7 +62,7 @@ class FallbackConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ReconstructionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    former_keys = former_names.KEYS
+    former_keys = RECONSTRUCTION_KEYS
 
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     # Of the generators of random numbers: the same seed and photographs give the same scene

@@ -27,15 +27,13 @@ from typing import Any, NoReturn
 import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
-from splatnode.capture import former_names as capture_names
-from splatnode.capture.process import plugins
+from splatnode.capture.process import former_names, plugins
 from splatnode.capture.process.arguments import Verb, replace_former_words
 from splatnode.capture.process.files import default_runtime_directory
 from splatnode.capture.process.library_lines import keep_last_words, tell_last_words
 from splatnode.capture.process.system import SHORT_OF_MEMORY, handle_first_signal, is_shortage, remedy
 from splatnode.capture.process.terminal import beneath, is_output_closed, sanitize_output, say, use_plain_lines
 from splatnode.capture.process.text import sanitize_lines, sanitize_text
-from splatnode.recon import former_names as recon_names
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -50,8 +48,8 @@ _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a clos
 # Of the core; further ones are entry points.
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
 # Hidden aliases: no help lists them
-FORMER_VERBS = recon_names.VERBS | capture_names.VERBS
-FORMER_FLAGS = recon_names.FLAGS | capture_names.FLAGS
+FORMER_VERBS = former_names.VERBS
+FORMER_FLAGS = former_names.FLAGS
 
 
 def main(argv: Sequence[str] | None = None) -> int:

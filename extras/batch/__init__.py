@@ -32,6 +32,7 @@ from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.process.arguments import replace_former_words
 from splatnode.capture.process.config import record_in, record_of
 from splatnode.capture.process.files import open_itself, read_bounded
+from splatnode.capture.process.former_names import FLAGS
 from splatnode.capture.process.system import SHORT_OF_MEMORY, outlast, raise_shortage
 from splatnode.capture.process.terminal import event
 from splatnode.capture.process.text import sanitize_name, sanitize_text
@@ -39,7 +40,6 @@ from splatnode.extras import lerobot
 from splatnode.extras.cameras.mcap import SUFFIX as MCAP
 from splatnode.extras.cameras.mcap import image_topics
 from splatnode.extras.jobs import NOT_RUN, Child, End, Limits, free_core, other_version, run_processes, wait_for_end
-from splatnode.recon.former_names import FLAGS
 from splatnode.recon.result.export.limits import read_json_file
 
 # batch.jsonl: what a batch is, then a line for each recording that came to an end. Lines are only added.

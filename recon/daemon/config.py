@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.messaging.network import Network
-from splatnode.recon import former_names
+from splatnode.capture.process.former_names import NODE_KEYS
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon.ingest import FrameSetConfig
 from splatnode.recon.daemon.relocalization import LocatorConfig
@@ -20,7 +20,7 @@ Positive = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    former_keys = former_names.NODE_KEYS
+    former_keys = NODE_KEYS
 
     network: Network = Network()  # the same as in capture's configuration
     reconstruction: Reconstruction = Reconstruction()

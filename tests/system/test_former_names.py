@@ -10,20 +10,19 @@ import msgspec
 import pytest
 
 from splatnode import command_line
-from splatnode.capture import former_names as capture_names
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.process import config as config_keys
+from splatnode.capture.process import former_names
 from splatnode.capture.process.arguments import replace_former_words
 from splatnode.capture.process.config import build_config, list_field_types, parse_config
-from splatnode.recon import former_names as recon_names
 from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.config import DaemonConfig
 
 REQUIRED = {"folder": "f", "file": "f", "part": "0"}  # by kinds of cameras
 TABLES = [
-    *((CaptureConfig, former, present) for former, present in capture_names.KEYS.items()),
-    *((ReconstructionConfig, former, present) for former, present in recon_names.KEYS.items()),
-    *((DaemonConfig, former, present) for former, present in recon_names.NODE_KEYS.items()),
+    *((CaptureConfig, former, present) for former, present in former_names.CAPTURE_KEYS.items()),
+    *((ReconstructionConfig, former, present) for former, present in former_names.RECONSTRUCTION_KEYS.items()),
+    *((DaemonConfig, former, present) for former, present in former_names.NODE_KEYS.items()),
 ]
 
 

@@ -11,8 +11,7 @@ import pytest
 import yaml
 
 from splatnode import command_line
-from splatnode.capture import former_names as capture_names
-from splatnode.recon import former_names
+from splatnode.capture.process import former_names
 from tests.conftest import ROOT
 from tests.system.test_pages import PAGES, text
 
@@ -20,7 +19,7 @@ LOOKED_AT = sorted(set(PAGES) - {"CHANGELOG.md", "docs/configuration.md"})  # wh
 RUN_VERBS = {"test", "check", "docs", "wheels", "release", "fuzz"}  # of ./run alone
 FLAGS_OF_OTHERS = {"--no-compile", "--find-links", "--all", "--serve", "--only", "--room", "--seed", "--pictures"}
 KEYS = set(re.findall(r"^\| `([\w.]+)` \| ", text("docs/configuration.md"), re.MULTILINE))
-FORMER_SECTIONS = {former for former in former_names.KEYS | former_names.NODE_KEYS if "." not in former}
+FORMER_SECTIONS = {former for former in former_names.RECONSTRUCTION_KEYS | former_names.NODE_KEYS if "." not in former}
 SECTIONS = {key.partition(".")[0] for key in KEYS if "." in key} | FORMER_SECTIONS
 OF_A_RIG = {"T_rig_camera", "sigma_m", "sigma_deg", "metric"}  # of a camera in rig.yaml (capture/rig.py)
 SUFFIXES = {"npz", "bt", "json", "pgm", "png", "yaml", "py"}  # occupancy.npz is no key of `occupancy`
@@ -119,7 +118,7 @@ def test_configurations_on_a_page_have_keys_that_there_are(page):
 def list_former_words() -> set[str]:
     """Flags and dotted keys of the release before, as a sentence may name them."""
     flags = {flag for flags in command_line.FORMER_FLAGS.values() for flag in flags}
-    tables = capture_names.KEYS | former_names.KEYS | former_names.NODE_KEYS
+    tables = former_names.CAPTURE_KEYS | former_names.RECONSTRUCTION_KEYS | former_names.NODE_KEYS
     sections = {former: present for former, present in tables.items() if "." not in former}
     keys = {re.sub(r"\[.*?\]", "", former) for former in tables if "." in former}
     moved = {
