@@ -50,9 +50,9 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     )
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
-        "splatnode.capture.former_names",
         "splatnode.capture.process.arguments",
         "splatnode.capture.process.files",
+        "splatnode.capture.process.former_names",
         "splatnode.capture.process.library_lines",
         "splatnode.capture.process.plugins",
         "splatnode.capture.process.python",
@@ -63,7 +63,6 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.verbs",
         "splatnode.command_line",
         "splatnode.extras.verbs",
-        "splatnode.recon.former_names",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.verbs",
         "splatnode.viewer.verbs",
