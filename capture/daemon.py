@@ -112,14 +112,15 @@ class _Listener(Subscriber):
         """Counts nothing: one heartbeat is enough."""
 
 
-def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, Any] | None]:
+def heartbeats(network: Network, wait_s: float = WAIT_S, only: str | None = None) -> dict[str, dict[str, Any] | None]:
     """The next heartbeat of each process by its room's name; None for one that is silent. Raises NotAllowed.
 
-    A capture beside others is `capture@left`, by its camera id.
+    A capture beside others is `capture@left`, by its camera id. `only` is the one to wait for; None: all.
     """
     with contextlib.ExitStack() as listening:
         services = {_name_capture(each): CAPTURE_STATUS.select_capture(each) for each in find_captures(network) or [""]}
         services["recon"] = RECON_STATUS
+        services = {room: each for room, each in services.items() if only in (None, room)}
         listeners = {room: listening.enter_context(_Listener(each, network)) for room, each in services.items()}
         found: dict[str, dict[str, Any] | None] = dict.fromkeys(listeners)
         deadline = time.monotonic() + wait_s

@@ -11,10 +11,12 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.long_tests import LIST, is_long, parse_long_tests
+from tests.support.long_tests import LIST, is_long, parse_long_tests, sum_long_tests
 
 # As the command line does, before NumPy comes: matrices are small, and the threads of several processes collide.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Tests start hundreds of processes, which would otherwise compile all modules each for itself.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 pytest_plugins = ["tests.support.processor_times", "tests.support.reuse", "tests.support.skip_check"]
 
@@ -62,8 +64,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.startswith(tuple(f"tests/{start}" for start in NUMERICAL)):
             item.add_marker("numerical")
-        if is_long(item.nodeid.removeprefix("tests/"), long_tests):
+        if is_long(_name(item), long_tests):
             item.add_marker("long")
+    # Processes that share the files end at about the same time if the longest come first.
+    seconds = sum_long_tests((_name(item) for item in items), long_tests)
+    items.sort(key=lambda item: -seconds[_name(item).partition("::")[0]])
+
+
+def _name(item: pytest.Item) -> str:
+    return item.nodeid.removeprefix("tests/")
 
 
 @pytest.fixture(scope="session")

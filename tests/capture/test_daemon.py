@@ -208,7 +208,9 @@ def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
     process = start(", loops: 1000")
     with KeyframeClient(network(tmp_path)) as client:
         wait_for(lambda: client.receive(0.05))  # a good one comes after those that are refused
-    status = wait_for(lambda: (it := heartbeats(network(tmp_path))["capture"]) and it["set_aside"] == 3 and it)
+    status = wait_for(
+        lambda: (it := heartbeats(network(tmp_path), only="capture")["capture"]) and it["set_aside"] == 3 and it
+    )
     assert [each["name"] for each in status["newest_set_aside"]] == ["old2.png", "old1.png", "old0.png"]
     assert "3 keyframes were set aside, the last: old2.png: refused by recon" in status["problem"]
     command = [sys.executable, "-m", "splatnode", "status", "--config", str(tmp_path / "capture.yaml")]
@@ -217,7 +219,7 @@ def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
     process.terminate()
     assert process.wait(60) == 0
     start(", loops: 1000")
-    status = wait_for(lambda: heartbeats(network(tmp_path))["capture"])
+    status = wait_for(lambda: heartbeats(network(tmp_path), only="capture")["capture"])
     assert status["set_aside"] == 3 and status["problem"] == ""
 
 
@@ -293,7 +295,7 @@ def test_status_tells_a_capture_that_has_finished_from_one_that_is_silent(tmp_pa
     )
     assert "recon: nothing heard of it" in told
     start(", loops: 1000")
-    wait_for(lambda: heartbeats(network(tmp_path))["capture"])
+    wait_for(lambda: heartbeats(network(tmp_path), only="capture")["capture"])
     assert last_run(network(tmp_path)) is None
 
 

@@ -6,6 +6,7 @@ A line is a folder, a file or a test, from tests/ on, and the processor seconds 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,3 +43,12 @@ def starts_with(test: str, start: str) -> bool:
 def is_long(test: str, long_tests: tuple[LongTest, ...]) -> bool:
     """`test` is a test's id from tests/ on."""
     return any(starts_with(test, each.start) for each in long_tests)
+
+
+def sum_long_tests(tests: Iterable[str], long_tests: tuple[LongTest, ...]) -> dict[str, float]:
+    """The processor seconds of each file's long tests; those of a folder count for each of its files."""
+    lines: dict[str, set[LongTest]] = {}
+    for test in tests:
+        named = {each for each in long_tests if starts_with(test, each.start)}
+        lines.setdefault(test.partition("::")[0], set()).update(named)
+    return {file: sum(each.processor_s for each in named) for file, named in lines.items()}

@@ -61,9 +61,9 @@ def test_fuzzing_gets_its_options(calls):
 @pytest.mark.parametrize(
     ("arguments", "given"),
     [
-        ([], "-n 2 --dist loadfile -m not long"),
-        (["--all"], "-n 2 --dist loadfile"),
-        (["--all", "-m", "long", "-x"], "-n 2 --dist loadfile -m long -x"),
+        ([], "-n 3 --dist loadfile --no-loadscope-reorder -m not long"),
+        (["--all"], "-n 3 --dist loadfile --no-loadscope-reorder"),
+        (["--all", "-m", "long", "-x"], "-n 3 --dist loadfile --no-loadscope-reorder -m long -x"),
         (["tests/recon/merging", "-x"], "tests/recon/merging -x"),
         (["-k", "merging"], "-k merging"),
     ],

@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import Clock, DroppedFrame, Frame, Intrinsics, Stamp, make_given_pose
+from splatnode.capture.messaging import keyframe_queue
 from splatnode.capture.messaging.keyframe_queue import (
     KeyframeClient,
     KeyframeServer,
@@ -117,7 +118,8 @@ def test_frames_arrive_in_order_and_leave_the_spool_when_acknowledged(tmp_path, 
         assert server.num_queued == 0 and client.duplicates == client.refused == server.refused == 0
 
 
-def test_a_new_recon_gets_what_the_old_one_had_not_acknowledged(tmp_path):
+def test_a_new_recon_gets_what_the_old_one_had_not_acknowledged(tmp_path, monkeypatch):
+    monkeypatch.setattr(keyframe_queue, "SILENT_S", 1.5)
     network, spool = ipc(tmp_path), open_spool(tmp_path)
     with KeyframeServer(network, spool) as server:
         for index in range(3):

@@ -48,7 +48,7 @@ def test_poses_of_keyframes_give_what_is_shown_and_what_is_written_metres(config
             peer.server.offer(frame)
         scene = peer.wait(finished(3), "a final scene").snapshot
         first = next(heard.snapshot for heard in peer.heard if len(heard.snapshot.cameras) == 3)
-        assert heartbeats(config.network)["recon"]["bounds"].count(" m")
+        assert heartbeats(config.network, only="recon")["recon"]["bounds"].count(" m")
     for shown in (first, scene):
         assert shown.scale.metric and shown.scale.source.startswith("poses of 3 photographs, known to ")
         low, high = shown.scale.interval_95

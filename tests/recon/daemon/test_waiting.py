@@ -42,7 +42,7 @@ def store_all(store, frames) -> list:
 
 def at_rest(config) -> bool:
     """Whether the node has nothing left to do."""
-    status = heartbeats(config.network, 1.0)["recon"]
+    status = heartbeats(config.network, 1.0, only="recon")["recon"]
     if status is None or status["state"] not in ("idle", "waiting", "lost") or status["delay_s"] > 0:
         return False
     return status["unfinished"] == 0 and all(not each["provisional"] for each in index(config))

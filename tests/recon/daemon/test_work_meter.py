@@ -120,7 +120,7 @@ def test_a_running_node_tells_what_it_does_and_what_is_left(config, peer):  # no
         while not any(each["left_s"] is not None and each["of"] == 2000 for each in told):
             assert time.monotonic() < deadline, told[-5:]
             peer.server.serve(0.01)
-            heard = heartbeats(config.network, 0.3)["recon"]
+            heard = heartbeats(config.network, 0.3, only="recon")["recon"]
             if heard is not None and heard["work"] is not None:
                 told.append(heard["work"])
         (line,) = [each for each in describe_heartbeat("recon", heard) if each.startswith("  now ")]
