@@ -27,6 +27,7 @@ from splatnode.recon.registration.mapping_problem import (
     Lens,
     MapperInput,
     MapperView,
+    OwnLens,
     Pair,
     Pairs,
     PartialMap,
@@ -359,6 +360,9 @@ def _errors(problem: MapperInput, estimate: bundle_adjustment.Problem) -> Array:
 
 _MAX_SPLITS = 4  # rounds in which views get lenses of their own
 _MAX_DOUBTED = 8  # views for which other focal lengths are tried at once
+# Of the focal length, and of the longer side for the principal point: an own lens that comes out nearer to the common
+# one is none, for those that are tried are at least 7 times as far from it
+_SAME_LENS = 0.01
 _DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
 _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
 # Of two maps, the median error of the matches of the better one over that of the other, from which on they explain them
@@ -594,12 +598,11 @@ def _separate_lenses(
         run.pause()
         before = finished
         for search in searches if _find_doubtful_views(problem, finished.map, config) else ():
-            found = search(problem, finished.map, config)
-            again = None if found is None else run_final_adjustment(*found, images, config.finishing)
-            if found is None or again is None:
+            found = search(problem, finished.map, images, config)
+            if found is None:
                 continue
-            if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
-                problem, finished = found[0], again
+            if _score_of(found[0], found[1].map, config) > _score_of(problem, finished.map, config):
+                problem, finished = found
         searches = [_try_other_focals]
         freed = self_calibration.free_lenses(problem, finished.map, finished.loss, config.own_lenses)
         if freed.refuting_views.any() or freed.displaced.any():
@@ -623,8 +626,8 @@ def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: Mapp
 
 
 def _try_coarse_lenses(
-    problem: MapperInput, partial: PartialMap, config: MapperConfig
-) -> tuple[MapperInput, PartialMap] | None:
+    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalMap] | None:
     """Both, with own lenses as a coarse search finds them; None where it finds none."""
     scale = float(np.median(problem.scale))
     noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
@@ -633,16 +636,39 @@ def _try_coarse_lenses(
     if not (freed.refuting_views.any() or freed.displaced.any()):
         return None
     problem, partial = self_calibration.split_lenses(problem, partial, freed, config.own_lenses)
+    return _finish_map(problem, partial, images, config)
+
+
+def _finish_map(
+    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalMap] | None:
     partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None
-    return problem, extend(problem, partial, config.incremental)
+    finished = run_final_adjustment(problem, extend(problem, partial, config.incremental), images, config.finishing)
+    return None if finished is None else (problem, finished)
 
 
 def _try_other_focals(
-    problem: MapperInput, partial: PartialMap, config: MapperConfig
-) -> tuple[MapperInput, PartialMap] | None:
-    """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits."""
+    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalMap] | None:
+    """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits.
+
+    None, too, where all of these lenses come out as the common one: then wrong matches are why the views hardly fit.
+    """
+    zoomed = _find_other_focals(problem, partial, config)
+    if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
+        return None
+    common, registered = partial.estimate.lens_of_camera, partial.registered
+    for view, lens in zoomed.items():
+        problem, partial = self_calibration.add_lens(problem, partial, view, lens.focal, lens.shift)
+    found = _finish_map(problem, partial, images, config)
+    if found is None or all(v in registered and _is_same_lens(*found, v, int(common[v])) for v in zoomed):
+        return None
+    return found
+
+
+def _find_other_focals(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> dict[int, OwnLens]:
     zoomed = {}
     for view in _find_doubtful_views(problem, partial, config)[:_MAX_DOUBTED]:
         # Points that the view helped to place where it does not belong must not speak for it.
@@ -656,14 +682,18 @@ def _try_other_focals(
         lens = mapping_problem.find_own_lens(problem, rest, view, config.incremental.resection)
         if lens is not None:
             zoomed[view] = lens
-    if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
-        return None
-    for view, lens in zoomed.items():
-        problem, partial = self_calibration.add_lens(problem, partial, view, lens.focal, lens.shift)
-    partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
-    if len(partial.estimate.points) < config.incremental.min_points:
-        return None
-    return problem, extend(problem, partial, config.incremental)
+    return zoomed
+
+
+def _is_same_lens(problem: MapperInput, finished: FinalMap, view: int, common: int) -> bool:
+    """Whether a view's own lens has come out as the common one."""
+    estimate = finished.map.estimate
+    own = estimate.lens_of_camera[view]
+    apart_px = float(np.linalg.norm(estimate.shifts[own] - estimate.shifts[common]))
+    same_focal = abs(estimate.log_focals[own] - estimate.log_focals[common]) < _SAME_LENS
+    return bool(
+        view in finished.map.registered and same_focal and apart_px < _SAME_LENS * problem.views[view].longer_side
+    )
 
 
 def _score_of(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> float:

@@ -220,7 +220,7 @@ def main() -> None:
         return
     cv2.setNumThreads(1)
     set_threads(1)
-    command = shlex.join(["python", "-m", "tests.bench", "query_lenses", *sys.argv[1:]])
+    command, commit = shlex.join(["python", "-m", "tests.bench", "query_lenses", *sys.argv[1:]]), head_commit()
     views = CHOSEN_ON | LEFT_OUT
     found: list[Trial] = []
     for name in args.scenes or views:
@@ -233,7 +233,7 @@ def main() -> None:
         names = load_split(folder, list(scene.paths), views[name]).test
         chosen = [names[i] for i in np.linspace(0, len(names) - 1, min(args.images, len(names))).round().astype(int)]
         found += trials(scene, landmarks, chosen, ("", "exif", "given") if args.told else ("",))
-        _write(args.out, found, command, head_commit())
+        _write(args.out, found, command, commit)
         print(name, json.dumps(summary([t for t in found if t.scene == name])), flush=True)
     print(json.dumps(summary(found)))
 

@@ -18,7 +18,7 @@ from splatnode.recon.registration import (
     multiview_geometry,
     self_calibration,
 )
-from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, OwnLens, PartialMap
 
 FOCAL = 900.0
 SIZE = (1024, 768)
@@ -415,3 +415,19 @@ def test_views_are_placed_on_points_that_the_last_adjustment_has_not_renumbered(
     assert incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], apart, incremental_mapper.MapperConfig())
     assert extended[-1][2] == 4, "one view is left"
     assert all(points == tracks for points, tracks, _ in extended)
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.03])
+def test_a_lens_of_its_own_that_comes_out_as_the_common_one_is_none(taken, pairs, monkeypatch, zoom):
+    """As where wrong matches alone are why a view hardly fits."""
+    pixels = [zoom * points if view == 2 else points for view, points in enumerate(taken.pixels)]
+    views = [MapperView(points, 0, max(SIZE)) for points in pixels]
+    tried = OwnLens(1.07 * FOCAL, np.array([0.0, 0.07 * max(SIZE)]))
+    monkeypatch.setattr(incremental_mapper, "_find_doubtful_views", lambda *_: [2])
+    monkeypatch.setattr(mapping_problem, "find_own_lens", lambda *_: tried)
+    monkeypatch.setattr(incremental_mapper, "_score_of", lambda problem, *_: float(len(problem.lenses)))
+    found = incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], pairs, incremental_mapper.MapperConfig())
+    assert found is not None
+    focals = np.exp(found.estimate.log_focals[found.estimate.lens_of_camera])
+    assert (found.estimate.lens_of_camera[2] == 0) == (zoom == 1.0)
+    np.testing.assert_allclose(focals[2] / focals[1], zoom, rtol=0.003)
