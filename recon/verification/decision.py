@@ -7,8 +7,7 @@ refuses gives the reason. A further check is a file with a function of a `Verifi
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,14 +18,13 @@ from splatnode.recon.keyframes import Rejected, longer_side
 from splatnode.recon.matching.pair_matching import TwoView, median_motion_px
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
-from splatnode.recon.result.verdict import Bounds, Code, Verdict, find_widest
+from splatnode.recon.result.verdict import Bounds, Code, Verdict
 from splatnode.recon.verification import DecisionConfig, Refusal, refit, refuse
 from splatnode.recon.verification.error_model import (
-    VerdictModel,
+    EvidenceCase,
     VerdictModels,
+    VerificationCase,
     compute_log_odds,
-    compute_travel_percent,
-    predict_bounds,
 )
 from splatnode.recon.verification.evidence import Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
@@ -201,66 +199,6 @@ def _motion_px(graph: ViewGraph, pair: Pair, view: TwoView) -> float:
 # Checks of registered poses, each of one piece of evidence: a refusal, or None where nothing speaks against them.
 #
 # A limit is asked so that NaN refuses: "not (value <= limit)", never "value > limit".
-
-
-@dataclass(frozen=True, eq=False)
-class EvidenceCase:
-    """The evidence of registered poses, and the numbers to judge it by."""
-
-    evidence: Evidence
-    config: DecisionConfig
-    numbers: VerdictModel
-
-    @cached_property
-    def bounds(self) -> Mapping[str, Bounds]:
-        """Returns the bounds of each camera's errors, by its name."""
-        return predict_bounds(self.evidence, self.numbers.claims)
-
-    @property
-    def widest_bounds(self) -> Bounds:
-        """The widest bound of each kind. Raises ValueError where there is no camera."""
-        found = find_widest(self.bounds.values())
-        if found is None:
-            raise ValueError("there must be a camera to be judged")
-        return found
-
-    @property
-    def travel_percent(self) -> float:
-        """The widest bound of a centre, of how far the camera moved."""
-        return compute_travel_percent(self.bounds, self.evidence)
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether what is known is as good as a right answer; else it is rough."""
-        worst, config = self.widest_bounds, self.config
-        return (
-            worst.rotation_deg <= config.exact_rotation_deg
-            and worst.focal_percent <= config.exact_focal_percent
-            and self.travel_percent <= config.exact_travel_percent
-        )
-
-    @property
-    def is_usable(self) -> bool:
-        """Whether the bounds are narrow enough for anything to be done with the cameras."""
-        worst, config = self.widest_bounds, self.config
-        return (
-            worst.rotation_deg <= config.max_rotation_deg
-            and worst.centre_percent <= config.max_centre_percent
-            and self.travel_percent <= config.max_travel_percent
-        )
-
-    @property
-    def names(self) -> list[str]:
-        """Returns the names of the frames that were placed."""
-        return [camera.name for camera in self.evidence.cameras]
-
-
-@dataclass(frozen=True, eq=False)
-class VerificationCase(EvidenceCase):
-    """Registered poses, and where they come from."""
-
-    graph: ViewGraph
-    registration: Registration
 
 
 def check_given_lens(case: EvidenceCase) -> Verdict | None:
@@ -786,7 +724,7 @@ def decide(
 ) -> Verdict:
     """OK, or another code that is publishable, or the reason why there is no scene.
 
-    `evidence` is that of `recon.verification.verify` for this registration, which `refuse_before_registration` let
+    `evidence` is that of `evidence.verify` for this registration, which `refuse_before_registration` let
     pass.
     """
     if registration is None or evidence is None or len(registration.cameras) < config.min_cameras:

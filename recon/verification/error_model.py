@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -444,3 +445,66 @@ def _residual(graph: ViewGraph, deviation: Deviation, placed: set[int]) -> str:
     done = "placed by the photographs alone" if deviation.index in placed else "left out"
     name = sanitize_text(graph.names[deviation.index])
     return f"that of {name} is {deviation.metres:.2g} m and {deviation.degrees:.2g} degrees off ({done})"
+
+
+# What a check of registered poses judges: decision.py asks them one after the other.
+
+
+@dataclass(frozen=True, eq=False)
+class EvidenceCase:
+    """The evidence of registered poses, and the numbers to judge it by."""
+
+    evidence: Evidence
+    config: DecisionConfig
+    numbers: VerdictModel
+
+    @cached_property
+    def bounds(self) -> Mapping[str, Bounds]:
+        """Returns the bounds of each camera's errors, by its name."""
+        return predict_bounds(self.evidence, self.numbers.claims)
+
+    @property
+    def widest_bounds(self) -> Bounds:
+        """The widest bound of each kind. Raises ValueError where there is no camera."""
+        found = find_widest(self.bounds.values())
+        if found is None:
+            raise ValueError("there must be a camera to be judged")
+        return found
+
+    @property
+    def travel_percent(self) -> float:
+        """The widest bound of a centre, of how far the camera moved."""
+        return compute_travel_percent(self.bounds, self.evidence)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether what is known is as good as a right answer; else it is rough."""
+        worst, config = self.widest_bounds, self.config
+        return (
+            worst.rotation_deg <= config.exact_rotation_deg
+            and worst.focal_percent <= config.exact_focal_percent
+            and self.travel_percent <= config.exact_travel_percent
+        )
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether the bounds are narrow enough for anything to be done with the cameras."""
+        worst, config = self.widest_bounds, self.config
+        return (
+            worst.rotation_deg <= config.max_rotation_deg
+            and worst.centre_percent <= config.max_centre_percent
+            and self.travel_percent <= config.max_travel_percent
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Returns the names of the frames that were placed."""
+        return [camera.name for camera in self.evidence.cameras]
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationCase(EvidenceCase):
+    """Registered poses, and where they come from."""
+
+    graph: ViewGraph
+    registration: Registration

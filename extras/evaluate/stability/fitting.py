@@ -23,11 +23,12 @@ from splatnode.extras.evaluate.stability.window_campaign import KINDS, compute_s
 from splatnode.extras.evaluate.stability.windows import OURS, WindowRow
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification import DecisionConfig
-from splatnode.recon.verification.decision import LIMITS, EvidenceCase
+from splatnode.recon.verification.decision import LIMITS
 from splatnode.recon.verification.error_model import (
     MIN_INLIER_RATIO,
     BoundModel,
     ErrorModel,
+    EvidenceCase,
     OddsModel,
     Term,
     VerdictModel,
