@@ -53,7 +53,7 @@ class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     name: Name
     stamp_ns: Sequential
-    state: Name  # of the camera: reader.State
+    state: Name  # of the camera: reader.ReaderState
     taken: bool  # it became a keyframe
     reason: Text  # why, or why not
     captured_at: Stamp | None = None

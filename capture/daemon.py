@@ -71,7 +71,7 @@ ANSWER_S = 3.0
 NAMED = 8  # keyframes that were set aside last
 
 Field = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z_]+\Z", max_length=40)]
-# Any process's heartbeat. What a field holds is for people: wire.decode has checked that it can be shown.
+# Any process's heartbeat. What a field holds is for people: messages.decode has checked that it can be shown.
 Heartbeat = Annotated[dict[Field, Any], msgspec.Meta(max_length=64)]
 
 

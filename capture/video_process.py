@@ -48,10 +48,6 @@ class Span:
     from_ns: int = 0
     to_ns: int | None = None  # which is in it no more; None: to the end
 
-    @property
-    def is_all(self) -> bool:
-        return self == Span()
-
     def __str__(self) -> str:
         end = "its end" if self.to_ns is None else f"{self.to_ns / 1e9:g} s"
         return f"{self.from_ns / 1e9:g} s and {end}"

@@ -83,7 +83,7 @@ def matrices_from_quats(quats: Tensor) -> Tensor:
     """(N, 3, 3) rotation matrices of quaternions (N, 4) wxyz of any length but zero, in as few operations as can be.
 
     Each is a launch on a GPU. A matrix, times the squared length, is linear in the products of two components. To be
-    read are `rasterize.reference.rotations` and, without torch, `result.export.quaternions`.
+    read are `rasterize.reference.rotations` and, without torch, `result.placement`.
     """
     products = (quats[:, :, None] * quats[:, None, :]).flatten(1)  # (N, 16)
     rows, squared_lengths = (products @ _quaternion_product_matrix(quats.dtype, quats.device)).split((9, 1), 1)

@@ -108,7 +108,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame | KeepAlive]]:
     """Returns the function that opens the folder, again after each loss: no photograph is taken twice or missed.
 
-    Each look at the folder ends with NothingNew.
+    Each look at the folder ends with KeepAlive.
     """
     return _Watched(config).stream
 

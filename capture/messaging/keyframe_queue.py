@@ -167,7 +167,7 @@ class Quarantine:
     """Takes files over from the spool beside it, whose lock it lies under. No failure of the disk is raised."""
 
     def __init__(self, directory: Path, config: QuarantineConfig) -> None:
-        """Goes on with what lies in the directory. Raises OSError where it cannot be made, NotPrivate."""
+        """Goes on with what lies in the directory. Raises OSError where it cannot be made, NotOwnerOnly."""
         self.config = config
         self.directory = directory
         make_owner_only_folder(directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
@@ -282,7 +282,7 @@ class Spool:
     """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
 
     def __init__(self, config: SpoolConfig, camera_id: str = "") -> None:
-        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate.
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotOwnerOnly.
 
         Captures beside one another have a camera id each, and so a spool each.
         """

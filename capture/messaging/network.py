@@ -178,7 +178,7 @@ class Keys:
 def create_keys(folder: Path) -> bytes:
     """A new pair in `folder`, whose public key is returned; a secret key that was cut short is replaced, and said.
 
-    Raises KeyFileError where there is a secret key already, NotPrivate where others could change what is there.
+    Raises KeyFileError where there is a secret key already, NotOwnerOnly where others could change what is there.
     """
     _make(folder)
     if _is_cut(folder / SECRET):
@@ -192,7 +192,7 @@ def create_keys(folder: Path) -> bytes:
 
 
 def allow(folder: Path, name: str, public: bytes) -> None:
-    """Lets the machine `name` connect, at once: the list is read at each handshake. Raises ValueError, NotPrivate."""
+    """Lets the machine `name` connect, at once: the list is read at each handshake. Raises ValueError, NotOwnerOnly."""
     if not re.fullmatch(r"[\w.-]{1,64}", name) or name.startswith("."):
         raise ValueError(f"a machine's name has letters, digits, - and _, got {name!r}")
     _make(folder)
@@ -237,7 +237,7 @@ def _key_pair() -> tuple[bytes, bytes]:
 
 
 def _make(folder: Path) -> None:
-    """The folder, and that of the allowed keys. Raises NotPrivate, OSError."""
+    """The folder, and that of the allowed keys. Raises NotOwnerOnly, OSError."""
     for each in (folder, folder / ALLOWED):
         each.mkdir(mode=0o700, parents=True, exist_ok=True)
         check_owner_only(each)
@@ -257,7 +257,7 @@ def _write_key(path: Path, key: bytes) -> None:
 
 
 def _read_key(path: Path) -> bytes:
-    """Raises KeyFileError, and NotPrivate where others could change it."""
+    """Raises KeyFileError, and NotOwnerOnly where others could change it."""
     try:
         return check_key(read_own(path, _LARGEST, only_ours=True), path)
     except FileNotFoundError as error:
@@ -285,7 +285,7 @@ class AllowList:
         return allowed
 
     def _list_keys(self) -> set[bytes]:
-        """The keys that only this user can have put there; the others are said. Raises NotPrivate, OSError."""
+        """The keys that only this user can have put there; the others are said. Raises NotOwnerOnly, OSError."""
         for each in (self.folder.parent, self.folder):
             check_owner_only(each)
         found = set()

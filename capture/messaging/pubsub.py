@@ -230,7 +230,7 @@ class StateServer(Endpoint):
         self._router.router_mandatory = True  # what is not sent is said
 
     def publish(self, header: Any, arrays: Sequence[npt.NDArray] = ()) -> None:
-        """Sends a state (its header is a wire.Header) and keeps it. The arrays must not be written to afterwards.
+        """Sends a state (its header is a messages.Header) and keeps it. The arrays must not be written to afterwards.
 
         Raises WireError where it is larger than a client takes: ZeroMQ would end the connection, again and again.
         """

@@ -43,7 +43,7 @@ def make_owner_only_folder(folder: Path, instead: str, *, ours: bool) -> None:
     """Makes `folder`, and what is missing above it, for this user alone.
 
     Where it is there and others may read it, it is closed to them if it is `ours` by its name, and refused if it is
-    any folder that somebody named. Raises OSError, and NotPrivate, which names what to set `instead`.
+    any folder that somebody named. Raises OSError, and NotOwnerOnly, which names what to set `instead`.
     """
     with _open_folder(folder, instead) as descriptor:
         found = os.fstat(descriptor)
@@ -61,7 +61,7 @@ def make_owner_only_folder(folder: Path, instead: str, *, ours: bool) -> None:
 
 
 def check_way(folder: Path, instead: str = "") -> None:
-    """Raises NotPrivate where another user could make the way to `folder` lead elsewhere, as sshd's StrictModes does.
+    """Raises NotOwnerOnly where another user could make the way to `folder` lead elsewhere, as sshd's StrictModes does.
 
     Each folder above it must be root's or this user's, and no group and nobody else may write there, unless it is
     sticky. So must each above what a link on the way leads to. What is not there yet is no hindrance. The text says
@@ -71,7 +71,7 @@ def check_way(folder: Path, instead: str = "") -> None:
 
 
 def check_owner_only(folder: Path) -> None:
-    """Raises NotPrivate where another user could change what lies in `folder`, OSError where it is none."""
+    """Raises NotOwnerOnly where another user could change what lies in `folder`, OSError where it is none."""
     check_way(folder)
     with _open(os.path.realpath(folder), _FOLDER) as descriptor:
         _check_owner(os.fstat(descriptor), folder)
@@ -81,7 +81,7 @@ def check_owner_only(folder: Path) -> None:
 def temporary_folder(prefix: str) -> Iterator[Path]:
     """A folder among the system's temporary ones, which is removed at the end, and which this user alone can change.
 
-    Raises NotPrivate, OSError.
+    Raises NotOwnerOnly, OSError.
     """
     with tempfile.TemporaryDirectory(prefix=prefix) as name:
         check_way(Path(name), "$TMPDIR")
@@ -91,7 +91,7 @@ def temporary_folder(prefix: str) -> Iterator[Path]:
 def read_own(path: Path, most_bytes: int, *, only_ours: bool = False) -> bytes:
     """The content of a file of this user. Raises OSError, and StrayFile for what is none, or is larger.
 
-    `only_ours`: raises NotPrivate where another user could change it.
+    `only_ours`: raises NotOwnerOnly where another user could change it.
     """
     if only_ours:
         check_way(path.parent)
@@ -182,7 +182,7 @@ def _open(path: Path | str, flags: int) -> Iterator[int]:
 
 
 def _check_step(each: Path, instead: str, is_end: bool) -> bool:
-    """Whether the way goes on behind `each`. Raises NotPrivate; what may be done with an end, its caller checks."""
+    """Whether the way goes on behind `each`. Raises NotOwnerOnly; what may be done with an end, its caller checks."""
     try:
         found = os.lstat(each)
     except (FileNotFoundError, NotADirectoryError):

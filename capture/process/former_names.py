@@ -36,43 +36,35 @@ NODE_KEYS = {
     "tracking.every_s": "interval_s",
     "map": "occupancy",
 }
-RECONSTRUCTION_KEYS = (
-    {
-        "quick": "no_fallbacks",
-        "ladder": "fallbacks",
-        "fallbacks.work": "budget",
-        "fallbacks.most_s": "timeout_s",
-        "light": "exposure_compensation",
-        "denied": "transient_mask",
-        "seeding": "initialization",
-        "screening.limits.blur_px": "max_blur_px",
-        "screening.limits.exposed": "min_exposed_share",
-        "screening.limits.novelty": "min_novelty",
-        "matching.moving": "dynamic_objects",
-        "matching.features.num_features": "max_num_features",
-        "matching.features.max_longer_side": "max_image_size",
-        "decision.require_percent": "max_position_error_percent",
-        "metric.marker_m": "marker_size_m",
-        "metric.marker_sigma_m": "marker_size_sigma_m",
-        "metric.motions_shared": "odometry_scale_sigma",
-        "metric.motions_drift": "odometry_drift",
-        "metric.motions_sigma_deg": "odometry_sigma_deg",
-        "metric.stereo_m": "stereo_baseline_m",
-        "metric.stereo_sigma_m": "stereo_baseline_sigma_m",
-        "metric.network": "depth_network",
-        "metric.network_sigma": "depth_network_sigma",
-    }
-    | {
-        f"{stage}.{former}": present
-        for stage in ("preview", "optimize")
-        for former, present in (("dssim", "ssim_lambda"), ("rates", "lr"), ("regularise", "regularizers"))
-    }
-    | {
-        f"{stage}.{former}": present
-        for stage in ("preview", "optimize")
-        for former, present in (("dssim", "ssim_lambda"), ("rates", "lr"), ("regularise", "regularizers"))
-    }
-)
+RECONSTRUCTION_KEYS = {
+    "quick": "no_fallbacks",
+    "ladder": "fallbacks",
+    "fallbacks.work": "budget",
+    "fallbacks.most_s": "timeout_s",
+    "light": "exposure_compensation",
+    "denied": "transient_mask",
+    "seeding": "initialization",
+    "screening.limits.blur_px": "max_blur_px",
+    "screening.limits.exposed": "min_exposed_share",
+    "screening.limits.novelty": "min_novelty",
+    "matching.moving": "dynamic_objects",
+    "matching.features.num_features": "max_num_features",
+    "matching.features.max_longer_side": "max_image_size",
+    "decision.require_percent": "max_position_error_percent",
+    "metric.marker_m": "marker_size_m",
+    "metric.marker_sigma_m": "marker_size_sigma_m",
+    "metric.motions_shared": "odometry_scale_sigma",
+    "metric.motions_drift": "odometry_drift",
+    "metric.motions_sigma_deg": "odometry_sigma_deg",
+    "metric.stereo_m": "stereo_baseline_m",
+    "metric.stereo_sigma_m": "stereo_baseline_sigma_m",
+    "metric.network": "depth_network",
+    "metric.network_sigma": "depth_network_sigma",
+} | {
+    f"{stage}.{former}": present
+    for stage in ("preview", "optimize")
+    for former, present in (("dssim", "ssim_lambda"), ("rates", "lr"), ("regularise", "regularizers"))
+}
 _RECONSTRUCTION_FLAGS = {
     "--quick": "--no-fallbacks",
     "--require": "--max-position-error",

@@ -502,7 +502,7 @@ def list_cameras(path: Path, part: str) -> list[tuple[list[str], str]] | None:
 
 
 def read_rig(path: Path, parts: Mapping[str, str]) -> Rig:
-    """Returns where the cameras of these topics stand to each other. Raises as `static_rig.read_rig`."""
+    """Returns where the cameras of these topics stand to each other. Raises as `transforms.read_rig`."""
     return transforms.read_rig(path, parts)
 
 

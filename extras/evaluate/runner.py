@@ -523,7 +523,7 @@ def run_bench(
     return _add_rows(before, found, sets, plan)
 
 
-_Key = tuple[str, int, str, int]  # of records.run_of
+_Key = tuple[str, int, str, int]  # as report.make_run_key makes it
 _Set = tuple[EvaluationScene, Split]
 _JOURNAL = "bench.jsonl"
 

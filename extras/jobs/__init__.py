@@ -272,7 +272,7 @@ class _Pickler(pickle.Pickler):
 
 
 def write_call(call: bytes, folder: Path) -> Path:
-    """Makes the folder of a `pack_call` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
+    """Makes the folder of a `pack_call` call, for this user alone. Raises OSError, NotOwnerOnly where it cannot be."""
     make_owner_only_folder(folder, "--out or $TMPDIR", ours=True)
     (folder / CALL).write_bytes(call)
     return folder
@@ -538,7 +538,7 @@ def work_folder(out: Path) -> Iterator[Path]:
     """An empty folder of this user alone for what is under way in `out`, which this process holds; removed at the end.
 
     Calls are pickles: whoever could put one there could run anything as this user. So it is a hidden folder in `out`
-    where nobody else can change what lies there, else one among temporary files. Raises NotPrivate, OSError.
+    where nobody else can change what lies there, else one among temporary files. Raises NotOwnerOnly, OSError.
     """
     folder = out / ".calls"
     shutil.rmtree(folder, ignore_errors=True)  # of a driver that was killed

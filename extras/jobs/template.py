@@ -32,7 +32,7 @@ RAISED = 1  # the exit code where the function raised
 def run_call(folder: Path) -> int:
     """Makes the call and leaves the answer, or what was raised; returns the exit code.
 
-    Raises NotPrivate for a call that another user could have put there.
+    Raises NotOwnerOnly for a call that another user could have put there.
     """
     check_owner_only(folder)
     with (folder / CALL).open("rb") as call:

@@ -94,7 +94,7 @@ class Store:
     def __init__(self, directory: Path) -> None:
         """Raises CheckpointError where another process uses it, or where it is of another version or damaged.
 
-        Raises NotPrivate where another user could read or change it, and OSError.
+        Raises NotOwnerOnly where another user could read or change it, and OSError.
         """
         self.directory = directory
         self._frames = directory / "frames"
@@ -555,7 +555,7 @@ class ReconstructionRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
 
 class FallbacksRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Fallbacks that gained nothing, as recon.memory.Memory has them."""
+    """Fallbacks that gained nothing, as recon.incremental.ReconstructionCache has them."""
 
     fruitless: list[tuple[str, str]]
 

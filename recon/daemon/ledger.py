@@ -123,7 +123,7 @@ LEFT, FINISHED = "left", "finished"
 def link_left_checkpoint(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) -> None:
     """Links `files` of the checkpoint in `directory`, which go with `ledger`, into a folder of their own there.
 
-    `files` are relative paths. Raises OSError, and NotPrivate, which names what to set `instead`.
+    `files` are relative paths. Raises OSError, and NotOwnerOnly, which names what to set `instead`.
     """
     _link_files(directory, directory / LEFT / ledger.scene_id, ledger, files, instead)
 
@@ -176,7 +176,7 @@ def list_finished_folders(directory: Path) -> list[Path]:
 def move_to_finished(folder: Path, instead: str) -> None:
     """Takes the checkpoint of a place that was left among the finished ones.
 
-    Raises OSError, and NotPrivate as `link_left_checkpoint`.
+    Raises OSError, and NotOwnerOnly as `link_left_checkpoint`.
     """
     target = make_finished_path(folder.parent.parent, folder.name)
     make_owner_only_folder(target.parent, instead, ours=True)

@@ -112,7 +112,7 @@ class DiskSpace:
         return problem and f"{problem}: make room on the disk"
 
 
-# Commands to the running daemon, and the verb `retract` that sends one.
+# Commands to the running daemon, and the verb `remove-keyframe` that sends one.
 
 EXIT_GOOD, EXIT_UNKNOWN_NAME, EXIT_NO_SCENE, EXIT_UNFINISHED = 0, 2, 65, 75
 

@@ -387,7 +387,7 @@ _Placed = Mapping[str, tuple[str, Similarity]]  # by scene: the first scene of i
 
 
 def _place_scenes(scenes: Sequence[str], links: Sequence[PoseGraphEdge], hardest: float) -> _Placed:
-    """The scenes by the links, all of which count; `hardest` as for `relaxed`."""
+    """The scenes by the links, all of which count; `hardest` as for `solve_pose_graph`."""
     placed: dict[str, tuple[str, Similarity]] = {}
     for root in scenes:
         if root in placed:

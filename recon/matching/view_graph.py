@@ -201,7 +201,7 @@ class ViewGraph:
         return find_components(range(len(self.keyframes)), self.pairs)
 
     def select_pairs_worth_matching(self) -> set[Pair]:
-        """The pairs (i < j), matched or not, that are worth it (`candidates.select_pairs_worth_matching`)."""
+        """The pairs (i < j), matched or not, that are worth it (`pair_matching.select_pairs_worth_matching`)."""
         firm = {
             _ascending(i, j)
             for (i, j), pair in self.plain.items()

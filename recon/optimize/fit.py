@@ -486,7 +486,7 @@ def _regularisation(
     pointmaps = []
     for view in scene.views:
         if view.pointmap is None:
-            raise ValueError(f"{view.name} has no point map, which the losses in `regularise` compare with")
+            raise ValueError(f"{view.name} has no point map, which the losses in `regularizers` compare with")
         T_world_camera = view.T_world_camera.double().numpy()
         pointmaps.append(replace(view.pointmap, T_world_camera=T_world_camera, K=view.K.double().numpy()))
     images = [view.image for view in scene.views]

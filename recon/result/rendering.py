@@ -115,7 +115,7 @@ NEAR = 0.01  # world units; splatnode.recon.rasterize.reference has it too, but 
 
 @dataclass(frozen=True, eq=False)
 class RenderedArrays:
-    """The channels of `recon.rasterize.render.Render`; one that was not asked for is empty, (0, 0) or (0, 0, 3)."""
+    """The channels of `recon.rasterize.reference.Render`; one that was not asked for is empty, (0, 0) or (0, 0, 3)."""
 
     rgb: Array  # (H, W, 3) on black, not clipped
     depth: Array  # (H, W) expected z in the camera frame, 0 where alpha is 0

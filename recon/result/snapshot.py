@@ -278,10 +278,10 @@ class Snapshot:
     dropped: tuple[DroppedFrame, ...]
     iterations: int
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
-    budget: tuple[Mapping[str, object], ...] = ()  # recon.modelling.Hit.record of each limit that bound the final scene
+    budget: tuple[Mapping[str, object], ...] = ()  # modelling.BudgetHit.record of each limit that bound the final scene
     final: bool = False
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
-    evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
+    evidence: Mapping[str, object] | None = None  # error_model.make_evidence_record; None: nothing to verify
     scale: Scale = RELATIVE  # the unit of all lengths
     given: InGivenWorld | None = None  # how it lies in the world of given poses; None: that is not known, or it does
     up: Up | None = None  # in the world; None: no IMU tells it

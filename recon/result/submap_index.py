@@ -1,6 +1,6 @@
 """places.json, read as the whole that it tells of: the scenes, how they are linked, and which lie in one world.
 
-This is the reader of those who show or merge what a node has written; `recon.daemon.places` writes it. It is lenient
+This is the reader of those who show or merge what a node has written; `recon.daemon.output` writes it. It is lenient
 with what an older node did not write: a link without a kind is one of a chain, and without `poses` the scenes of a map
 are placed by their links.
 """

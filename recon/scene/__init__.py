@@ -34,7 +34,7 @@ class Gaussians:
     log_scales: Tensor  # (N, 3)
     logit_opacities: Tensor  # (N,)
     sh: Tensor  # (N, B, 3) spherical harmonics, B = 1, 4, 9 or 16; colour = 0.5 + sum of basis * sh
-    source_frame: Tensor  # (N,) int32: where it comes from: see recon.result.sources; -1 for the far shell
+    source_frame: Tensor  # (N,) int32: where it comes from: see recon.result.snapshot; -1 for the far shell
 
     def __len__(self) -> int:
         return self.means.shape[0]

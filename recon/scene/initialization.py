@@ -93,7 +93,7 @@ def visibility(image: Float32, scale: float) -> Float32:
     """(h, w) factors in (0, 1] by which differences from an `image` (h, w, 3) in [0, 1] count.
 
     SSIM weighs a difference of structure in the same way (Wang et al. 2004): by the variance around it. `scale` is the
-    image's size over the reference's (`seeding.REFERENCE_PX`).
+    image's size over the reference's (`REFERENCE_PX`).
     """
     side = 2 * round(WINDOW_PX * scale / 2) + 1
     mean = cv2.blur(image, (side, side))

@@ -33,6 +33,7 @@ def calls(tmp_path):
         (["demo"], ""),
         (["test", "-x"], "[dev,bench]"),
         (["bench", "scene", "--out", "o"], "[bench]"),
+        (["robustness", "scene", "--out", "o"], "[bench]"),
         (["fuzz", "--seconds", "9"], "[dev,bench]"),
         (["docs"], "[docs]"),
         (["view", "out"], "[viewer]"),

@@ -107,7 +107,7 @@ def new_key() -> str:
 def load_or_create_key(path: Path) -> str:
     """The key in the file; a new one, which the file gets, where there is none, or where it was cut to nothing.
 
-    Raises NotPrivate where others may read the file, ValueError for one that holds something else, OSError.
+    Raises NotOwnerOnly where others may read the file, ValueError for one that holds something else, OSError.
     """
     text = _read_key_file(path)
     if not text:

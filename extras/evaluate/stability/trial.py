@@ -458,7 +458,7 @@ class Trial:
     held: bool | None = None  # whether that was within the row's limits
     errors: tuple[CameraError, ...] = ()  # of the published cameras; of a refusal, of those that were registered
     registered_right: bool | None = None  # whether the registered cameras are right, published or not; None: no cameras
-    evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record
+    evidence: Mapping[str, object] | None = None  # recon.verification.error_model.make_evidence_record
     message: str = ""  # the verdict's sentence, or the error
 
 

@@ -154,7 +154,7 @@ class WindowRow:
     cameras: tuple[CameraError, ...]  # those published; of a refusal, those that were registered
     rotation_deg: float | None  # the largest error of any relative rotation
     centre_pct: float | None  # RMS error of the centres, in percent of the true ones' spread
-    evidence: Mapping[str, Any] | None  # recon.verification.likelihood.record
+    evidence: Mapping[str, Any] | None  # recon.verification.error_model.make_evidence_record
     cores: int | None = None  # that it could use
     processor: str | None = None
     others: float | None = None  # the share of the cores' time that others took meanwhile; None also: nobody can tell

@@ -277,7 +277,7 @@ def _make_given(record: _Given | None) -> GivenCameraPose | None:
 
 # A result on disk, read as far as somebody asks for it.
 
-# sources.bin: the source frames of a result's Gaussians (`recon.result.sources`), which scene files have no place for.
+# sources.bin: the source frames of a result's Gaussians (`recon.result.snapshot`), which scene files have no place for.
 #
 # Little-endian int32, one a Gaussian, in the order of the scene.ply beside it.
 
