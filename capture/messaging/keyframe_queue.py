@@ -282,7 +282,7 @@ class Spool:
     """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
 
     def __init__(self, config: SpoolConfig, camera_id: str = "") -> None:
-        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotOwnerOnly.
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, LockHeld, NotOwnerOnly.
 
         Captures beside one another have a camera id each, and so a spool each.
         """

@@ -405,7 +405,7 @@ class Endpoint:
     """
 
     def __init__(self, network: Network, offers: Service | None = None) -> None:
-        """Raises AlreadyRunning, NetworkError, KeyFileError, Limited."""
+        """Raises AlreadyRunning, NetworkError, KeyFileError, LimitTooLow."""
         self.network = network
         self.refused = 0  # messages that could not be taken
         self.why_refused = ""  # the last of them

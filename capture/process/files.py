@@ -376,7 +376,7 @@ class LockHeld(RuntimeError):
 
 @contextlib.contextmanager
 def exclusive(path: Path) -> Iterator[None]:
-    """Holds the lock file at `path`, which is this user's and tells the holder's process id. Raises Held, OSError.
+    """Holds the lock file at `path`, which is this user's and tells the holder's process id. Raises LockHeld, OSError.
 
     The file stays, unless its holder removes it.
     """
@@ -433,7 +433,7 @@ def make_folder(folder: Path) -> Iterator[None]:
 def claim_folder(folder: Path) -> Iterator[None]:
     """Makes `folder` as `make_folder` does and holds its lock, whose file is removed at the end.
 
-    Raises Held, OSError.
+    Raises LockHeld, OSError.
     """
     with make_folder(folder), exclusive(folder / LOCK):
         try:

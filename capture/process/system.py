@@ -94,7 +94,7 @@ def raise_file_limit() -> None:
 
 
 def make_sure_of_room(files: int, threads: int) -> None:
-    """Raises Limited where so many further files cannot be opened, or so many threads not be started."""
+    """Raises LimitTooLow where so many further files cannot be opened, or so many threads not be started."""
     now, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
         used = len(os.listdir("/proc/self/fd"))

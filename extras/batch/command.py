@@ -278,7 +278,7 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
 
 @contextlib.contextmanager
 def _lock_exclusively(file: Path) -> Iterator[None]:
-    """One process at a time writes a log or a data set; what a killed one has left is removed. Raises Held, OSError."""
+    """One process at a time writes a log or a data set; what a killed one left is removed. Raises LockHeld, OSError."""
     if file.is_dir():
         lock, begun = file / "meta" / LOCK, (file / "meta").rglob(f".*{BEING_WRITTEN}")
     else:

@@ -213,7 +213,7 @@ class Daemon:
     def __init__(self, config: DaemonConfig, stopping: threading.Event, finish: bool = False) -> None:
         """If `finish`, the daemon ends by itself once every keyframe is in a final scene and the maps are merged.
 
-        Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
+        Raises AlreadyRunning, CheckpointError, FolderInUse, LimitTooLow, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
         self._problems = Problems()
@@ -275,7 +275,7 @@ class Daemon:
         self._resources.close()
 
     def run(self) -> None:
-        """Runs until the daemon is stopped. Raises Failed where one of its threads ended."""
+        """Runs until the daemon is stopped. Raises what ended one of its threads."""
         manager = ServiceManager()
         with wrap_late_errors(manager):
             self._run(manager)
