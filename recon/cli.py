@@ -434,7 +434,7 @@ def _enqueue_frames(
         else:
             events.append(ArrivedKeyframe(keyframe, time.monotonic(), stored[0].number if len(stored) > 1 else None))
     if events:
-        inbox.enqueue_together(events, stopping, check)
+        inbox.enqueue(events, stopping, check)
 
 
 _OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo", "gravity")

@@ -9,7 +9,7 @@ import msgspec
 
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.former_names import NODE_KEYS
-from splatnode.recon.config import ReconstructionConfig as Reconstruction
+from splatnode.recon.config import ReconstructionConfig
 from splatnode.recon.daemon.ingest import FrameSetConfig
 from splatnode.recon.daemon.relocalization import LocatorConfig
 from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
@@ -23,7 +23,7 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     former_keys = NODE_KEYS
 
     network: Network = Network()  # the same as in capture's configuration
-    reconstruction: Reconstruction = Reconstruction()
+    reconstruction: ReconstructionConfig = ReconstructionConfig()
     tracking: Tracking = Tracking()  # localization of the live camera in a final submap
     occupancy: FreeSpace = FreeSpace()  # the occupancy map: which space is free, occupied, or not seen
     localization: LocatorConfig = LocatorConfig()  # of images that clients send

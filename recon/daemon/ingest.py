@@ -297,19 +297,13 @@ class Inbox:
         with self._changed:
             return next((each.at_s for each in self._events if isinstance(each, ArrivedKeyframe)), None)
 
-    def enqueue(self, event: Event, stopping: threading.Event, meanwhile: Callable[[], None] = _do_nothing) -> None:
-        """Waits where the inbox is full, until there is room or the daemon stops; calls `meanwhile` again and again."""
-        with self._changed:
-            while len(self._events) >= CAPACITY and not stopping.is_set():
-                self._changed.wait(WAIT_S)
-                meanwhile()
-            self._events.append(event)
-            self._changed.notify_all()
-
-    def enqueue_together(
+    def enqueue(
         self, events: Sequence[Event], stopping: threading.Event, meanwhile: Callable[[], None] = _do_nothing
     ) -> None:
-        """As `enqueue`, of events of which none is to be seen without the others; all go in where one has room."""
+        """Waits where the inbox is full, until there is room or the daemon stops; calls `meanwhile` again and again.
+
+        None of the events is seen without the others: all go in where one has room.
+        """
         with self._changed:
             while len(self._events) >= CAPACITY and not stopping.is_set():
                 self._changed.wait(WAIT_S)
@@ -452,7 +446,7 @@ class Intake:
             else:
                 events.append(ArrivedKeyframe(keyframe, arrived_s, frame_set))
         if events:
-            self._inbox.enqueue_together(events, self._stopping, captures.say_ready)
+            self._inbox.enqueue(events, self._stopping, captures.say_ready)
 
     def _prepare_keyframe(self, captures: Captures, stored: StoredFrame) -> Keyframe:
         """Waits where the memory does not suffice; while the daemon stops, that is raised."""

@@ -19,7 +19,6 @@ from functools import partial
 from splatnode.capture.process.system import is_shortage
 from splatnode.capture.process.terminal import ProgressStep, event
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import ReconState, Work, WorkMeter, checkpoint, weigh_final
 from splatnode.recon.daemon.checkpoint import Store
@@ -231,6 +230,23 @@ def verify_keyframes(work: IncrementalReconstruction, forget: Forget, run: RunCo
         forget(keyframe.name, "it contradicts the scene")
 
 
+def split_submaps(
+    work: IncrementalReconstruction, store: Store, output: Output, run: RunContext, present: bool = False
+) -> bool:
+    """Makes submaps, which wait, of keyframes that show other places; returns whether there were any.
+
+    `present`: the camera is in this submap.
+    """
+    groups = find_separate_groups(work, run)
+    for keyframes in groups:
+        names = _list_names(keyframes)
+        scene = store.split_off(names, present=present)
+        output.add_split_submap(scene, names)
+        event(log, logging.INFO, "parted", scene=store.scene_id, part=scene, keyframes=len(names))
+        work.remove_keyframes(names)
+    return bool(groups)
+
+
 def refine(
     work: IncrementalReconstruction, config: ReconstructionConfig, run: RunContext
 ) -> Iterator[SceneWithVerdict]:
@@ -291,7 +307,7 @@ class ActiveSubmap:
     def __init__(
         self,
         config: DaemonConfig,
-        recipe: Recipe,
+        recipe: ReconstructionConfig,
         store: Store,
         output: Output,
         pause: Callable[[float], None],
@@ -571,12 +587,7 @@ class ActiveSubmap:
                 finally:
                     self._save_fallbacks()
             more = self._check_lost(fitted)
-        for keyframes in find_separate_groups(self._work, self._until_disturbed):
-            names = [keyframe.name for keyframe in keyframes]
-            scene = self._store.split_off(names, present=True)
-            self._output.add_split_submap(scene, names)
-            event(log, logging.INFO, "parted", scene=self._store.scene_id, part=scene, keyframes=len(names))
-            self._work.remove_keyframes(names)
+        split_submaps(self._work, self._store, self._output, self._until_disturbed, present=True)
 
     def _save_fallbacks(self) -> None:
         """Writes into the checkpoint which fallbacks gained nothing, where there are others than before."""

@@ -440,7 +440,8 @@ class InactiveSubmaps:
     def _verify(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> bool:
         """Whether the place is judged now, and its result written."""
         work = found.work
-        if found.final and not found.new and not self._split_off(store, work, run):  # as it was when the place was left
+        # As it was when the place was left
+        if found.final and not found.new and not submap.split_submaps(work, store, self._output, run):
             self._output.mark_finished(store.scene_id)
         else:
             event(log, logging.INFO, "judging", scene=store.scene_id)
@@ -469,21 +470,10 @@ class InactiveSubmaps:
         for keyframe in submap.screen_keyframes(work, found.new, forget):  # that came shortly before the place was left
             work.add_keyframe(keyframe, run)
         submap.verify_keyframes(work, forget, run)
-        if self._split_off(store, work, run):
+        if submap.split_submaps(work, store, self._output, run):
             work.estimate_thoroughly(run)
         for keyframe in work.keyframes_deferred:
             forget(keyframe.name, "it does not fit the scene")
-
-    def _split_off(self, store: Store, work: IncrementalReconstruction, run: RunContext) -> bool:
-        """Whether some of the keyframes showed other places, and are places of their own now, which wait here."""
-        parts = submap.find_separate_groups(work, run)
-        for keyframes in parts:
-            names = [keyframe.name for keyframe in keyframes]
-            scene = store.split_off(names)
-            self._output.add_split_submap(scene, names)
-            event(log, logging.INFO, "parted", scene=store.scene_id, part=scene, keyframes=len(names))
-            work.remove_keyframes(names)
-        return bool(parts)
 
     def _finalize(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> bool:
         """Whether the scene of a place that is judged is final now, and its result written."""

@@ -132,8 +132,8 @@ def test_what_another_recon_is_served_now_is_forgotten():
 def test_a_frame_set_goes_into_the_map_together():
     inbox, stopping = Inbox(), threading.Event()
     keyframes = [ArrivedKeyframe(None, 0.0, number) for number in (0, 0, 0, 1, 1, 1)]  # pyright: ignore
-    inbox.enqueue_together(keyframes[:3], stopping)
-    inbox.enqueue_together(keyframes[3:], stopping)
+    inbox.enqueue(keyframes[:3], stopping)
+    inbox.enqueue(keyframes[3:], stopping)
     inbox.enqueue_now(RemovedFrame("x"))
     assert [getattr(each, "frame_set", None) for each in inbox.dequeue(0)] == [0, 0, 0, 1, 1, 1]
     stored = [SimpleNamespace(name=each.name, frame=each) for each in

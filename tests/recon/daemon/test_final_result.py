@@ -100,7 +100,7 @@ def test_a_step_that_memory_or_disk_did_not_suffice_for_is_tried_again(working, 
 def test_who_takes_a_keyframe_back_does_not_wait_for_the_work():
     inbox, forgotten = Inbox(), []
     for index in range(CAPACITY):
-        inbox.enqueue(RemovedFrame(str(index)), threading.Event())
+        inbox.enqueue([RemovedFrame(str(index))], threading.Event())
     daemon = SimpleNamespace(
         _worker=SimpleNamespace(find_inactive_scenes=lambda _: [], find_frame_set=lambda name: [name]),
         _store=SimpleNamespace(names={"a.png"}, forget_frames=lambda *what: forgotten.append(what)),

@@ -230,7 +230,7 @@ def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer
 def test_keyframes_are_worked_in_a_few_at_a_time():
     inbox, stopping = Inbox(), threading.Event()
     for number in range(2 * BATCH + 1):
-        inbox.enqueue(ArrivedKeyframe(None, float(number)), stopping)  # pyright: ignore[reportArgumentType]
+        inbox.enqueue([ArrivedKeyframe(None, float(number))], stopping)  # pyright: ignore[reportArgumentType]
     assert inbox.oldest_s == 0.0
     assert [len(inbox.dequeue(0)) for _ in range(4)] == [BATCH, BATCH, 1, 0]
     assert inbox.oldest_s is None

@@ -230,7 +230,7 @@ def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_a
         node = Worker(config, store, inbox, lambda _: None, threading.Event())
         node.loading = 0
         node._backlog = keyframes[:5]
-        inbox.enqueue(keyframes[5], threading.Event())
+        inbox.enqueue([keyframes[5]], threading.Event())
         taken = []
         monkeypatch.setattr(node.place, "add_keyframes", taken.append)
         assert node.delay[0] > 0

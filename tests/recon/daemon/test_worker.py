@@ -43,10 +43,10 @@ def test_what_was_retracted_before_it_was_prepared_is_not_taken_in(again, tmp_pa
     inbox.enqueue_now(RemovedFrame("0.png"))
     arrived = [ArrivedKeyframe(prepare(each.frame, Recipe()), 0.0) for each in stored if each is not None]
     for each in arrived:
-        inbox.enqueue(each, threading.Event())
+        inbox.enqueue([each], threading.Event())
     while len(inbox):
         node._process_events(0.0)
     assert taken == [arrived[1:]]
-    inbox.enqueue(arrived[0], threading.Event())
+    inbox.enqueue(arrived[:1], threading.Event())
     node._process_events(0.0)
     assert taken == [arrived[1:]]  # nor is there anything to be made better
