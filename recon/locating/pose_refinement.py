@@ -22,7 +22,7 @@ from splatnode.recon.geometry import undistort_rays as straight
 from splatnode.recon.keyframes import PLAIN, Features
 from splatnode.recon.locating import NORMAL_95, LensSource, Located
 from splatnode.recon.matching import features as matching_features
-from splatnode.recon.registration import multiview_geometry
+from splatnode.recon.registration import bundle_adjustment, multiview_geometry
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
 from splatnode.recon.verification.evidence import ReflectionConfig, mirror_descriptors
 
@@ -34,7 +34,6 @@ Array = npt.NDArray[np.float64]
 NUM_PARAMETERS = 11
 POSE = 6  # of them, the pose's
 PINHOLE = 0.0, 0.0  # its radial coefficients
-_MIN_DEPTH = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +128,7 @@ class CameraModel:
     def project(self, points: Array) -> tuple[Array, Array]:
         """Pixels (M, 2) of world points (M, 3), relative to the nominal principal point, and depths (M,)."""
         in_camera = points @ self.rotation.T + self.translation
-        rays = in_camera[:, :2] / _safe(in_camera[:, 2])[:, None]
+        rays = in_camera[:, :2] / bundle_adjustment.avoid_zero_depth(in_camera[:, 2])[:, None]
         bent = distortion((rays**2).sum(1), np.array(self.lens.radial))
         return self.lens.focals * bent[:, None] * rays + self.lens.shift, in_camera[:, 2]
 
@@ -137,7 +136,7 @@ class CameraModel:
         """Differentiates pixels of points (M, 3): (M, 2, NUM_PARAMETERS) by parameters, (M, 2, 3) by points."""
         # A row of memory is a derivative of all points: so NumPy's loops are long ones.
         turned = np.ascontiguousarray((points @ self.rotation.T).T)
-        z = _safe(turned[2] + self.translation[2])
+        z = bundle_adjustment.avoid_zero_depth(turned[2] + self.translation[2])
         x, y = (turned[0] + self.translation[0]) / z, (turned[1] + self.translation[1]) / z
         (across, down), (first, second), squared = self.lens.focals, self.lens.radial, x * x + y * y
         bent = distortion(squared, np.array(self.lens.radial))
@@ -161,10 +160,6 @@ def undistort_pixels(pixels: Array, lens: Lens) -> Array:
     """(M, 2) where a pinhole of the same focal length sees what `lens` sees at `pixels` (M, 2)."""
     distorted = (pixels - lens.shift) / lens.focals
     return lens.focal * straight(distorted, np.array(lens.radial))
-
-
-def _safe(depth: Array) -> Array:
-    return np.where(np.abs(depth) < _MIN_DEPTH, _MIN_DEPTH, depth)
 
 
 # Which pixels of a photograph may show which landmarks: its features matched with those of each known photograph.

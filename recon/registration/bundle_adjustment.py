@@ -309,7 +309,7 @@ def project(problem: Problem) -> tuple[Array, Array]:
         np.einsum("oij,oj->oi", problem.rotations[camera], problem.points[problem.point_of])
         + problem.translations[camera]
     )
-    normalised = in_camera[:, :2] / _safe_depth(in_camera[:, 2:])
+    normalised = in_camera[:, :2] / avoid_zero_depth(in_camera[:, 2:])
     bent = distortion((normalised**2).sum(1), problem.radials[lens])
     return normalised * _focals(problem, lens) * bent[:, None] + problem.shifts[lens], in_camera[:, 2]
 
@@ -532,7 +532,8 @@ def _pack_known_poses(problem: Problem, config: BundleAdjustmentConfig) -> list[
     return [np.ascontiguousarray(each, dtype=np.float64) for each in values]
 
 
-def _safe_depth(depth: Array) -> Array:
+def avoid_zero_depth(depth: Array) -> Array:
+    """Depths with _MIN_DEPTH in place of what is nearer to 0, so that they may be divided by."""
     return np.where(np.abs(depth) < _MIN_DEPTH, _MIN_DEPTH, depth)
 
 
