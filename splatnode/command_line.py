@@ -47,9 +47,6 @@ _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a clos
 
 # Of the core; further ones are entry points.
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
-# Hidden aliases: no help lists them
-FORMER_VERBS = former_names.VERBS
-FORMER_FLAGS = former_names.FLAGS
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -59,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    words, told = replace_former_words(sys.argv[1:] if argv is None else argv, FORMER_VERBS, FORMER_FLAGS)
+    words, told = replace_former_words(sys.argv[1:] if argv is None else argv, former_names.VERBS, former_names.FLAGS)
     for sentence in told:
         say(f"splatnode: {sentence}", error=True)
     parser = build_parser(words[0] if words else None)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.support.long_tests import LIST, is_long, parse_long_tests, sum_long_tests
+from tests.support.long_tests import LIST, find_long_test, parse_long_tests, sum_long_tests
 
 # As the command line does, before NumPy comes: matrices are small, and the threads of several processes collide.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -62,13 +62,14 @@ def pytest_collection() -> Iterator[None]:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     long_tests = parse_long_tests(LIST.read_text(encoding="utf-8"))
+    found = {_name(item): find_long_test(_name(item), long_tests) for item in items}
     for item in items:
         if item.nodeid.startswith(tuple(f"tests/{start}" for start in NUMERICAL)):
             item.add_marker("numerical")
-        if is_long(_name(item), long_tests):
+        if found[_name(item)]:
             item.add_marker("long")
     # Processes that share the files end at about the same time if the longest come first.
-    seconds = sum_long_tests((_name(item) for item in items), long_tests)
+    seconds = sum_long_tests(found)
     items.sort(key=lambda item: -seconds[_name(item).partition("::")[0]])
 
 

@@ -2,7 +2,7 @@
 
 The tables go with the next release. A key stands as "section.former" or, of one kind of camera alone, as
 "section[kind].former", and its present name stands in the same section (config.py beside this file); sections above it
-are by their present names.
+are by their present names. No help lists these names.
 """
 
 from __future__ import annotations

@@ -724,8 +724,7 @@ def decide(
 ) -> Verdict:
     """OK, or another code that is publishable, or the reason why there is no scene.
 
-    `evidence` is that of `evidence.verify` for this registration, which `refuse_before_registration` let
-    pass.
+    `evidence` is that of `evidence.verify` for this registration, which `refuse_before_registration` let pass.
     """
     if registration is None or evidence is None or len(registration.cameras) < config.min_cameras:
         return refuse_unplaced(graph, registration, config)

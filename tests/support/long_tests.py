@@ -6,7 +6,7 @@ A line is a folder, a file or a test, from tests/ on, and the processor seconds 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,15 +40,14 @@ def starts_with(test: str, start: str) -> bool:
     return len(rest) < len(test) and (not rest or start.endswith("/") or rest.startswith(("::", "[")))
 
 
-def is_long(test: str, long_tests: tuple[LongTest, ...]) -> bool:
-    """`test` is a test's id from tests/ on."""
-    return any(starts_with(test, each.start) for each in long_tests)
+def find_long_test(test: str, long_tests: Iterable[LongTest]) -> LongTest | None:
+    """The line that makes a test a long one; None: it is quick. `test` is its id from tests/ on."""
+    return next((each for each in long_tests if starts_with(test, each.start)), None)
 
 
-def sum_long_tests(tests: Iterable[str], long_tests: tuple[LongTest, ...]) -> dict[str, float]:
-    """The processor seconds of each file's long tests; those of a folder count for each of its files."""
+def sum_long_tests(found: Mapping[str, LongTest | None]) -> dict[str, float]:
+    """The processor seconds of each file's long tests, by the line of each test; a folder's count for all its files."""
     lines: dict[str, set[LongTest]] = {}
-    for test in tests:
-        named = {each for each in long_tests if starts_with(test, each.start)}
-        lines.setdefault(test.partition("::")[0], set()).update(named)
+    for test, line in found.items():
+        lines.setdefault(test.partition("::")[0], set()).update([line] if line else [])
     return {file: sum(each.processor_s for each in named) for file, named in lines.items()}

@@ -82,11 +82,11 @@ def subparsers() -> dict[str, argparse.ArgumentParser]:
 
 def test_former_verbs_and_flags_are_in_no_help():
     parsers = subparsers()
-    assert not {*command_line.FORMER_VERBS} & {*parsers}
-    for verb, flags in command_line.FORMER_FLAGS.items():
+    assert not {*former_names.VERBS} & {*parsers}
+    for verb, flags in former_names.FLAGS.items():
         known = parsers[verb]._option_string_actions
         assert {*flags.values()} <= {*known} and not {*flags} & {*known}, verb
-    assert {*command_line.FORMER_VERBS.values()} <= {*parsers}
+    assert {*former_names.VERBS.values()} <= {*parsers}
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_former_verbs_and_flags_are_in_no_help():
     ],
 )
 def test_a_command_line_is_taken_by_its_present_names(given, expected, told):
-    words, sentences = replace_former_words(given.split(), command_line.FORMER_VERBS, command_line.FORMER_FLAGS)
+    words, sentences = replace_former_words(given.split(), former_names.VERBS, former_names.FLAGS)
     assert (words, len(sentences)) == (expected.split(), told)
 
 

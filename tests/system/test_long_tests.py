@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from tests.conftest import ROOT, pytest_collection_modifyitems
-from tests.support.long_tests import LIST, LongTest, is_long, parse_long_tests, starts_with, sum_long_tests
+from tests.support.long_tests import LIST, LongTest, find_long_test, parse_long_tests, starts_with, sum_long_tests
 from tests.support.processor_times import read_times
 
 LONG_TESTS = parse_long_tests(LIST.read_text(encoding="utf-8"))
@@ -92,7 +92,7 @@ def test_the_list_gives_the_marker():
     long, quick = Item(f"tests/{STARTS[0]}"), Item("tests/system/test_sizes.py::test_any")
     pytest_collection_modifyitems([long, quick])
     assert "long" in long.markers and "long" not in quick.markers
-    assert not is_long("system/test_sizes.py::test_any", LONG_TESTS)
+    assert find_long_test("system/test_sizes.py::test_any", LONG_TESTS) is None
 
 
 def test_files_that_take_longest_come_first():
@@ -102,7 +102,8 @@ def test_files_that_take_longest_come_first():
         LongTest("vm/", 300.0),
     )
     tests = ["a/test_a.py::test_x", "a/test_b.py::test_long[1]", "a/test_b.py::test_long[2]", "vm/test_c.py::test_y"]
-    assert sum_long_tests(tests, lines) == {"a/test_a.py": 0.0, "a/test_b.py": 9.0, "vm/test_c.py": 300.0}
+    found = {test: find_long_test(test, lines) for test in tests}
+    assert sum_long_tests(found) == {"a/test_a.py": 0.0, "a/test_b.py": 9.0, "vm/test_c.py": 300.0}
     names = ["recon/test_pipeline.py::test_any", "system/test_sizes.py::test_any", "vm/test_v4l2.py::test_any"]
     items = [Item(f"tests/{name}") for name in names]
     pytest_collection_modifyitems(items)

@@ -117,7 +117,7 @@ def test_configurations_on_a_page_have_keys_that_there_are(page):
 
 def list_former_words() -> set[str]:
     """Flags and dotted keys of the release before, as a sentence may name them."""
-    flags = {flag for flags in command_line.FORMER_FLAGS.values() for flag in flags}
+    flags = {flag for flags in former_names.FLAGS.values() for flag in flags}
     tables = former_names.CAPTURE_KEYS | former_names.RECONSTRUCTION_KEYS | former_names.NODE_KEYS
     sections = {former: present for former, present in tables.items() if "." not in former}
     keys = {re.sub(r"\[.*?\]", "", former) for former in tables if "." in former}
