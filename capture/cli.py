@@ -22,7 +22,6 @@ from typing import Any
 
 from splatnode.capture import daemon
 from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live, mount_camera
-from splatnode.capture.daemon import describe_heartbeat, heartbeats, last_run, mark_problems_seen, parse_camera_id
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses import read_lens
 from splatnode.capture.messaging import network as key_files
@@ -41,6 +40,7 @@ from splatnode.capture.process.terminal import (
 from splatnode.capture.process.text import sanitize_text
 from splatnode.capture.reader import Reader, ReaderState
 from splatnode.capture.recording import Recorder
+from splatnode.capture.status import describe_heartbeat, heartbeats, last_run, mark_problems_seen, parse_camera_id
 
 # One configuration with several cameras: a capture process for each, with its camera id.
 

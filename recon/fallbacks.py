@@ -1,11 +1,10 @@
 """Fallbacks: what costs more is tried before photographs are refused for want of matches.
 
-The first estimate is the first rung of the ladder. While it lacks cameras for some keyframes, and there is work left,
-further rungs find more to estimate from, and cameras are estimated again. An answer is never made worse: the better
-one is kept. How much is tried depends on the photographs alone: work is counted by what is done, and no clock decides
-unless somebody asked for a deadline. One rung is simulated tilts in both directions, and stronger ones, as affine SIFT
-has them (Morel and Yu, 2009); another is matches by networks that were trained on wide baselines (XFeat, LighterGlue),
-where their weights are.
+While the estimate lacks cameras for some keyframes, and the budget lasts, a fallback extends the view graph, and
+cameras are estimated again. An answer is never made worse: the better one is kept. How much is tried depends on the
+photographs alone: the cost is counted by what is done, and no clock decides unless somebody asked for a deadline. One
+fallback simulates tilts in both directions, and stronger ones, as affine SIFT has them (Morel and Yu, 2009); another
+matches by networks that were trained on wide baselines (XFeat, LighterGlue), where their weights are.
 
 Where a refusal is about a few photographs, the rest is judged by itself. A photograph that shows little of what the
 others show, or only something that may have been moved, says nothing against these. They are judged as if it had never
@@ -114,22 +113,22 @@ def _catalogue() -> dict[str, Weights]:
 
 @dataclass(frozen=True, eq=False)
 class FallbackState:
-    """The view graph and configuration that cameras are estimated from, with the work spent so far."""
+    """The view graph and configuration that cameras are estimated from, with the cost so far."""
 
     graph: ViewGraph
     config: ReconstructionConfig
-    work: float = 0.0  # that went into them, as `config.fallbacks.budget` counts it
+    cost: float = 0.0  # of what was tried, as `config.fallbacks.budget` counts it
 
-    def add_work(self, work: float) -> FallbackState:
-        """The same, after so much further work."""
-        return replace(self, work=self.work + work)
+    def add_cost(self, cost: float) -> FallbackState:
+        """Returns the same state at a further cost."""
+        return replace(self, cost=self.cost + cost)
 
 
-# The means after each further piece of work, given those so far and the names of the keyframes in doubt; none
-# where this rung has nothing to add.
-Climb = Callable[[FallbackState, Collection[str]], Iterator[FallbackState]]
-# The work of matching a pair of the view graph further, by what there is to do: never by a clock.
-Work = Callable[[ViewGraph, Pair], float]
+# The state after each further pair, given the one so far and the names of the doubtful keyframes; none where this
+# fallback has nothing to add.
+GraphExtension = Callable[[FallbackState, Collection[str]], Iterator[FallbackState]]
+# What it costs to match a pair of the view graph further, by what there is to do: never by a clock.
+PairCost = Callable[[ViewGraph, Pair], float]
 
 
 @dataclass(frozen=True)
@@ -137,24 +136,23 @@ class Fallback:
     """One thing to try."""
 
     name: str  # as the verdict says what was tried
-    climb: Climb
-    obstacle: Callable[[], str] = lambda: ""  # what keeps this rung from being tried, in a word; empty: nothing does
+    extend: GraphExtension
+    unavailable_reason: Callable[[], str] = lambda: ""  # empty: it is available
 
 
 def match_weak_pairs(
-    means: FallbackState,
+    state: FallbackState,
     doubtful: Collection[str],
-    work: Work,
+    estimate_cost: PairCost,
     tilts: tuple[float, ...] = (),
     matcher: Matcher | None = None,
 ) -> Iterator[FallbackState]:
     """After each weak pair of a doubtful keyframe has got further matches, the most promising pairs first."""
-    for pair in find_weak_pairs(means.graph, doubtful):
-        cost = work(means.graph, pair)
-        means = replace(means, graph=match_weak_pair(means.graph, pair, tilts, matcher).select_geometries()).add_work(
-            cost
-        )
-        yield means
+    for pair in find_weak_pairs(state.graph, doubtful):
+        cost = estimate_cost(state.graph, pair)
+        graph = match_weak_pair(state.graph, pair, tilts, matcher).select_geometries()
+        state = replace(state, graph=graph).add_cost(cost)
+        yield state
 
 
 def find_weak_pairs(graph: ViewGraph, doubtful: Collection[str]) -> list[Pair]:
@@ -204,40 +202,44 @@ def _collect_poses(estimate: Reconstruction) -> dict[str, npt.NDArray[np.float64
 
 # Of the width, and below 1 of the height. The first matching has 1.6 of the width.
 _TILTS = (1.0 / 1.6, 2.5)
-_PIXEL = 2.3e-7  # work of finding features of both tilts, for each pixel that plain ones are looked for in
-_COMPARISON = 2.8e-9  # work, for each two plain features: about 2.8 times as many of other tilts are compared
+_COST_OF_PIXEL = 2.3e-7  # finding features of both tilts, for each pixel that plain ones are looked for in
+_COST_OF_COMPARISON = 2.8e-9  # for each two plain features: about 2.8 times as many of other tilts are compared
 
 
-def _match_affine(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
-    return match_weak_pairs(means, doubtful, _estimate_work, _TILTS)
+def _match_affine(state: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
+    return match_weak_pairs(state, doubtful, _estimate_cost, _TILTS)
 
 
-def _estimate_work(graph: ViewGraph, pair: Pair) -> float:
-    """Estimates the work of simulating tilts of the pair's images, and of comparing their features."""
+def _estimate_cost(graph: ViewGraph, pair: Pair) -> float:
+    """Estimates what it costs to simulate tilts of the pair's images, and to compare their features."""
     both = [graph.keyframes[index] for index in pair]
     untilted = [each for each in both if not np.isin(_TILTS, each.features.tilt).all()]
     searched = sum(count_search_pixels(each.frame.image, graph.config.features) for each in untilted)
     compared = np.prod([(each.features.tilt == PLAIN).sum() for each in both], dtype=float)
-    return _PIXEL * searched + _COMPARISON * float(compared)
+    return _COST_OF_PIXEL * searched + _COST_OF_COMPARISON * float(compared)
 
 
 AFFINE_SIMULATION = Fallback("stronger tilts", _match_affine)
 
 
-PAIR = 0.48  # work, with its share of finding the photographs' points: the networks take pictures of one size only
+LEARNED_PAIR_COST = (
+    0.48  # with its share of finding the photographs' points: the networks take pictures of one size only
+)
 _PART = LearnedPart("xfeat", "matches of wide baselines", xfeat.WEIGHTS, xfeat.PACKAGE)
 
 
-def _match_learned(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
-    if means.config.prior.kind != "classical":  # another prior has been asked for matches
+def _match_learned(state: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
+    if state.config.prior.kind != "classical":  # another prior has been asked for matches
         return iter(())
-    return match_weak_pairs(means, doubtful, lambda graph, pair: PAIR, matcher=xfeat.load(xfeat.Config()).matcher)
+    return match_weak_pairs(
+        state, doubtful, lambda graph, pair: LEARNED_PAIR_COST, matcher=xfeat.load(xfeat.Config()).matcher
+    )
 
 
 LEARNED_MATCHES = Fallback("learned matches", _match_learned, partial(find_unavailable_reason, _PART))
 
 
-MIN_LEFT = 3  # photographs with cameras: of fewer, nothing tells whether one of them is wrong
+MIN_REMAINING = 3  # photographs with cameras: of fewer, nothing tells whether one of them is wrong
 
 
 def estimate_without_doubtful(
@@ -252,7 +254,7 @@ def estimate_without_doubtful(
         doubtful = frozenset(other.verdict.frames) - left_out
         left_out |= doubtful
         few = 2 * len(left_out) < len(estimate.graph.keyframes)
-        if not doubtful or not few or len(other.camera_names - left_out) < MIN_LEFT:
+        if not doubtful or not few or len(other.camera_names - left_out) < MIN_REMAINING:
             return estimate
         other = estimate_cameras(estimate.graph.forget_pairs(left_out), rejected, config, run)
     if other is estimate or other.verdict.code is Code.OK_ROUGH:
@@ -272,11 +274,11 @@ def _explain_left_out(other: Reconstruction, refused: Reconstruction, left_out: 
 
 log = logging.getLogger(__name__)
 
-RUNGS = (LEARNED_MATCHES, AFFINE_SIMULATION)  # what wins most for its work comes first
-CAMERAS = 0.2  # work of estimating the cameras again, for each keyframe
+FALLBACKS = (LEARNED_MATCHES, AFFINE_SIMULATION)  # what wins most for its work comes first
+CAMERA_COST = 0.2  # of estimating the cameras again, for each keyframe
 LACKING_MATCHES = (Code.NO_OVERLAP, Code.SPLIT, Code.OK_PARTIAL, Code.AMBIGUOUS)
 # What is too little to be seen by photographs may be enough to be measured by a depth camera
-WANTING_SIGHT = (
+NEEDING_DEPTH = (
     *(Code.NO_OVERLAP, Code.SPLIT, Code.AMBIGUOUS, Code.LOW_TEXTURE, Code.NO_PARALLAX, Code.PLANAR_ONLY),
     *(Code.BASELINE_TOO_SMALL, Code.UNDETERMINED),
 )
@@ -290,22 +292,22 @@ def run_fallbacks(
     rejected: Sequence[Rejected],
     config: ReconstructionConfig,
     run: RunContext = BACKGROUND,
-    rungs: Sequence[Fallback] = RUNGS,
+    fallbacks: Sequence[Fallback] = FALLBACKS,
 ) -> Reconstruction:
-    """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
+    """Returns the best of `estimate` and what the `fallbacks` lead to; a refusal then says what was tried.
 
-    With `config.no_fallbacks` it is `estimate`. `config.fallbacks` bounds the work that is added: what it comes to is
-    looked at between pairs and before each rung, as is the deadline. A pair and an estimate
-    that have begun are finished. Where that does not help, photographs in doubt are left out.
+    With `config.no_fallbacks` it is `estimate`. `config.fallbacks` bounds the cost: it is compared with the budget
+    between pairs and before each fallback, as is the deadline. A pair and an estimate that have begun are finished.
+    Where that does not help, doubtful photographs are left out.
     """
     if config.no_fallbacks:
         return estimate
     if _lacks_matches(estimate):
-        estimate = _try_fallbacks(estimate, rejected, config, run, rungs)
+        estimate = _try_fallbacks(estimate, rejected, config, run, fallbacks)
     if run.is_over:
         return estimate
     estimate = estimate_without_doubtful(estimate, rejected, config, run)
-    if not _wants_depth(estimate):
+    if not _needs_depth(estimate):
         return _extend_by_depth(estimate, config, run)
     by_depth = estimate_cameras_by_depth(estimate.graph, config, run)
     if by_depth is None or not by_depth.publishable:
@@ -328,13 +330,13 @@ def _extend_by_depth(estimate: Reconstruction, config: ReconstructionConfig, run
     return extended
 
 
-def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, rungs: Sequence[Fallback] = RUNGS) -> str:
-    """Identifies what the rungs start from: the keyframes, their matches, the budget, and which rungs are available.
+def make_fallback_key(graph: ViewGraph, config: ReconstructionConfig, fallbacks: Sequence[Fallback] = FALLBACKS) -> str:
+    """Identifies what fallbacks start from: the keyframes, their matches, the budget, and which ones are available.
 
-    Rungs that gained nothing gain nothing from an equal start. The key is the same in another process.
+    Fallbacks that gained nothing gain nothing from an equal start. The key is the same in another process.
     """
     digest, names = hashlib.blake2b(digest_size=16), graph.names
-    available = [f"{rung.name}: {rung.obstacle()}" for rung in rungs]
+    available = [f"{each.name}: {each.unavailable_reason()}" for each in fallbacks]
     for text in (repr(config.fallbacks), *available, *sorted(names)):
         digest.update(f"{text}\0".encode(errors="surrogateescape"))
     by_name = {tuple(sorted((names[i], names[j]))): pair for (i, j), pair in graph.pairs.items()}
@@ -350,37 +352,37 @@ def _try_fallbacks(
     rejected: Sequence[Rejected],
     config: ReconstructionConfig,
     run: RunContext,
-    rungs: Sequence[Fallback],
+    fallbacks: Sequence[Fallback],
 ) -> Reconstruction:
-    means, most_s = FallbackState(estimate.graph, config), config.fallbacks.timeout_s
+    state, most_s = FallbackState(estimate.graph, config), config.fallbacks.timeout_s
     run = run if most_s is None else run.advance_deadline(time.monotonic() + most_s)
     tried: list[str] = []
     not_tried: list[str] = []
-    for rung in rungs:
+    for fallback in fallbacks:
         doubtful = find_doubtful_keyframes(estimate)
-        if not doubtful or _is_exhausted(means, run):
+        if not doubtful or _is_exhausted(state, run):
             break
-        obstacle = rung.obstacle()
-        if obstacle:
-            not_tried.append(f"{rung.name} ({obstacle})")
+        reason = fallback.unavailable_reason()
+        if reason:
+            not_tried.append(f"{fallback.name} ({reason})")
             continue
-        before = means
-        means = _run_fallback(rung.climb(before, doubtful), before, run)
-        if means is before:
+        before = state
+        state = _run_fallback(fallback.extend(before, doubtful), before, run)
+        if state is before:
             continue
-        other = estimate_cameras(means.graph, rejected, means.config, run)
-        means = means.add_work(CAMERAS * len(means.graph.keyframes))
+        other = estimate_cameras(state.graph, rejected, state.config, run)
+        state = state.add_cost(CAMERA_COST * len(state.graph.keyframes))
         estimate = choose_better_reconstruction(estimate, other)
         gained = "more photographs found their place" if estimate is other else "nothing gained"
-        log.info("looked for more matches: %s: %s by %.1f of work", rung.name, gained, means.work - before.work)
-        tried.append(rung.name)
+        log.info("looked for more matches: %s: %s at a cost of %.1f", fallback.name, gained, state.cost - before.cost)
+        tried.append(fallback.name)
     return _append_tried(estimate, {"Also tried": tried, "Not tried": not_tried})
 
 
-def _wants_depth(estimate: Reconstruction) -> bool:
+def _needs_depth(estimate: Reconstruction) -> bool:
     """Whether photographs show too little, where few matches at most speak against a lens."""
     code = estimate.verdict.code
-    return code in WANTING_SIGHT or (code is Code.FOCAL_SUSPECT and not find_telling_pairs(estimate.graph))
+    return code in NEEDING_DEPTH or (code is Code.FOCAL_SUSPECT and not find_telling_pairs(estimate.graph))
 
 
 def _advise_lens(estimate: Reconstruction) -> Reconstruction:
@@ -397,19 +399,19 @@ def _lacks_matches(estimate: Reconstruction) -> bool:
     return code in LACKING_MATCHES or (code in UNCERTAIN and bool(find_unplaced_keyframes(estimate)))
 
 
-def _run_fallback(climb: Iterator[FallbackState], means: FallbackState, run: RunContext) -> FallbackState:
-    """The means after the last piece of work that begins before the climb ends."""
-    for further in climb:
-        means = further
+def _run_fallback(steps: Iterator[FallbackState], state: FallbackState, run: RunContext) -> FallbackState:
+    """Returns the state after the last pair that begins within the budget and before the deadline."""
+    for further in steps:
+        state = further
         run.pause()
-        if _is_exhausted(means, run):
+        if _is_exhausted(state, run):
             break
-    return means
+    return state
 
 
-def _is_exhausted(means: FallbackState, run: RunContext) -> bool:
-    """Whether nothing further begins, for these means or since the deadline has passed."""
-    return means.work >= means.config.fallbacks.budget or run.is_over
+def _is_exhausted(state: FallbackState, run: RunContext) -> bool:
+    """Whether nothing further begins: the budget is spent, or the deadline has passed."""
+    return state.cost >= state.config.fallbacks.budget or run.is_over
 
 
 def find_doubtful_keyframes(estimate: Reconstruction) -> frozenset[str]:
@@ -423,10 +425,10 @@ def find_unplaced_keyframes(estimate: Reconstruction) -> frozenset[str]:
     return frozenset(estimate.graph.names) - estimate.camera_names
 
 
-def _append_tried(estimate: Reconstruction, rungs: Mapping[str, Sequence[str]]) -> Reconstruction:
+def _append_tried(estimate: Reconstruction, tried: Mapping[str, Sequence[str]]) -> Reconstruction:
     """Appends the fallbacks to the verdict's message, unless nothing is left to explain."""
     if not find_doubtful_keyframes(estimate):
         return estimate
-    sentences = [f"{what}: {', '.join(names)}." for what, names in rungs.items() if names]
+    sentences = [f"{what}: {', '.join(names)}." for what, names in tried.items() if names]
     message = " ".join([estimate.verdict.message, *sentences])
     return replace(estimate, verdict=replace(estimate.verdict, message=message)) if sentences else estimate

@@ -289,7 +289,7 @@ class IncrementalReconstruction:
         self.clock.lap("poses")
         estimate = self._run_fallbacks(estimate, rejected, run)
         self._remember(estimate)
-        self.clock.lap("ladder")
+        self.clock.lap("fallbacks")
         return estimate
 
     @contextlib.contextmanager

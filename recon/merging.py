@@ -98,7 +98,7 @@ def load_submaps(whole: MapSet, of: JoinedMap) -> Submaps:
     """
     used, left_out = [], {}
     for scene_id, placement in of.placements.items():
-        place = whole.places[scene_id]
+        place = whole.submaps[scene_id]
         why = _explain_exclusion(place)
         if why:
             left_out[scene_id] = why
@@ -168,7 +168,7 @@ def scale_and_up(whole: MapSet, of: JoinedMap, scenes: Sequence[str]) -> tuple[S
 
     The world and the unit are those of the scene that the map is named after. Raises SceneFileError, OSError.
     """
-    place = whole.places.get(of.name)
+    place = whole.submaps.get(of.name)
     if place is None or place.folder is None:
         return Scale(), None
     scale, up = StoredResult.create_from_path(place.folder).scale(), read_up(place.folder)

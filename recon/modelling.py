@@ -109,7 +109,7 @@ def _seconds(
     gain = _gain(done / planned, EARLIER)
     if not done:
         stages = {
-            "cameras": seconds.get("poses", 0.0) + seconds.get("ladder", 0.0),
+            "cameras": seconds.get("poses", 0.0) + seconds.get("fallbacks", 0.0),
             "points": seconds.get("points", 0.0),
         }
         taken = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())

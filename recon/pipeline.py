@@ -122,7 +122,7 @@ def estimate_frame_cameras(
     estimate = estimate_cameras(graph, rejected, config, run.report("finding and checking the cameras"))
     clock.lap("poses")
     estimate = run_fallbacks(estimate, rejected, config, run.report("looking for more matches"))
-    clock.lap("ladder")
+    clock.lap("fallbacks")
     return estimate, dropped + unusable
 
 

@@ -23,10 +23,10 @@ from pathlib import Path
 import msgspec
 import yaml
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import Network
+from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.checkpoint import Store
 from tests.support.synthetic import SMALL, places
 

@@ -424,9 +424,9 @@ class MapView:
             if piece.cameras
         }
         nodes = []
-        without = [scene_id for scene_id, place in self._whole.places.items() if not has_scene(place)]
+        without = [scene_id for scene_id, place in self._whole.submaps.items() if not has_scene(place)]
         for scene_id in dict.fromkeys([*self._of.placements, *without]):
-            place = self._whole.places[scene_id]
+            place = self._whole.submaps[scene_id]
             level, count = self._loader.shown.get(scene_id, (NOTHING, 0))
             good = any(piece.scene_id == scene_id for piece in self._pieces.pieces)
             nodes.append(GraphNode(scene_id, place.verdict, good, centres.get(scene_id), count, level))
@@ -461,7 +461,7 @@ def _read_maps(maps: Maps) -> MapSet:
 
 def _list_shown_maps(whole: MapSet) -> list[JoinedMap]:
     """Those with a scene to show."""
-    return [each for each in whole.maps if any(has_scene(whole.places[scene_id]) for scene_id in each.placements)]
+    return [each for each in whole.maps if any(has_scene(whole.submaps[scene_id]) for scene_id in each.placements)]
 
 
 class MapSource:

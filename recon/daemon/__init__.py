@@ -137,7 +137,7 @@ PLACES = 8  # that a heartbeat tells of; places.json has all
 
 
 class SubmapStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A place, as it was when it was last worked on."""
+    """A submap, as it was when it was last worked on."""
 
     scene_id: Name
     state: Name  # here, left, finished
@@ -174,8 +174,8 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     keyframe_s: Amount | None  # from the last keyframe's arrival until the scene showed it
     delay_s: Amount  # that the oldest keyframe has waited which no scene shows yet; 0: none waits
     delay: Text  # what it waits for
-    unfinished: Count  # places that were left and whose scenes are not final yet
-    scenes: Count  # whose cameras are judged with all evidence, of all places
+    unfinished: Count  # inactive submaps whose scenes are not final yet
+    scenes: Count  # whose cameras are verified with all evidence, of all submaps
     maps: Count  # that these are, joined by the chains and loops that count
     loops: Count
     newest_places: Annotated[tuple[SubmapStatus, ...], msgspec.Meta(max_length=PLACES)]
@@ -213,7 +213,7 @@ class Backlog:
     """The work that waits, beside what is being done."""
 
     keyframes: int = 0  # that no scene shows yet, those that are being worked in among them
-    unjudged: int = 0  # places that were left, the one that is being judged among them
+    unjudged: int = 0  # inactive submaps that are not verified, the one in work among them
     unfinished: int = 0  # of which no scene is final yet, these and others that are judged
 
 

@@ -1,19 +1,19 @@
 """The checkpoint: all that a daemon needs to continue after it was killed.
 
-    ledger              where the present place begins, and which frames are no longer stored
+    ledger              where the active submap begins, and which frames are no longer stored
     frames/<number>     a keyframe as it came; numbers count all keyframes that ever came
     graph               features and matches
     judgement           the cameras that they lead to, the evidence and the verdict
     fallbacks           what was tried for want of matches, and gained nothing: it is not tried again
     scene               cameras and Gaussians as they are shown
     pointmaps           depth maps of its views, from which it grows
-    left/<place>/       a place that was left and whose scene is not final yet: a checkpoint of its own
-    finished/<place>/   one whose scene is final: frames, graph and judgement
-    codes               in the folder of a place that was left: that it is judged, and by what it is recognised
+    left/<scene>/       an inactive submap whose scene is not final yet: a checkpoint of its own
+    finished/<scene>/   one whose scene is final: frames, graph and judgement
+    codes               in the folder of an inactive submap: it is verified, and is recognised by these
 
 Graph, judgement, fallbacks, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged
 once its file is there, those of a frame set once all are: where a kill left some of a set out, the next start forgets
-the others, and all come again. Every file is whole or not there, and has a checksum. A place is what one scene shows.
+the others, and all come again. Every file is whole or not there, and has a checksum. A submap is what one scene shows.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ from splatnode.recon.verification.evidence import Evidence
 log = logging.getLogger(__name__)
 
 REMEMBERED = 1000  # removed frames that are recognised if their sender missed the acknowledgement
-REMEMBERED_DROPPED = 1000  # names and reasons, of a place
+REMEMBERED_DROPPED = 1000  # names and reasons, of a submap
 _INSTEAD = "--checkpoint (or $XDG_STATE_HOME)"
 
 
@@ -110,7 +110,7 @@ class Store:
         remove_leftovers(directory)
         remove_leftovers(self._frames)
         self.ledger = ensure_identity(directory)
-        records.remove_incomplete(directory, self.ledger.place)
+        records.remove_incomplete(directory, self.ledger.number)
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
         self._taken: dict[str, tuple[str, Stamp]] = {}  # camera id and time of the frames that have both
@@ -162,7 +162,7 @@ class Store:
         return [*self.ledger.gone, *self._keys.values()]
 
     def frames(self) -> Iterator[StoredFrame]:
-        """The present place's frames that an earlier process stored, oldest first; each is returned once."""
+        """The active submap's frames that an earlier process stored, oldest first; each is returned once."""
         while self._found:
             yield self._found.popleft()
 
@@ -257,7 +257,7 @@ class Store:
     def forget_frames(self, names: Iterable[str], reason: str, elsewhere: Iterable[tuple[str, str]] = ()) -> None:
         """As `forget`, of several frames at once, so that no kill leaves half of a frame set. Raises OSError.
 
-        `elsewhere`: ids of scenes whose places were left, each with a name; these scenes are to lose such a frame.
+        `elsewhere`: ids of scenes of inactive submaps, each with a name; these scenes are to lose such a frame.
         """
         with self._writing:
             here = {self._names[name]: name for name in names if name in self._names}
@@ -273,9 +273,9 @@ class Store:
             self._write(msgspec.structs.replace(self.ledger, retracted=retracted))
 
     def leave_submap(self, first: int, shared: Collection[str] = ()) -> None:
-        """Begins another place as `begin_submap` does, and keeps what there is of the present one. Raises OSError.
+        """Begins the next submap as `begin_submap` does, and keeps the present one as an inactive one. Raises OSError.
 
-        `shared` are frames from `first` on that belong to both. A death in between leaves the place as it was.
+        `shared` are frames from `first` on that belong to both. A kill in between leaves the submap as it was.
         """
         with self._writing:
             own = (number for name, number in self._names.items() if number < first or name in shared)
@@ -286,9 +286,9 @@ class Store:
             self.begin_submap(first, shared)
 
     def split_off(self, names: Collection[str], present: bool = False) -> str:
-        """Makes a place of its own of frames of this place, forgets them, and returns its id. Raises OSError.
+        """Makes a submap of its own of some of its frames, forgets them, and returns its id. Raises OSError.
 
-        It waits among the places that were left. `present`: this place is where the camera is, else it was left, too.
+        It waits among the inactive submaps. `present`: this one is the active submap, else it is inactive, too.
         """
         with self._writing:
             numbers = sorted(self._names[name] for name in names)
@@ -308,17 +308,17 @@ class Store:
             return ledger.scene_id
 
     def begin_submap(self, first: int, shared: Collection[str] = ()) -> None:
-        """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError.
+        """Begins the next submap with frame `first`; the frames before it and their scene are removed. Raises OSError.
 
         It goes on from the present one where they have `shared` frames.
         """
         with self._writing:
-            # First: what a death leaves of the place before can be made anew, of this one not.
+            # First: what a kill leaves of the submap before can be made anew, of this one not.
             records.remove_rebuild_requests(self.directory, *MADE_ANEW)
             before = {number: name for name, number in self._names.items() if number < first}
             gone = (*self.ledger.gone, *(self._keys[number] for number in before))
-            place = self.ledger.place + 1
-            began = {"place": place, "first": first, "next": self._next, "gone": gone[-REMEMBERED:], "dropped": ()}
+            number = self.ledger.number + 1
+            began = {"number": number, "first": first, "next": self._next, "gone": gone[-REMEMBERED:], "dropped": ()}
             chain = {"follows": self.scene_id if shared else "", "shared": tuple(sorted(shared))}
             self._write(msgspec.structs.replace(self.ledger, **began, **chain))
             self._unlink(before)
@@ -336,7 +336,7 @@ class Store:
         records.remove_rebuild_requests(self.directory, *records.SHOWN)
 
     def finalize(self) -> None:
-        """Takes a place that was left among the finished ones. Nothing is read or written here afterwards.
+        """Takes an inactive submap among the finished ones. Nothing is read or written here afterwards.
 
         Raises OSError.
         """

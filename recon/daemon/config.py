@@ -10,9 +10,9 @@ import msgspec
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.former_names import NODE_KEYS
 from splatnode.recon.config import ReconstructionConfig
+from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.ingest import FrameSetConfig
 from splatnode.recon.daemon.relocalization import LocatorConfig
-from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
 from splatnode.recon.daemon.relocalization import TrackingConfig as Tracking
 from splatnode.recon.result.message import MAX_CAMERAS
 

@@ -1,4 +1,4 @@
-"""Free space beside finished scenes: of one that grows, and of all scenes of a map in one frame."""
+"""Free space: of a final scene, of one that grows, and of all scenes of a map in one frame."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.system import raise_shortage
 from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.recon.core import give_back_memory
+from splatnode.recon.daemon import ReconState
+from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.occupancy import (
     LONGEST_SIDE,
@@ -34,8 +38,9 @@ from splatnode.recon.result.export.limits import SceneFileError
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.stored_snapshot import read_depths
 from splatnode.recon.result.submap_index import FILE, JoinedMap, MapSet, read_map_set
-from splatnode.recon.threads import apply_thread_limit
+from splatnode.recon.threads import RunContext, apply_thread_limit
 
 Array = npt.NDArray[np.float64]
 
@@ -182,6 +187,82 @@ def _sample_occupied(part: PlacedMap) -> Array:
     return part.transform_to_all(part.occupancy.origin + points * part.occupancy.voxel)
 
 
+# The map of the active submap: which space is free, occupied, or not seen; made in spare moments, of final scenes.
+
+NOT_FINAL = "a map is made of a scene that is final: when no keyframe has come for a while"
+LOST = "the last keyframes do not belong to the scene: where the robot is now is not known"
+
+
+class OccupancyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    live: bool = False  # send the map of each scene that is final, as the service recon.map
+    # With `live`: send a map of the scene while it grows, too, marked provisional. It is less certain, and changes
+    provisional: bool = False
+    # Keep a file out/free_space/MAP.npz for each map: the free space of all its final scenes, in one frame
+    maps: bool = False
+    # Side of a voxel, in the unit of the scene; nothing: as `splatnode occupancy` chooses it
+    voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyResult:
+    """The occupancy map of a scene, or the reason why there is none."""
+
+    of: FinalScene
+    occupancy: OccupancyMap | None
+    why: str = ""  # there is none
+
+
+class OccupancyMapper:
+    """Maps the active submap. `map_scene` is for the thread that works; any thread may ask for `find_current_map`."""
+
+    def __init__(self, config: OccupancyConfig) -> None:
+        self._config = config
+        self._made: OccupancyResult | None = None
+
+    def map_scene(self, finished: FinalScene | None, state: ReconState, folder: Path, run: RunContext) -> bool:
+        """Maps the final scene, of which `folder` is the result; False where there was nothing to do.
+
+        What a pause raises ends the work.
+        """
+        if not self._config.live or finished is None or state is ReconState.LOST or self._is_map_of(finished):
+            return False
+        try:
+            snapshot = _add_depths(finished.snapshot, folder)
+            occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=run.pause), ""
+        except ValueError as error:
+            occupancy, why = None, str(error)
+        self._made = OccupancyResult(finished, occupancy, why)
+        shares = {} if occupancy is None else {name: round(share, 4) for name, share in occupancy.shares.items()}
+        event(log, logging.INFO, "map", why=why, **shares)
+        return True
+
+    def find_current_map(self, finished: FinalScene | None, state: ReconState) -> OccupancyResult | str:
+        """The map of this scene as it is now, or why there is none."""
+        if state is ReconState.LOST:
+            return LOST
+        made = self._made
+        return made if made is not None and made.of is finished else NOT_FINAL
+
+    def _is_map_of(self, finished: FinalScene) -> bool:
+        return self._made is not None and self._made.of is finished
+
+
+def _add_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
+    """Adds the multi-view consistent depths, from the result folder if an earlier process made the scene."""
+    if snapshot.depths or not folder.is_dir():
+        return snapshot
+    try:
+        depths, written = read_depths(folder), read_cameras(folder / "cameras.json")
+    except (OSError, ValueError) as error:
+        raise_shortage(error)
+        log.warning("the depths in %s cannot be read: %s", folder, error)
+        return snapshot
+    poses = {camera.name: camera.T_world_camera for camera in written}
+    ours = [(camera.T_world_camera, poses.get(camera.name)) for camera in snapshot.cameras]
+    same = all(pose is not None and np.allclose(shown, pose, rtol=0, atol=1e-6) for shown, pose in ours)
+    return replace(snapshot, depths=depths) if same else snapshot
+
+
 # The thread that maps free space while a scene grows; what it makes is provisional, and is withdrawn with the world.
 #
 # It maps the newest scene that is shown, and then the newest again: a keyframe waits for no map, and a map for no
@@ -306,7 +387,7 @@ def add_growing_depths(snapshot: Snapshot, pointmaps: Mapping[str, Pointmap]) ->
 
 # The thread that keeps a file of each map's free space: of all its final scenes, in one frame, as links join them.
 #
-# It reads what the node writes: the index of places, and the results of final scenes. A file is written anew when a
+# It reads what the node writes: the index of submaps, and the results of final scenes. A file is written anew when a
 # scene becomes final, when a loop joins or moves scenes, and is removed when its map is no more. A scene that grows,
 # and shares photographs with one of the map, is added, marked, and taken out again with its world.
 
@@ -410,7 +491,7 @@ class WholeMapper:
     def _map_scenes(self, found: MapSet) -> dict[str, _Key]:
         """The keys of the maps of all final scenes that have one, by scene."""
         keys = {}
-        for name, place in found.places.items():
+        for name, place in found.submaps.items():
             if place.folder is None or place.provisional or not place.publishable:
                 continue
             try:
@@ -499,7 +580,7 @@ def find_shared_placement(cameras: Sequence[CameraEstimate], found: MapSet, join
     """
     own = {camera.name: camera.T_world_camera for camera in cameras}
     for name in reversed(list(joined.placements)):  # it most likely goes on from the newest
-        place = found.places[name]
+        place = found.submaps[name]
         if place.folder is None or len(own.keys() & set(place.frames_used)) < LEAST_SHARED:
             continue
         there = {camera.name: camera.T_world_camera for camera in read_cameras(place.folder / "cameras.json")}

@@ -1,4 +1,4 @@
-"""The ledger of a checkpoint: where its place begins, and which frames are no longer stored."""
+"""The ledger of a checkpoint: where its submap begins, and which frames are no longer stored."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from splatnode.capture.process.system import raise_shortage
 
 log = logging.getLogger(__name__)
 
-# Of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes, 5 neither given
+# Of a checkpoint's files: 1 knew no time of capture, 2 no split submaps, 3 no masks, 4 no fisheyes, 5 neither given
 # poses nor lenses that were estimated, 6 one radial coefficient of a lens, 7 nothing brighter than white, 8 no frames
 # that were stored together.
 VERSION = 9
@@ -48,21 +48,21 @@ class CheckpointError(ValueError):
 
 class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     version: int = VERSION
-    place: int = 1  # number of the present place, from 1
-    first: int = 0  # number of the present place's first frame
+    number: int = msgspec.field(default=1, name="place")  # of the active submap, from 1
+    first: int = 0  # number of the active submap's first frame
     next: int = 0  # at least this is the number of the next frame
     gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
     dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
     identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
     follows: str = ""  # the scene that the present one goes on from; empty: it began anew
     shared: tuple[str, ...] = ()  # names of the frames that both have
-    part: int = 0  # of a place that turned out to be several: number of its first frame, from 1; 0: no part
-    retracted: tuple[tuple[str, str], ...] = ()  # scene and name of frames that places that were left are to lose
+    part: int = 0  # of a submap that turned out to be several: number of its first frame, from 1; 0: no part
+    retracted: tuple[tuple[str, str], ...] = ()  # scene and name of frames that inactive submaps are to lose
 
     @property
     def scene_id(self) -> str:
         """The id of the active submap's scene."""
-        return f"scene-{self.place:04d}" + (f"-{self.part}" if self.part else "")
+        return f"scene-{self.number:04d}" + (f"-{self.part}" if self.part else "")
 
 
 def read_ledger(directory: Path) -> Ledger:
@@ -111,11 +111,11 @@ def ensure_identity(directory: Path) -> Ledger:
     return ledger
 
 
-# Places that the camera has left, each a checkpoint of its own: left/scene-NNNN while its scene is not final yet.
+# Inactive submaps, each a checkpoint of its own: left/scene-NNNN while its scene is not final yet.
 #
 # What turns out to show another place than the rest becomes left/scene-NNNN-M: M is its first frame's number, from 1.
 # A folder counts from the moment when it has a ledger, and no longer once it has none. One whose scene is final is
-# finished/scene-NNNN: by what it holds a place is recognised when the camera comes back.
+# finished/scene-NNNN: by what it holds a submap is recognised when the camera comes back.
 
 LEFT, FINISHED = "left", "finished"
 
@@ -129,10 +129,10 @@ def link_left_checkpoint(directory: Path, ledger: Ledger, files: Iterable[str], 
 
 
 def link_split_checkpoint(folder: Path, ledger: Ledger, files: Iterable[str], instead: str, present: bool) -> None:
-    """Links `files` of a place, in `folder`, into a folder of their own among those that were left, as
+    """Links `files` of a submap, in `folder`, into a folder of their own among those that were left, as
     `link_left_checkpoint` does.
 
-    `present`: the place is where the camera is, else one that was left. A part that is there already, from a process
+    `present`: it is the active submap, else an inactive one. A part that is there already, from a process
     that did not get any further, stays as it is.
     """
     target = folder / LEFT / ledger.scene_id if present else folder.with_name(ledger.scene_id)
@@ -174,7 +174,7 @@ def list_finished_folders(directory: Path) -> list[Path]:
 
 
 def move_to_finished(folder: Path, instead: str) -> None:
-    """Takes the checkpoint of a place that was left among the finished ones.
+    """Moves the checkpoint of an inactive submap to the finished ones.
 
     Raises OSError, and NotOwnerOnly as `link_left_checkpoint`.
     """
@@ -186,7 +186,7 @@ def move_to_finished(folder: Path, instead: str) -> None:
 
 
 def reopen(directory: Path, scene_id: str) -> Path | None:
-    """The folder of a place that was left, taken back from the finished ones if it is there; None where there is none.
+    """The folder of an inactive submap, moved back from the finished ones if it is there; None where there is none.
 
     Raises OSError.
     """
@@ -198,26 +198,26 @@ def reopen(directory: Path, scene_id: str) -> Path | None:
 
 
 def remove_left_checkpoint(folder: Path) -> None:
-    """Removes the checkpoint of a place that was left. What the disk keeps of it, the next start removes."""
+    """Removes the checkpoint of an inactive submap. What the disk keeps of it, the next start removes."""
     (folder / LEDGER_FILE).unlink(missing_ok=True)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def remove_incomplete(directory: Path, place: int) -> None:
-    """Removes half-written files, and folders of places that were not left yet, `place` among them, or removed.
+def remove_incomplete(directory: Path, active: int) -> None:
+    """Removes half-written files, and folders of submaps that are not inactive yet, `active` among them, or removed.
 
-    A part of `place` stays: it is a place of its own from the moment when its folder has a ledger.
+    A part of `active` stays: it is a submap of its own from the moment when its folder has a ledger.
     """
     for folder in (directory / LEFT).glob("scene-*"):
         number, *part = _parse_place_number(folder)
-        if number > place or (number == place and not part) or not (folder / LEDGER_FILE).exists():
+        if number > active or (number == active and not part) or not (folder / LEDGER_FILE).exists():
             remove_left_checkpoint(folder)
     for folder in (*list_left_folders(directory), *list_finished_folders(directory)):
         remove_leftovers(folder)
 
 
 def _parse_place_number(folder: Path) -> tuple[int, ...]:
-    """The number of the place, and of the part of it; 0 for what is no number."""
+    """Returns the number of the submap, and of the part of it; 0 for what is no number."""
     return tuple(int(each) if each.isdecimal() else 0 for each in folder.name.removeprefix("scene-").split("-"))
 
 

@@ -20,8 +20,8 @@ from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import checkpoint, ledger
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import CheckpointError
-from splatnode.recon.daemon.output import SubmapIndex
 from splatnode.recon.daemon.pose_graph import EdgeKind, PoseGraphEdge, make_loop_edge
+from splatnode.recon.daemon.submap_index import SubmapIndex
 from splatnode.recon.estimation import estimate_cameras, load_prior
 from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching import pair_matching
@@ -294,9 +294,9 @@ NEAR = 2  # links of a chain: scenes so near have much in common, and a loop bet
 
 
 class LoopDetector:
-    def __init__(self, directory: Path, config: ReconstructionConfig, places: SubmapIndex) -> None:
+    def __init__(self, directory: Path, config: ReconstructionConfig, index: SubmapIndex) -> None:
         """`directory` is that of the checkpoint which has left/ and finished/ in it, `config` how scenes are made."""
-        self._directory, self._config, self._places = directory, config, places
+        self._directory, self._config, self._index = directory, config, index
         self._matcher: Matcher | None = None
         self._codes: dict[str, Codes] = {}
         for folder in (*ledger.list_finished_folders(directory), *ledger.list_left_folders(directory)):
@@ -330,8 +330,8 @@ class LoopDetector:
         if self._matcher is None:
             self._matcher = load_prior(self._config).matcher
         codes = {**self._codes, scene: compute_global_descriptors(graph.keyframes)}
-        common, near = compute_mean_descriptor(codes), _find_neighbours(scene, self._places.links)
-        mine = LoopSide(scene, graph, self._places.load_cameras(scene), centre_descriptors(codes[scene], common))
+        common, near = compute_mean_descriptor(codes), _find_neighbours(scene, self._index.links)
+        mine = LoopSide(scene, graph, self._index.load_cameras(scene), centre_descriptors(codes[scene], common))
         loops: list[PoseGraphEdge] = []
         for other in [each for each in rank_similar_scenes(scene, codes) if each not in near][:TRIED]:
             run.pause()
@@ -340,7 +340,7 @@ class LoopDetector:
             loops += [] if link is None else [link]
             if len(loops) == MOST_LOOPS:
                 break
-        self._places.add_loops(scene, loops)
+        self._index.add_loops(scene, loops)
         return codes[scene]
 
     def _load_graph(self, scene: str) -> ViewGraph:
@@ -362,7 +362,7 @@ class LoopDetector:
         graph, codes = self._load_graph(other), self._codes.get(other)
         if codes is None or len(graph.keyframes) != len(codes):
             return None  # something of it is damaged
-        theirs = LoopSide(other, graph, self._places.load_cameras(other), centre_descriptors(codes, common))
+        theirs = LoopSide(other, graph, self._index.load_cameras(other), centre_descriptors(codes, common))
         found, link = verify_loop(theirs, mine, self._config, self._matcher, run), None
         if isinstance(found, VerifiedLoop):
             ends = found.one, found.other

@@ -66,10 +66,17 @@ from splatnode.recon.config import apply_changes
 from splatnode.recon.daemon import ReconState, ReconStatus, WorldRecord, WorldRevisions
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.free_space import GrowingMapper, GrowingScene, ProvisionalMap, WholeMapper
+from splatnode.recon.daemon.free_space import (
+    NOT_FINAL,
+    GrowingMapper,
+    GrowingScene,
+    OccupancyResult,
+    ProvisionalMap,
+    WholeMapper,
+)
 from splatnode.recon.daemon.ingest import Inbox, Intake, RemovedFrame
 from splatnode.recon.daemon.output import OccupancyPublisher, PublishedSnapshot
-from splatnode.recon.daemon.relocalization import NOT_FINAL, LocatableScene, Locator, OccupancyResult, Watcher
+from splatnode.recon.daemon.relocalization import LocatableScene, Locator, Watcher
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.metric.arguments import collect_frame_changes, collect_marker_changes
 from splatnode.recon.result import snapshot as result_snapshot
@@ -245,7 +252,9 @@ class Daemon:
             network, config.reconstruction, self._store, self._inbox, self._problems, stopping, *several
         )
         self._worker = Worker(config, self._store, self._inbox, self._newest.update, stopping, self._worlds)
-        self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
+        self._watcher = Watcher(
+            network, config.tracking, lambda: self._worker.active.finished, self._problems, stopping
+        )
         self._scene_numbers = Numbering()
         session = self._scene_numbers.session
         self._depth_numbers = Numbering(session)
@@ -448,7 +457,7 @@ class Daemon:
         scenes, maps, loops = worker.map_counts
         return ReconStatus(
             **self._status_numbers.next(),
-            state=ReconState.FULL if intake.full else ReconState.LOADING if worker.loading else worker.place.state,
+            state=ReconState.FULL if intake.full else ReconState.LOADING if worker.loading else worker.active.state,
             uptime_s=time.monotonic() - self._started_s,
             scene_id=self._store.scene_id,
             keyframe=intake.newest,
@@ -462,14 +471,14 @@ class Daemon:
             bounds=sanitize_text(result_snapshot.format_widest_bounds(snapshot.cameras, snapshot.scale))
             if snapshot
             else "",
-            keyframe_s=worker.place.keyframe_s,
+            keyframe_s=worker.active.keyframe_s,
             delay_s=delay_s,
             delay=delay,
             unfinished=worker.num_unfinished,
             scenes=scenes,
             maps=maps,
             loops=loops,
-            newest_places=worker.newest_places,
+            newest_places=worker.newest_submaps,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
             rss_mb=resident_mb(),

@@ -12,8 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -28,11 +26,10 @@ from splatnode.capture.messaging.messages import Message, WireError
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_LOCATE, Network, NotAllowed, find_captures
 from splatnode.capture.messaging.pubsub import QueryServer, Subscriber
 from splatnode.capture.process.config import Internal
-from splatnode.capture.process.system import is_shortage, raise_shortage
+from splatnode.capture.process.system import is_shortage
 from splatnode.capture.process.terminal import Problems, event, is_logged
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon import poselib
-from splatnode.recon.daemon import ReconState
 from splatnode.recon.estimation import Reconstruction
 from splatnode.recon.geometry import MIN_DEPTH, project, transform_to_camera
 from splatnode.recon.keyframes import PLAIN, Keyframe
@@ -48,13 +45,10 @@ from splatnode.recon.locating import (
 from splatnode.recon.locating.localize import follow, localize_image
 from splatnode.recon.matching import features
 from splatnode.recon.modelling import add_landmarks
-from splatnode.recon.occupancy import OccupancyMap, occupancy_map
 from splatnode.recon.registration.registration import undistort_pixels
-from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, Landmarks, Snapshot
-from splatnode.recon.result.stored_snapshot import read_depths
-from splatnode.recon.threads import RunContext, apply_thread_limit
+from splatnode.recon.threads import apply_thread_limit
 
 Array = npt.NDArray[np.float64]
 
@@ -73,7 +67,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Least rendered opacity at a keyframe's feature; below, its depth is not known well enough
     min_alpha: Internal[float] = 0.8
     min_inliers: Internal[int] = 20  # points from which a camera is resected
-    min_share: Internal[float] = 0.3  # least inlier ratio; matches with another place reach 0.2
+    min_share: Internal[float] = 0.3  # least inlier ratio; matches with another submap reach 0.2
     max_error_px: Internal[float] = 3.0  # reprojection error of an inlier, at `longer_side`
     # Inliers share errors of the scene: more than so many make the position no more certain
     independent: Internal[int] = 50
@@ -410,83 +404,6 @@ class Watcher:
 def scale_intrinsics(camera: CameraEstimate, width: int, height: int) -> npt.NDArray[np.float64]:
     """(3, 3) intrinsic matrix of the same camera's image resized to `width` x `height`."""
     return np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
-
-
-# The map of the present scene: which space is free, occupied, or not seen; made in spare moments, of final scenes.
-
-
-NOT_FINAL = "a map is made of a scene that is final: when no keyframe has come for a while"
-LOST = "the last keyframes do not belong to the scene: where the robot is now is not known"
-
-
-class OccupancyConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    live: bool = False  # send the map of each scene that is final, as the service recon.map
-    # With `live`: send a map of the scene while it grows, too, marked provisional. It is less certain, and changes
-    provisional: bool = False
-    # Keep a file out/free_space/MAP.npz for each map: the free space of all its final scenes, in one frame
-    maps: bool = False
-    # Side of a voxel, in the unit of the scene; nothing: as `splatnode occupancy` chooses it
-    voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class OccupancyResult:
-    """The occupancy map of a scene, or the reason why there is none."""
-
-    of: FinalScene
-    occupancy: OccupancyMap | None
-    why: str = ""  # there is none
-
-
-class OccupancyMapper:
-    """Maps the present scene. `map_scene` is for the thread that works; any thread may ask for `find_current_map`."""
-
-    def __init__(self, config: OccupancyConfig) -> None:
-        self._config = config
-        self._made: OccupancyResult | None = None
-
-    def map_scene(self, finished: FinalScene | None, state: ReconState, folder: Path, run: RunContext) -> bool:
-        """Maps the final scene, of which `folder` is the result; False where there was nothing to do.
-
-        What a pause raises ends the work.
-        """
-        if not self._config.live or finished is None or state is ReconState.LOST or self._is_map_of(finished):
-            return False
-        try:
-            snapshot = _add_depths(finished.snapshot, folder)
-            occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=run.pause), ""
-        except ValueError as error:
-            occupancy, why = None, str(error)
-        self._made = OccupancyResult(finished, occupancy, why)
-        shares = {} if occupancy is None else {name: round(share, 4) for name, share in occupancy.shares.items()}
-        event(log, logging.INFO, "map", why=why, **shares)
-        return True
-
-    def find_current_map(self, finished: FinalScene | None, state: ReconState) -> OccupancyResult | str:
-        """The map of this scene as it is now, or why there is none."""
-        if state is ReconState.LOST:
-            return LOST
-        made = self._made
-        return made if made is not None and made.of is finished else NOT_FINAL
-
-    def _is_map_of(self, finished: FinalScene) -> bool:
-        return self._made is not None and self._made.of is finished
-
-
-def _add_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
-    """Adds the multi-view consistent depths, from the result folder if an earlier process made the scene."""
-    if snapshot.depths or not folder.is_dir():
-        return snapshot
-    try:
-        depths, written = read_depths(folder), read_cameras(folder / "cameras.json")
-    except (OSError, ValueError) as error:
-        raise_shortage(error)
-        log.warning("the depths in %s cannot be read: %s", folder, error)
-        return snapshot
-    poses = {camera.name: camera.T_world_camera for camera in written}
-    ours = [(camera.T_world_camera, poses.get(camera.name)) for camera in snapshot.cameras]
-    same = all(pose is not None and np.allclose(shown, pose, rtol=0, atol=1e-6) for shown, pose in ours)
-    return replace(snapshot, depths=depths) if same else snapshot
 
 
 # The thread that tells clients where their images were taken, in the scene that is shown: also while it grows.

@@ -1,6 +1,6 @@
-"""The place where the camera is: keyframes are worked in, the scene grows, is shown, and becomes as good as it gets.
+"""The active submap: keyframes are worked in, the scene grows, is shown, and becomes as good as it gets.
 
-Whether a keyframe belongs to the place has a quick answer at once, and a thorough one in the end; so has which views
+Whether a keyframe belongs to the submap has a quick answer at once, and a thorough one in the end; so has which views
 can be spared. A keyframe that does not fit at once is set aside, out of the scene: it may spoil it. It belongs all the
 same where all keyframes, estimated together as an offline run estimates them, make a scene: a later one may have
 joined it.
@@ -25,8 +25,9 @@ from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
 from splatnode.recon.daemon.loop_closure import LoopDetector
-from splatnode.recon.daemon.output import Output, SubmapState
+from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.relocalization import FinalScene
+from splatnode.recon.daemon.submap_index import SubmapState
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -37,7 +38,7 @@ from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.threads import BACKGROUND, RunContext
 
 NEWEST = 3  # keyframes that are never given up: what comes next connects to them
-PLACE = 3  # keyframes that may be a place of their own
+MIN_SUBMAP_KEYFRAMES = 3  # keyframes that may be a submap of their own
 MIN_KEPT_CAMERAS = 0.6  # share of a scene's cameras that a merged scene must keep to count as the same scene
 
 
@@ -108,11 +109,11 @@ def find_separate_groups(work: IncrementalReconstruction, run: RunContext = BACK
         work.defer_keyframes(aside)
     here = placed or {keyframe.name for group in groups[:1] for keyframe in group}
     others = [group for group in groups if here.isdisjoint(keyframe.name for keyframe in group)]
-    return [group for group in others if len(group) >= PLACE]
+    return [group for group in others if len(group) >= MIN_SUBMAP_KEYFRAMES]
 
 
 def is_split(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> bool:
-    """Whether the keyframes show several places: groups that verified pairs join to each other, and to no other."""
+    """Whether the keyframes show several submaps: groups that verified pairs join to each other, and to no other."""
     work.match_pending_pairs(run)
     return sum(len(group) > 1 for group in work.graph.components()) > 1
 
@@ -200,7 +201,7 @@ def _list_names(keyframes: Iterable[Keyframe]) -> list[str]:
     return [keyframe.name for keyframe in keyframes]
 
 
-# What is done alike for the place where the camera is, and for one that it has left.
+# What is done alike for the active submap, and for an inactive one.
 #
 # Keyframes are screened; in the end all evidence is weighed, and the scene is made afresh and refined.
 
@@ -224,7 +225,7 @@ def screen_keyframes(work: IncrementalReconstruction, keyframes: Iterable[Keyfra
 
 
 def verify_keyframes(work: IncrementalReconstruction, forget: Forget, run: RunContext) -> None:
-    """Estimates thoroughly which keyframes belong to the place; those that contradict it are forgotten."""
+    """Estimates thoroughly which keyframes belong to the submap; those that contradict it are forgotten."""
     verify_provisional(work, run)
     for keyframe in find_contradicting(work, run):
         forget(keyframe.name, "it contradicts the scene")
@@ -233,7 +234,7 @@ def verify_keyframes(work: IncrementalReconstruction, forget: Forget, run: RunCo
 def split_submaps(
     work: IncrementalReconstruction, store: Store, output: Output, run: RunContext, present: bool = False
 ) -> bool:
-    """Makes submaps, which wait, of keyframes that show other places; returns whether there were any.
+    """Makes submaps, which wait, of keyframes that show other submaps; returns whether there were any.
 
     `present`: the camera is in this submap.
     """
@@ -267,7 +268,7 @@ def refine(
     yield from work.refine(work.initial_scene, optimize, RunContext(pause_periodically))
 
 
-# The result of the present place's finished scene: written when the scene is, or when the disk takes it again.
+# The result of the active submap's final scene: written when the scene is, or when the disk takes it again.
 
 AGAIN_S = 60.0  # after the disk did not take it
 
@@ -350,10 +351,10 @@ class ActiveSubmap:
             self.add_keyframes([])
 
     def add_keyframes(self, arrived: Sequence[ArrivedKeyframe]) -> None:
-        """Keyframes that have come, shown together where all belong to one place, else one after the other.
+        """Keyframes that have come, shown together where all belong to one submap, else one after the other.
 
-        So the same places come of them as if each had come by itself: of keyframes that waited, those of the next
-        places would else begin one together.
+        So the same submaps come of them as if each had come by itself: of keyframes that waited, those of the next
+        submaps would else begin one together.
         """
         self.state, self.settled, self.finished = ReconState.GROWING, False, None
         self.owed = self.under_way = self._prepend_retries(arrived)
@@ -437,7 +438,7 @@ class ActiveSubmap:
         """Whether the scene changes by keyframes that did not fit at once. Raises Abandoned.
 
         They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
-        If that does not help them, another place begins with them.
+        If that does not help, another submap begins with them.
         """
         lost = len(self._find_untracked()) >= self._config.new_submap_after
         soon = math.inf if lost else time.monotonic() + PATIENCE_S
@@ -453,7 +454,7 @@ class ActiveSubmap:
         return joined
 
     def _check_lost(self, newest: Collection[str]) -> bool:
-        """Says which of the newest keyframes do not fit; where too many in a row do not, another place begins."""
+        """Says which of the newest keyframes do not fit; where too many in a row do not, another submap begins."""
         strangers = self._find_untracked()
         for keyframe in strangers:
             if keyframe.name in newest:
@@ -497,7 +498,7 @@ class ActiveSubmap:
         return self._final.retry_write(self._shown, self._work, at_once)
 
     def _export_provisionally(self, state: SubmapState, names: Collection[str]) -> None:
-        """`names` are those of the place's keyframes."""
+        """`names` are those of the submap's keyframes."""
         self._exported_s = time.monotonic()
         if self._shown is None or self._shown.final:
             return
@@ -508,7 +509,7 @@ class ActiveSubmap:
             self._output.update_index(self._shown, state, kept)
 
     def _begin_overlapping_submap(self) -> None:
-        """Begins the next scene of the same place with the newest views, which both scenes have; the first is left.
+        """Begins the next scene of the same walk with the newest views, which both scenes have; the first is left.
 
         Not where the newest alone make no scene.
         """
@@ -577,7 +578,7 @@ class ActiveSubmap:
             self._refine_verified()
 
     def _verify(self) -> None:
-        """Weighs all evidence; what shows other places begins others, or becomes places of its own that wait."""
+        """Weighs all evidence; what shows other submaps begins others, or becomes submaps of its own that wait."""
         more = True
         while more:
             fitted = set(self._work.names)

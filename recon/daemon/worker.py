@@ -1,6 +1,6 @@
 """The thread that reconstructs: works keyframes in as they come, and makes scenes as good as they get in between.
 
-The scenes of places that the camera has left are finished by a finalizer.
+The scenes of inactive submaps are made final in between.
 """
 
 from __future__ import annotations
@@ -36,13 +36,14 @@ from splatnode.recon.daemon import (
 )
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
+from splatnode.recon.daemon.free_space import OccupancyMapper, OccupancyResult
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Event, Inbox, RemovedFrame, are_one_set
 from splatnode.recon.daemon.ledger import CheckpointError
 from splatnode.recon.daemon.loop_closure import LoopDetector
-from splatnode.recon.daemon.output import Output, PublishedSnapshot, SubmapState
+from splatnode.recon.daemon.output import Output, PublishedSnapshot
 from splatnode.recon.daemon.pose_graph import EdgeKind
-from splatnode.recon.daemon.relocalization import OccupancyMapper, OccupancyResult
 from splatnode.recon.daemon.submap import Abandoned, ActiveSubmap
+from splatnode.recon.daemon.submap_index import SubmapState
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.modelling import SceneWithVerdict
@@ -54,7 +55,7 @@ log = logging.getLogger(__name__)
 
 IDLE_S = 0.5  # between looks at whether to stop
 FIRST_WAIT_S, LONGEST_WAIT_S = 5.0, 300.0  # after a step for which memory or disk did not suffice; doubled each time
-LADDER_S = 4.0  # in which more matches may be looked for, also on a slow machine: keyframes wait meanwhile
+FALLBACK_TIMEOUT_S = 4.0  # in which more matches may be looked for, also on a slow machine: keyframes wait meanwhile
 
 
 class Worker:
@@ -69,23 +70,24 @@ class Worker:
     ) -> None:
         """`worlds` hears which scenes are made afresh."""
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
-        asked = config.reconstruction.fallbacks
-        ladder = asked if asked.timeout_s is not None else msgspec.structs.replace(asked, timeout_s=LADDER_S)
+        fallbacks = config.reconstruction.fallbacks
+        if fallbacks.timeout_s is None:
+            fallbacks = msgspec.structs.replace(fallbacks, timeout_s=FALLBACK_TIMEOUT_S)
         self._recipe = msgspec.structs.replace(
             config.reconstruction,
             max_gaussians=limit,
             budget_s=None,
-            fallbacks=ladder,
+            fallbacks=fallbacks,
             frame_set_tolerance_s=config.frame_set_tolerance_s,
         )
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._report_problem, worlds)
         self._meter = WorkMeter()
-        self.place = ActiveSubmap(config, self._recipe, store, self._output, self._pause, self._meter)
+        self.active = ActiveSubmap(config, self._recipe, store, self._output, self._pause, self._meter)
         self._free_space = OccupancyMapper(config.occupancy)
-        self._atlas = LoopDetector(store.directory, self._recipe, self._output.places)
-        self._left = InactiveSubmaps(
-            store, self._recipe, self._output, self._atlas, config.fallback_timeout_s, self._meter
+        self._loop_detector = LoopDetector(store.directory, self._recipe, self._output.index)
+        self._inactive = InactiveSubmaps(
+            store, self._recipe, self._output, self._loop_detector, config.fallback_timeout_s, self._meter
         )
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
@@ -98,44 +100,44 @@ class Worker:
 
     @property
     def num_unfinished(self) -> int:
-        """Places that the camera has left and whose scenes are not final yet."""
-        return self._left.num_unfinished
+        """inactive submaps and whose scenes are not final yet."""
+        return self._inactive.num_unfinished
 
     def count_waiting(self) -> int:
         """Keyframes that no scene shows yet."""
-        return self.loading + len(self._backlog) + len(self.place.under_way) + len(self._inbox)
+        return self.loading + len(self._backlog) + len(self.active.under_way) + len(self._inbox)
 
     @property
     def map_counts(self) -> tuple[int, int, int]:
         """How many scenes are judged, how many maps they are, and how many loops count."""
-        poses, links = self._output.places.poses, self._output.places.links
+        poses, links = self._output.index.poses, self._output.index.links
         loops = sum(link.kind is EdgeKind.LOOP and link.retracted is None for link in links)
         return len(poses), len({pose.map for pose in poses}), loops
 
     @property
-    def newest_places(self) -> tuple[SubmapStatus, ...]:
+    def newest_submaps(self) -> tuple[SubmapStatus, ...]:
         """The status of the newest submaps, each as of when it was last worked on."""
-        return tuple(each.status for each in self._output.places.select_newest(PLACES))
+        return tuple(each.status for each in self._output.index.select_newest(PLACES))
 
     @property
     def current_map(self) -> OccupancyResult | str:
         """The map of the present scene as it is now, or why there is none."""
-        return self._free_space.find_current_map(self.place.finished, self.place.state)
+        return self._free_space.find_current_map(self.active.finished, self.active.state)
 
     @property
     def work(self) -> WorkProgress | None:
         """Tells what is being done, and how long the rest of it takes; None while nothing is."""
-        return self._meter.describe(Backlog(self.count_waiting(), self._left.num_unjudged, self.num_unfinished))
+        return self._meter.describe(Backlog(self.count_waiting(), self._inactive.num_unjudged, self.num_unfinished))
 
     def find_inactive_scenes(self, name: str) -> list[str]:
-        """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
-        return [scene for scene in self._output.places.find_scenes(name) if scene != self._store.scene_id]
+        """The ids of the scenes, of inactive submaps, that have a camera of this photograph."""
+        return [scene for scene in self._output.index.find_scenes(name) if scene != self._store.scene_id]
 
     def find_frame_set(self, name: str) -> list[str]:
-        """The photograph, and those that other cameras took with it, here and in places that the camera has left."""
-        tolerance_s, places = self._recipe.frame_set_tolerance_s, self._output.places
+        """The photograph, and those that other cameras took with it, here and in inactive submaps."""
+        tolerance_s, index = self._recipe.frame_set_tolerance_s, self._output.index
         found = [self._store.find_frame_set(name, tolerance_s)]
-        found += [places.find_frame_set(scene, name, tolerance_s) for scene in self.find_inactive_scenes(name)]
+        found += [index.find_frame_set(scene, name, tolerance_s) for scene in self.find_inactive_scenes(name)]
         return list(dict.fromkeys([name, *itertools.chain.from_iterable(found)]))
 
     @property
@@ -143,7 +145,7 @@ class Worker:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
         if self.loading:
             return time.monotonic() - self._quiet_since_s, f"{_format_keyframe_count(self.loading)} being loaded"
-        under_way, waiting = [*self.place.under_way, *self._backlog], len(self._inbox)
+        under_way, waiting = [*self.active.under_way, *self._backlog], len(self._inbox)
         oldest_s = under_way[0].at_s if under_way else self._inbox.oldest_s
         if oldest_s is None:
             return 0.0, ""
@@ -158,25 +160,25 @@ class Worker:
         self.loading = 0
         if found is not None:
             self._backlog = number_frame_sets(found.new, self._config.frame_set_tolerance_s)
-            self._run_step(lambda: self.place.resume(found))
+            self._run_step(lambda: self.active.resume(found))
         give_back_memory()
         while not self._stopping.is_set():
             worked = self._process_events(min(IDLE_S, self._config.idle_finalize_s))
-            if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
+            if not worked and self.active.settled and time.monotonic() >= self._not_before_s:
                 self._run_step(self._process_idle, present=False)
-        self._run_step(self.place.export_provisionally)
+        self._run_step(self.active.export_provisionally)
 
     def _process_idle(self) -> None:
         """Does one step of work that is left while the active submap needs nothing."""
         self._meter.restart_count(Work.KEYFRAMES)
-        if self.place.retry_write():
+        if self.active.retry_write():
             self.problem = ""
             return
         if not (
             self._map_scene()
-            or self._left.verify_next(RunContext(self._serve_active_submap))
-            or self.place.detect_loops(self._atlas)
-            or self._left.finalize_next(RunContext(self._serve_active_submap))
+            or self._inactive.verify_next(RunContext(self._serve_active_submap))
+            or self.active.detect_loops(self._loop_detector)
+            or self._inactive.finalize_next(RunContext(self._serve_active_submap))
         ):
             self.rests += 1
 
@@ -184,7 +186,7 @@ class Worker:
         """Maps the present scene, if it is final; False where that was done. Abandoned when something comes."""
         folder = self._config.out / self._store.scene_id
         run = RunContext(lambda: self._pause(-math.inf))
-        return self._free_space.map_scene(self.place.finished, self.place.state, folder, run)
+        return self._free_space.map_scene(self.active.finished, self.active.state, folder, run)
 
     def _process_events(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""
@@ -196,11 +198,13 @@ class Worker:
         if arrived:
             self._run_step(lambda: self._add_keyframes(arrived))
         elif left_out:
-            self._run_step(lambda: self.place.remove_frames(left_out))
-        elif self.place.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.idle_finalize_s:
+            self._run_step(lambda: self.active.remove_frames(left_out))
+        elif (
+            self.active.settled or now < self._not_before_s or now - self._quiet_since_s < self._config.idle_finalize_s
+        ):
             return False
         else:
-            self._run_step(lambda: self._add_keyframes([]) if self.place.owed else self.place.finalize())
+            self._run_step(lambda: self._add_keyframes([]) if self.active.owed else self.active.finalize())
         self._quiet_since_s = time.monotonic()
         return True
 
@@ -220,19 +224,19 @@ class Worker:
         stored = [each for each in arrived if self._store.holds(each.keyframe.frame)]
         if stored or not arrived:
             with self._meter.measure(Work.KEYFRAMES, len(stored), len(stored)):
-                self.place.add_keyframes(stored)
+                self.active.add_keyframes(stored)
 
     def _serve_active_submap(self) -> None:
-        """While the scene of a place that was left is finished, the present one goes on.
+        """While the scene of an inactive submap is finished, the present one goes on.
 
         Raises Abandoned if the daemon stops.
         """
         self._pause(math.inf)
         began = time.monotonic()
         self._process_events(0.0)
-        if self.place.settled:
+        if self.active.settled:
             self._run_step(self._map_scene, present=False)
-        self._left.exclude_seconds(time.monotonic() - began)
+        self._inactive.exclude_seconds(time.monotonic() - began)
 
     def _pause(self, until_s: float) -> None:
         """Raises Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""
@@ -244,7 +248,7 @@ class Worker:
     def _run_step(self, step: Callable[[], object], present: bool = True) -> None:
         """A step that fails is told, and repeated only where memory or the disk did not suffice.
 
-        `present`: whether it is for the present place.
+        `present`: whether it is for the active submap.
         """
         try:
             step()
@@ -260,7 +264,7 @@ class Worker:
             again = short or is_disk_error(error)
             self.problem = f"{type(error).__name__}: {error}"
             if present:
-                self.place.settled = not again
+                self.active.settled = not again
             if again:
                 why = SHORT_OF_MEMORY if short else f"{error}: make room on the disk"
                 self.problem = self._shortage = f"{why}. What failed is tried again"
@@ -300,13 +304,13 @@ def _format_keyframe_count(number: int) -> str:
     return "1 keyframe is" if number == 1 else f"{number} keyframes are"
 
 
-# Finishes the scenes of places that the camera has left, oldest first, from their checkpoints.
+# Finishes the scenes of inactive submaps, oldest first, from their checkpoints.
 #
-# First every place is judged with all its evidence, and compared with those that were judged before it: that tells
+# First every submap is verified with all its evidence, and compared with those that were verified before it: that tells
 # where the robot is. Then their scenes are made, which takes longer.
 
 
-AGAIN_S = 300.0  # after a place could not be finished
+AGAIN_S = 300.0  # after a submap could not be finished
 
 _Step = Callable[[Store, checkpoint.RestoredReconstruction, RunContext], bool]
 
@@ -317,15 +321,15 @@ class InactiveSubmaps:
         here: Store,
         config: ReconstructionConfig,
         output: Output,
-        atlas: LoopDetector,
+        loop_detector: LoopDetector,
         fallback_s: float = math.inf,
         meter: WorkMeter | None = None,
     ) -> None:
         """`here` is the checkpoint which has left/ in it, `config` how scenes are made.
 
-        Fallbacks take at most `fallback_s` seconds of each step with a place.
+        Fallbacks take at most `fallback_s` seconds of each step with a submap.
         """
-        self._here, self._config, self._output, self._atlas = here, config, output, atlas
+        self._here, self._config, self._output, self._loop_detector = here, config, output, loop_detector
         self._fallback_s, self._meter = fallback_s, meter or WorkMeter()
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
@@ -333,7 +337,7 @@ class InactiveSubmaps:
 
     @property
     def num_unfinished(self) -> int:
-        """Places that were left and are not finished."""
+        """Counts the inactive submaps that are not finished."""
         return len(ledger.list_left_folders(self._here.directory))
 
     def exclude_seconds(self, seconds: float) -> None:
@@ -342,27 +346,27 @@ class InactiveSubmaps:
             self._work.clock.leave_out(seconds)
 
     def verify_next(self, run: RunContext) -> bool:
-        """Judges the oldest place that is not judged yet with all its evidence, and compares it with the others.
+        """Judges the oldest submap that is not verified yet with all its evidence, and compares it with the others.
 
         Its scene stays a draft, in a result folder, unless there is none to be made. False where there is none to be
-        judged now. What places that were left are to lose is taken out of them first. What a pause raises ends the
+        judged now. What inactive submaps are to lose is taken out of them first. What a pause raises ends the
         work; it is begun again another time, as after a failure.
         """
         self._remove_keyframes()
         return self._process_first(
-            [each for each in self._pending_folders if not self._atlas.has_scene(each.name)],
+            [each for each in self._pending_folders if not self._loop_detector.has_scene(each.name)],
             self._verify,
             run,
             Work.JUDGE,
         )
 
     def finalize_next(self, run: RunContext) -> bool:
-        """Makes the scene of the oldest place that is judged, as good as it gets, and writes its result.
+        """Makes the scene of the oldest submap that is verified, as good as it gets, and writes its result.
 
         False where there is none to be made now; `run` as for `verify_next`.
         """
         return self._process_first(
-            [each for each in self._pending_folders if self._atlas.has_scene(each.name)],
+            [each for each in self._pending_folders if self._loop_detector.has_scene(each.name)],
             self._finalize,
             run,
             Work.FINISH,
@@ -370,7 +374,7 @@ class InactiveSubmaps:
 
     @property
     def _pending_folders(self) -> list[Path]:
-        """The folders of the places that are not finished, the oldest first; not those that failed a moment ago."""
+        """The folders of the submaps that are not finished, the oldest first; not those that failed a moment ago."""
         now = time.monotonic()
         return [
             each for each in ledger.list_left_folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now
@@ -378,11 +382,13 @@ class InactiveSubmaps:
 
     @property
     def num_unjudged(self) -> int:
-        """Places that were left and are not judged."""
-        return sum(not self._atlas.has_scene(each.name) for each in ledger.list_left_folders(self._here.directory))
+        """Counts the inactive submaps that are not verified."""
+        return sum(
+            not self._loop_detector.has_scene(each.name) for each in ledger.list_left_folders(self._here.directory)
+        )
 
     def _process_first(self, folders: Sequence[Path], step: _Step, run: RunContext, work: Work) -> bool:
-        """Takes the step with the first of the places; False where there is none, or the disk did not take it."""
+        """Takes the step with the first of the submaps; False where there is none, or the disk did not take it."""
         if not folders:
             return False
         folder = folders[0]
@@ -408,7 +414,7 @@ class InactiveSubmaps:
         return True
 
     def _remove_keyframes(self) -> None:
-        """Takes out of the places that were left what they are to lose; their scenes are not final then."""
+        """Takes out of the inactive submaps what they are to lose; their scenes are not final then."""
         if time.monotonic() < self._retract_after_s:
             return
         for scene, name in self._here.ledger.retracted:
@@ -426,7 +432,7 @@ class InactiveSubmaps:
         """Raises OSError."""
         folder = ledger.reopen(self._here.directory, scene)
         if folder is not None:
-            self._atlas.remove_scene(scene)
+            self._loop_detector.remove_scene(scene)
             ledger.remove_rebuild_requests(folder, "codes")
             self._not_before_s.pop(folder, None)
             try:
@@ -438,9 +444,9 @@ class InactiveSubmaps:
         self._here.confirm_removal(scene, name)
 
     def _verify(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> bool:
-        """Whether the place is judged now, and its result written."""
+        """Whether the submap is verified now, and its result written."""
         work = found.work
-        # As it was when the place was left
+        # As it was when the camera left
         if found.final and not found.new and not submap.split_submaps(work, store, self._output, run):
             self._output.mark_finished(store.scene_id)
         else:
@@ -456,18 +462,20 @@ class InactiveSubmaps:
             self._output.save(store, work, final=False)
         work.release_scene()  # the checkpoint has it, and comparing takes memory, too
         give_back_memory()
-        self._atlas.add_scene(store, work.graph, self._atlas.detect_loops(store.scene_id, work.graph, run))
+        self._loop_detector.add_scene(
+            store, work.graph, self._loop_detector.detect_loops(store.scene_id, work.graph, run)
+        )
         return True
 
     def _verify_keyframes(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> None:
-        """All evidence on all keyframes; those that do not belong to the place are forgotten."""
+        """All evidence on all keyframes; those that do not belong to the submap are forgotten."""
         work = found.work
 
         def forget(name: str, reason: str) -> None:
             store.forget(name, reason)
             work.remove_keyframes([name])
 
-        for keyframe in submap.screen_keyframes(work, found.new, forget):  # that came shortly before the place was left
+        for keyframe in submap.screen_keyframes(work, found.new, forget):  # that came shortly before the camera left
             work.add_keyframe(keyframe, run)
         submap.verify_keyframes(work, forget, run)
         if submap.split_submaps(work, store, self._output, run):
@@ -476,7 +484,7 @@ class InactiveSubmaps:
             forget(keyframe.name, "it does not fit the scene")
 
     def _finalize(self, store: Store, found: checkpoint.RestoredReconstruction, run: RunContext) -> bool:
-        """Whether the scene of a place that is judged is final now, and its result written."""
+        """Whether the scene of a verified submap is final now, and its result written."""
         work = found.work
         if not found.final:
             event(log, logging.INFO, "finishing", scene=store.scene_id)
@@ -488,7 +496,7 @@ class InactiveSubmaps:
                 return False
             self._output.save(store, work, final=True)
         if work.scene is None:  # one that is refused is of no use later
-            self._atlas.remove_scene(store.scene_id)
+            self._loop_detector.remove_scene(store.scene_id)
             ledger.remove_left_checkpoint(store.directory)
         else:
             store.remove_scene_files()

@@ -268,7 +268,7 @@ def print_summary(snapshot: Snapshot, out: Path) -> None:
             say(f"lengths: {snapshot.scale.sentence}")
         if snapshot.scale.frame != FIRST_CAMERA:
             say(f"frame: {snapshot.scale.frame.sentence}")
-    further = snapshot.seconds.get("ladder", 0.0)
+    further = snapshot.seconds.get("fallbacks", 0.0)
     if further >= 0.1:
         say(
             f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches "

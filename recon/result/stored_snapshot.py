@@ -546,11 +546,11 @@ def make_piece_name(scene_id: str) -> str:
 
 def find_pieces(whole: MapSet, of: JoinedMap, out: Path) -> Pieces:
     """The pieces of a map whose merged result may be in `out`. Raises SceneFileError, OSError."""
-    shown = {name: placement for name, placement in of.placements.items() if has_scene(whole.places[name])}
+    shown = {name: placement for name, placement in of.placements.items() if has_scene(whole.submaps[name])}
     folder = make_merged_path(out, of)
     if shown and (folder / make_piece_name(SHELL_PIECE)).is_file() and all(_is_merged(whole, n, folder) for n in shown):
         cameras = {each.name: each for each in decode_cameras(read_json_file(folder / "cameras.json"), str(folder))}
-        used = {name: whole.places[name].frames_used for name in shown}
+        used = {name: whole.submaps[name].frames_used for name in shown}
         known = {name: tuple(cameras[each] for each in names if each in cameras) for name, names in used.items()}
         pieces = [Piece(name, folder / make_piece_name(name), IDENTITY, known[name]) for name in shown]
         return Pieces((*pieces, Piece(SHELL_PIECE, folder / make_piece_name(SHELL_PIECE), IDENTITY, ())), merged=True)
@@ -559,7 +559,7 @@ def find_pieces(whole: MapSet, of: JoinedMap, out: Path) -> Pieces:
 
 def _is_merged(whole: MapSet, scene_id: str, folder: Path) -> bool:
     """Whether a merged result has the scene as it is now."""
-    piece, scene = folder / make_piece_name(scene_id), whole.places[scene_id].folder
+    piece, scene = folder / make_piece_name(scene_id), whole.submaps[scene_id].folder
     return piece.is_file() and (scene is None or (scene / "scene.ply").stat().st_mtime <= piece.stat().st_mtime)
 
 
@@ -571,7 +571,7 @@ def has_scene(place: SubmapEntry) -> bool:
 def _make_scene_pieces(whole: MapSet, placements: Mapping[str, Placement]) -> list[Piece]:
     found = []
     for scene_id, placement in placements.items():
-        folder = whole.places[scene_id].folder
+        folder = whole.submaps[scene_id].folder
         assert folder is not None  # `has_scene` has seen to it
         cameras = tuple(placement.transform_camera(camera) for camera in read_cameras(folder / "cameras.json"))
         found.append(Piece(scene_id, folder / "scene.ply", placement, cameras))

@@ -1,8 +1,8 @@
 """places.json, read as the whole that it tells of: the scenes, how they are linked, and which lie in one world.
 
-This is the reader of those who show or merge what a node has written; `recon.daemon.output` writes it. It is lenient
-with what an older node did not write: a link without a kind is one of a chain, and without `poses` the scenes of a map
-are placed by their links.
+This is the reader of those who show or merge what a node has written; `recon.daemon.submap_index` writes it. It is
+lenient with what an older node did not write: a link without a kind is one of a chain, and without `poses` the scenes
+of a map are placed by their links.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class JoinedMap:
 class MapSet:
     """All that a node has made. Every scene is in exactly one map; one that is linked to none is a map of its own."""
 
-    places: Mapping[str, SubmapEntry]  # by scene_id
+    submaps: Mapping[str, SubmapEntry]  # by scene_id
     links: tuple[SubmapEdge, ...]
     maps: tuple[JoinedMap, ...]
 
@@ -96,12 +96,14 @@ def read_map_set(folder: Path) -> MapSet:
             found = record_in(data, _File)
         except msgspec.MsgspecError as error:
             raise SceneFileError(f"{path} is not a places.json of splatnode, or is damaged: {error}") from error
-        places = {place.scene_id: _parse_submap(place, folder, path) for place in found.places}
-        links = tuple(_parse_edge(link, path) for link in found.links if link.scene in places and link.other in places)
-        placed = (
-            _parse_poses(found.poses, places, path) if found.poses is not None else _chain_placements(places, links)
+        submaps = {submap.scene_id: _parse_submap(submap, folder, path) for submap in found.submaps}
+        links = tuple(
+            _parse_edge(link, path) for link in found.links if link.scene in submaps and link.other in submaps
         )
-        return MapSet(places, links, _group_maps(places, placed))
+        placed = (
+            _parse_poses(found.poses, submaps, path) if found.poses is not None else _chain_placements(submaps, links)
+        )
+        return MapSet(submaps, links, _group_maps(submaps, placed))
 
 
 class _SubmapRecord(msgspec.Struct, frozen=True):
@@ -135,26 +137,26 @@ class _PoseRecord(_Sim3, frozen=True, kw_only=True):
 
 
 class _File(msgspec.Struct, frozen=True):
-    places: Annotated[tuple[_SubmapRecord, ...], msgspec.Meta(max_length=MOST_SCENES)]
+    submaps: Annotated[tuple[_SubmapRecord, ...], msgspec.Meta(max_length=MOST_SCENES)] = msgspec.field(name="places")
     links: Annotated[tuple[_EdgeRecord, ...], msgspec.Meta(max_length=10 * MOST_SCENES)] = ()
     poses: Annotated[tuple[_PoseRecord, ...], msgspec.Meta(max_length=MOST_SCENES)] | None = None
 
 
-def _parse_submap(place: _SubmapRecord, folder: Path, path: Path) -> SubmapEntry:
-    texts = (place.scene_id, place.verdict, place.message, *place.frames_used)
+def _parse_submap(submap: _SubmapRecord, folder: Path, path: Path) -> SubmapEntry:
+    texts = (submap.scene_id, submap.verdict, submap.message, *submap.frames_used)
     if not all(is_printable(text) for text in texts):
         raise SceneFileError(f"{path}: its texts must be printable")
-    names = [place.scene_id] if place.folder is None else [place.scene_id, place.folder]
+    names = [submap.scene_id] if submap.folder is None else [submap.scene_id, submap.folder]
     if any("/" in name or "\0" in name or name in (".", "..") for name in names):
-        raise SceneFileError(f"{path}: {place.scene_id!a} must name a folder beside the file, not {place.folder!a}")
+        raise SceneFileError(f"{path}: {submap.scene_id!a} must name a folder beside the file, not {submap.folder!a}")
     return SubmapEntry(
-        place.scene_id,
-        None if place.folder is None else folder / place.folder,
-        place.verdict,
-        place.message,
-        place.publishable,
-        place.provisional,
-        place.frames_used,
+        submap.scene_id,
+        None if submap.folder is None else folder / submap.folder,
+        submap.verdict,
+        submap.message,
+        submap.publishable,
+        submap.provisional,
+        submap.frames_used,
     )
 
 
@@ -173,22 +175,22 @@ def _parse_edge(link: _EdgeRecord, path: Path) -> SubmapEdge:
 
 
 def _parse_poses(
-    poses: Sequence[_PoseRecord], places: Mapping[str, SubmapEntry], path: Path
+    poses: Sequence[_PoseRecord], submaps: Mapping[str, SubmapEntry], path: Path
 ) -> dict[str, tuple[str, Placement]]:
-    unknown = sorted({pose.map for pose in poses} - set(places))
+    unknown = sorted({pose.map for pose in poses} - set(submaps))
     if unknown:  # folders are named after maps
         raise SceneFileError(f"{path}: a map must be named after one of its scenes, not {unknown[0][:60]!a}")
     return {
         pose.scene: (pose.map, _parse_placement(pose, f"the pose of {pose.scene!a}", path))
         for pose in poses
-        if pose.scene in places
+        if pose.scene in submaps
     }
 
 
-Beside = Mapping[str, Sequence[SubmapEdge]]  # by scene, the links of it that count
+EdgesByScene = Mapping[str, Sequence[SubmapEdge]]  # by scene, the links of it that count
 
 
-def group_edges(links: Iterable[SubmapEdge]) -> Beside:
+def group_edges(links: Iterable[SubmapEdge]) -> EdgesByScene:
     """The links that count, in their order, by both of their scenes."""
     found: dict[str, list[SubmapEdge]] = {}
     for link in links:
@@ -198,7 +200,7 @@ def group_edges(links: Iterable[SubmapEdge]) -> Beside:
     return found
 
 
-def walk_edges(first: str, links: Beside) -> Iterator[tuple[str, str, SubmapEdge]]:
+def walk_edges(first: str, links: EdgesByScene) -> Iterator[tuple[str, str, SubmapEdge]]:
     """How links lead to all other scenes from the first, along the fewest: the scene before, the scene, the link."""
     known, waiting = {first}, deque([first])
     while waiting:
@@ -212,12 +214,12 @@ def walk_edges(first: str, links: Beside) -> Iterator[tuple[str, str, SubmapEdge
 
 
 def _chain_placements(
-    places: Mapping[str, SubmapEntry], links: Iterable[SubmapEdge]
+    submaps: Mapping[str, SubmapEntry], links: Iterable[SubmapEdge]
 ) -> dict[str, tuple[str, Placement]]:
     """Returns each scene's map and placement: a scene is placed by the first edge that reaches it."""
     those = group_edges(links)
     placed: dict[str, tuple[str, Placement]] = {}
-    for first in places:
+    for first in submaps:
         if first in placed:
             continue
         placed[first] = first, IDENTITY
@@ -228,11 +230,11 @@ def _chain_placements(
 
 
 def _group_maps(
-    places: Mapping[str, SubmapEntry], placed: Mapping[str, tuple[str, Placement]]
+    submaps: Mapping[str, SubmapEntry], placed: Mapping[str, tuple[str, Placement]]
 ) -> tuple[JoinedMap, ...]:
     """In the order of their first scenes. A scene that has no place in a map is one of its own."""
     maps: dict[str, dict[str, Placement]] = {}
-    for scene_id in places:
+    for scene_id in submaps:
         name, placement = placed.get(scene_id, (scene_id, IDENTITY))
         maps.setdefault(name, {})[scene_id] = placement
     return tuple(JoinedMap(name, placements) for name, placements in maps.items())

@@ -12,11 +12,11 @@ import pytest
 
 import splatnode
 from splatnode.capture.config import PreviewHeader, decode_preview
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import Clock, Stamp
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, Network
 from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.status import heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 

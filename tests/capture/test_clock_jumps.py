@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import CAPTURE_STATUS
 from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.status import CaptureStatus
 from tests.capture.messaging.test_sockets import wait_for
 from tests.support.disk_faults import SOURCE, compiled, find_compiler
 from tests.support.node import Node, running

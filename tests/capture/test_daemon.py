@@ -21,13 +21,14 @@ import pytest
 from splatnode.capture import keyframe_selection
 from splatnode.capture.cameras import folder
 from splatnode.capture.config import Camera, CaptureConfig, PreviewHeader, decode_preview
-from splatnode.capture.daemon import CaptureSession, CaptureStatus, capture, heartbeats, last_run
+from splatnode.capture.daemon import CaptureSession, capture
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, Spool, SpoolConfig
 from splatnode.capture.messaging.messages import FrameHeader, Key, encode
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.process.system import FailedAfterReady
+from splatnode.capture.status import CaptureStatus, heartbeats, last_run
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from splatnode.capture.daemon import begin_run, end_run, last_run
 from splatnode.capture.messaging.network import Network
+from splatnode.capture.status import begin_run, end_run, last_run
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from splatnode.capture.daemon import _NOT_PRINTED, _WORDS, CaptureStatus, describe_heartbeat
+from splatnode.capture.status import _NOT_PRINTED, _WORDS, CaptureStatus, describe_heartbeat
 from splatnode.recon.daemon import ReconStatus
 
 RECON = {"state": "growing", "keyframe": 7, "queue": 17, "delay_s": 240.1, "keyframe_s": 26.4, "camera_moved": False}

@@ -27,7 +27,6 @@ import cv2
 import numpy as np
 import zmq
 
-from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import (
     CAPTURE_CONTROL,
@@ -41,6 +40,7 @@ from splatnode.capture.messaging.network import (
     create_keys,
 )
 from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon import ReconStatus
 from tests.capture.messaging.test_sockets import free_ports
 from tests.support.node import Node, descriptors, running

@@ -593,7 +593,7 @@ MUTANTS = (
     ),
     *_list_mutants(
         "node",
-        "recon/daemon/relocalization.py",
+        "recon/daemon/free_space.py",
         ("a map of a lost robot is told", "        if state is ReconState.LOST:\n            return LOST\n", ""),
     ),
     *_list_mutants(

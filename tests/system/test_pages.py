@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.frame import ExposureSettings, GivenPose, Gravity, Intrinsics, Motion
 from splatnode.capture.messaging import messages, network, pubsub
+from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon import ReconState, ReconStatus
 from splatnode.recon.daemon.node import Finish, RemoveKeyframe
 from splatnode.recon.locating import LocateAnswer, LocateRequest, LocationRecord

@@ -54,10 +54,10 @@ HARMLESS = {
         "viewer/window.py:call",
     },
     "what is left out is no frame, no keyframe and no result: a name, a reason, a picture, a figure": {
-        "capture/daemon.py:last_run",
+        "capture/status.py:last_run",
         "capture/messaging/keyframe_queue.py:_quarantine_frame",
-        "capture/messaging/frame_set_link.py:_send",
-        "capture/messaging/frame_set_link.py:receive",
+        "capture/messaging/pubsub.py:_send",
+        "capture/messaging/pubsub.py:receive",
         "capture/process/library_lines.py:_create_file",
         "capture/process/library_lines.py:_find_memory",
         "capture/process/library_lines.py:tell_last_words",

@@ -8,9 +8,9 @@ import signal
 import subprocess
 import time
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.network import RECON_SCENE
 from splatnode.capture.messaging.pubsub import StateClient
+from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.daemon import heartbeats
+from splatnode.capture.status import heartbeats
 from splatnode.extras.cameras import building
 from splatnode.recon.result.export import read_cameras
 from tests.bench.node.building_cost import Sample, cost_row, folder_mb

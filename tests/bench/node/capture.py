@@ -21,12 +21,12 @@ import cv2
 import numpy as np
 
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.image_file import decode_image
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.process.system import keep_freed
+from splatnode.capture.status import CaptureStatus
 from tests.support.node import processor_s
 
 RATE, WIDTH, HEIGHT = 30, 1280, 720

@@ -19,7 +19,7 @@ from typing import Any
 
 import cv2
 
-from splatnode.capture.daemon import heartbeats
+from splatnode.capture.status import heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node.building import LOOK_S, RESTS, scored
 from tests.support.node import Node, at_rest, memory_mb, processor_s, running, taken

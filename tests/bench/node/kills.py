@@ -26,7 +26,7 @@ from typing import Any
 
 import cv2
 
-from splatnode.capture.daemon import heartbeats
+from splatnode.capture.status import heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node.trial import expect_exports_whole
 from tests.bench.node.walk_faults import RECON, SIDE

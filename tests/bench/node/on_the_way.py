@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.network import RECON_SCENE, Network, create_keys, expect_server
 from splatnode.capture.messaging.pubsub import StateClient
 from splatnode.capture.process.config import parse_config
+from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.ledger import MADE_ANEW
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.intruders import refusal

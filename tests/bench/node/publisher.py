@@ -26,13 +26,13 @@ import numpy as np
 import splatnode
 from splatnode.capture import daemon
 from splatnode.capture.config import Camera, CaptureConfig, PreviewHeader
-from splatnode.capture.daemon import CaptureStatus
 from splatnode.capture.frame import Frame, wall_clock
 from splatnode.capture.image_file import decode_image
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, SpoolConfig
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, CAPTURE_STATUS, Network
 from splatnode.capture.messaging.pubsub import Subscriber
 from splatnode.capture.process.system import keep_freed
+from splatnode.capture.status import CaptureStatus
 from tests.bench.node.capture import HEIGHT, RATE, WIDTH, write_walk
 from tests.support.node import processor_s
 

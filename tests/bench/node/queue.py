@@ -23,11 +23,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.messages import FrameHeader, Key, Numbering, Part, encode
 from splatnode.capture.messaging.network import Network
+from splatnode.capture.status import heartbeats
 from tests.bench.node.trial import RECON, expect, expect_scene
 from tests.support.node import Node, running
 from tests.support.synthetic import photographs

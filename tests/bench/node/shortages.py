@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatnode.capture.daemon import heartbeats
+from splatnode.capture.status import heartbeats
 from tests.bench.node.trial import NotTried, Trial, expect, expect_scene, expect_whole, wait_for
 from tests.support.disk_faults import compiled, environment
 from tests.support.node import Node, running

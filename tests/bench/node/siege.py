@@ -27,9 +27,9 @@ import yaml
 
 from splatnode.capture.cameras.synthetic import TARGET, Config, intrinsic_matrix, look_at, render_image
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, create_keys
 from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.status import heartbeats
 from tests.bench.node.soak import SAMPLE_S, change, sample
 from tests.bench.node.trial import RECON
 from tests.conftest import ROOT

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW
 from splatnode.capture.messaging.pubsub import Subscriber
+from splatnode.capture.status import heartbeats
 from tests.support.node import Node, descriptors, memory_mb, running
 
 SAMPLE_S = 5.0

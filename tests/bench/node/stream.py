@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.capture.daemon import heartbeats
+from splatnode.capture.status import heartbeats
 from splatnode.extras.evaluate.dataset import EvaluationScene, Split, load_scene
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.config import ReconstructionConfig

@@ -24,8 +24,8 @@ from typing import Any
 import cv2
 import msgspec
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.network import create_keys, expect_server
+from splatnode.capture.status import heartbeats
 from splatnode.extras.cameras import building
 from tests.bench.node import on_the_way
 from tests.bench.node.building import scored

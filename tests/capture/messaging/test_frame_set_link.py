@@ -8,9 +8,9 @@ import struct
 import pytest
 
 from splatnode.capture.frame import LARGEST_NS, Clock, Stamp
-from splatnode.capture.messaging import frame_set_link
-from splatnode.capture.messaging.frame_set_link import FULL_S, FrameSetLink
+from splatnode.capture.messaging import pubsub
 from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.pubsub import FULL_S, FrameSetLink
 
 AT = Stamp(1_700_000_000_123_456_789, Clock.UTC)
 
@@ -67,6 +67,6 @@ def test_one_that_has_no_room_says_so_for_a_while(network, monkeypatch):
         assert not right.is_another_full
         left.announce_full()
         assert right.receive() == [] and right.is_another_full and not left.is_another_full
-        now_s = frame_set_link.time.monotonic()
-        monkeypatch.setattr(frame_set_link.time, "monotonic", lambda: now_s + FULL_S + 0.1)
+        now_s = pubsub.time.monotonic()
+        monkeypatch.setattr(pubsub.time, "monotonic", lambda: now_s + FULL_S + 0.1)
         assert not right.is_another_full

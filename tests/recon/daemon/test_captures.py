@@ -39,7 +39,7 @@ from splatnode.recon.daemon.ingest import (
 )
 from splatnode.recon.daemon.ledger import read_frame
 from splatnode.recon.daemon.node import Daemon, RemoveKeyframe
-from splatnode.recon.daemon.output import SubmapIndex, SubmapState, make_submap_record
+from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.daemon.worker import InactiveSubmaps, Worker, number_frame_sets
 from splatnode.recon.result.export import write_files
 from splatnode.recon.result.export.stored import encode_cameras
@@ -231,7 +231,7 @@ def make_daemon(store: Store, places=None) -> SimpleNamespace:
     """What of a daemon answers who takes a keyframe back."""
     places = places or SimpleNamespace(find_scenes=lambda name: [])
     worker = SimpleNamespace(
-        _store=store, _recipe=ReconstructionConfig(), _output=SimpleNamespace(places=places),
+        _store=store, _recipe=ReconstructionConfig(), _output=SimpleNamespace(index=places),
         find_inactive_scenes=lambda name: Worker.find_inactive_scenes(worker, name),
         find_frame_set=lambda name: Worker.find_frame_set(worker, name),
     )  # fmt: skip
@@ -276,7 +276,7 @@ def test_a_frame_set_of_a_place_that_the_camera_has_left_is_retracted_as_one(tmp
     places.update(make_submap_record("scene-0001", SubmapState.LEFT, "scene-0001", snapshot, [], []))
     answer = Daemon._answer(make_daemon(store, places), RemoveKeyframe("middle_100"))
     assert answer.done and answer.message.endswith("with it left_100, right_100, taken at the same time")
-    output = SimpleNamespace(places=places, complain=pytest.fail)
+    output = SimpleNamespace(index=places, complain=pytest.fail)
     left = InactiveSubmaps(store, ReconstructionConfig(), output, SimpleNamespace(remove_scene=lambda _: None))  # pyright: ignore
     left._remove_keyframes()
     assert store.ledger.retracted == ()

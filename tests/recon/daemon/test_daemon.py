@@ -15,11 +15,11 @@ from types import SimpleNamespace
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.keyframe_queue import KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.network import RECON_CONTROL, RECON_SCENE, AlreadyRunning, Network
 from splatnode.capture.messaging.pubsub import StateClient, ask
 from splatnode.capture.process.files import LOCK
+from splatnode.capture.status import heartbeats
 from splatnode.recon.config import PREVIEW
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import submap, worker

@@ -10,8 +10,9 @@ import pytest
 from msgspec.structs import replace
 
 import splatnode
-from splatnode.recon.daemon import ReconState, relocalization
-from splatnode.recon.daemon.relocalization import NOT_FINAL, FinalScene, OccupancyConfig, OccupancyMapper
+from splatnode.recon.daemon import ReconState
+from splatnode.recon.daemon.free_space import LOST, NOT_FINAL, OccupancyConfig, OccupancyMapper
+from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.daemon.submap import Abandoned
 from splatnode.recon.occupancy import OccupancyMap
 from splatnode.recon.result.verdict import Code, Verdict
@@ -106,7 +107,7 @@ def test_a_map_is_abandoned_for_a_keyframe_and_made_afterwards(tmp_path):
     found = space.find_current_map(scene, ReconState.IDLE)
     assert not isinstance(found, str) and found.occupancy is not None
     assert (
-        space.find_current_map(scene, ReconState.LOST) == relocalization.LOST
+        space.find_current_map(scene, ReconState.LOST) == LOST
         and space.find_current_map(None, ReconState.GROWING) == NOT_FINAL
     )
 

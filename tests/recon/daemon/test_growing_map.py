@@ -16,16 +16,18 @@ from splatnode.capture.messaging.messages import Numbering, decode, encode
 from splatnode.capture.process.terminal import Problems
 from splatnode.recon.daemon import free_space
 from splatnode.recon.daemon.free_space import (
+    LOST,
+    NOT_FINAL,
     OLD_DEPTHS,
     GrowingMapper,
     GrowingScene,
+    OccupancyConfig,
     ProvisionalMap,
     add_growing_depths,
     drop_normals,
     map_growing_scene,
 )
 from splatnode.recon.daemon.output import PublishedSnapshot, _match_shown_scene
-from splatnode.recon.daemon.relocalization import LOST, NOT_FINAL, OccupancyConfig
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.occupancy import MapHeader, VoxelState, encode_map, make_provisional_record, occupancy_map
 from splatnode.recon.priors import Pointmap

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from msgspec import inspect
 
-from splatnode.capture import config, daemon
+from splatnode.capture import config, status
 from splatnode.capture.depth_image import DepthNoise
 from splatnode.capture.frame import Baseline, ExposureSettings, GivenPose, Gravity, Intrinsics, Motion
 from splatnode.capture.messaging import messages, pubsub
@@ -24,7 +24,7 @@ from splatnode.recon.result.message import DepthHeader, SceneHeader
 SCHEMAS = [
     messages.FrameHeader, messages.DroppedHeader, messages.Delivery,
     messages.ConsumerStatus, messages.Ready, messages.Acknowledge, messages.Refuse,
-    config.PreviewHeader, daemon.CaptureStatus, daemon.Heartbeat, pubsub.MarkProblemsSeen, pubsub.Answer,
+    config.PreviewHeader, status.CaptureStatus, status.Heartbeat, pubsub.MarkProblemsSeen, pubsub.Answer,
     node.RemoveKeyframe,
     Want, ReconStatus, SceneHeader, MapHeader, DepthHeader,
 ]  # fmt: skip

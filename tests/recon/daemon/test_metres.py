@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import make_given_pose
+from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.output import MetricScaler
 from splatnode.recon.keyframes import Features, Keyframe
 from splatnode.recon.metric.measurement import MetricConfig as Metric

@@ -13,7 +13,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama import Config as Odometry
 from splatnode.capture.frame import Frame
 from splatnode.capture.recording import Recorder
-from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
+from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
 from splatnode.recon.result.verdict import FrameName
 from tests.recon.daemon.test_daemon import config, finished, peer, running  # noqa: F401
 from tests.support.synthetic import SMALL, photographs

@@ -12,10 +12,11 @@ from msgspec.structs import replace
 from splatnode.capture.messaging.messages import WireError
 from splatnode.capture.messaging.pubsub import Publisher, StateServer
 from splatnode.recon.daemon import ReconStatus
+from splatnode.recon.daemon.free_space import OccupancyConfig as FreeSpace
+from splatnode.recon.daemon.free_space import OccupancyResult
 from splatnode.recon.daemon.node import Daemon
 from splatnode.recon.daemon.output import PublishedSnapshot
-from splatnode.recon.daemon.relocalization import FinalScene, OccupancyResult
-from splatnode.recon.daemon.relocalization import OccupancyConfig as FreeSpace
+from splatnode.recon.daemon.relocalization import FinalScene
 from splatnode.recon.occupancy import MapHeader
 from splatnode.recon.result.message import SceneHeader
 from tests.recon.daemon.test_daemon import config  # noqa: F401

@@ -12,18 +12,19 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import DroppedFrame, Frame, rename_frame
 from splatnode.capture.messaging.messages import ReceivedFrame
 from splatnode.capture.messaging.network import RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, ask
+from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon import checkpoint, ledger, worker
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.ingest import BATCH, ArrivedKeyframe, Inbox
 from splatnode.recon.daemon.loop_closure import LoopDetector
 from splatnode.recon.daemon.node import RemoveKeyframe
-from splatnode.recon.daemon.output import Output, SubmapIndex, SubmapState, make_submap_record
+from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.submap import ActiveSubmap
+from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.verdict import Code
@@ -321,7 +322,7 @@ def test_a_place_that_turns_out_to_be_two_becomes_two(config):
             store.add_frame(ReceivedFrame("0" * 32, number, frame))
         store.leave_submap(len(frames))
         output = Output(config, store, lambda _: None, pytest.fail)
-        atlas = LoopDetector(store.directory, config.reconstruction, output.places)
+        atlas = LoopDetector(store.directory, config.reconstruction, output.index)
         waiting = InactiveSubmaps(store, config.reconstruction, output, atlas)
         assert waiting.verify_next(BACKGROUND)
         first, part = [folder.name for folder in ledger.list_left_folders(config.checkpoint)]
@@ -334,7 +335,7 @@ def test_a_place_that_turns_out_to_be_two_becomes_two(config):
         ours, other = by_id(config)
         names = [frame.name for frame in frames]
         assert other["judged"] and sorted([ours["frames_used"], other["frames_used"]]) == [names[:3], names[3:]]
-        assert output.places.links == ()
+        assert output.index.links == ()
 
 
 def by_id(config) -> list[dict]:

@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.daemon.output import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.daemon.pose_graph import LEAST_DEG, LEAST_RELATIVE, EdgeKind, PoseGraphEdge, optimize_pose_graph
+from splatnode.recon.daemon.submap_index import SubmapIndex, SubmapState, make_submap_record
 from splatnode.recon.geometry import Similarity
 from tests.support.exported import make_snapshot
 
@@ -138,7 +138,7 @@ def test_a_link_to_a_scene_that_is_a_draft_again_is_forgotten_and_stops_nothing(
         index.update(place)
     index.add_loops(SCENES[1], [link(at, 0, 1, EdgeKind.LOOP)])
     assert [pose.map for pose in index.poses] == [SCENES[0], SCENES[0], SCENES[2]]
-    index.update(replace(final[1], provisional=True, judged=False))
+    index.update(replace(final[1], provisional=True, verified=False))
     index.add_loops(SCENES[2], [link(at, 0, 2, EdgeKind.LOOP)])
     assert [(each.scene, each.other) for each in index.links] == [(SCENES[0], SCENES[2])]
     assert [(pose.scene, pose.map) for pose in index.poses] == [(SCENES[0], SCENES[0]), (SCENES[2], SCENES[0])]

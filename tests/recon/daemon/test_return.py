@@ -11,15 +11,15 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.status import heartbeats
 from splatnode.extras.evaluate.protocol import compare_cameras
 from splatnode.recon.daemon import checkpoint, ledger
 from splatnode.recon.daemon import loop_closure as module
 from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.loop_closure import LoopDetector, compute_global_descriptors, make_descriptors_message
-from splatnode.recon.daemon.output import SubmapIndex
+from splatnode.recon.daemon.submap_index import SubmapIndex
 from splatnode.recon.daemon.worker import InactiveSubmaps
 from splatnode.recon.estimation import prepare
 from splatnode.recon.geometry import Similarity

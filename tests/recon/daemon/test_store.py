@@ -236,9 +236,9 @@ def test_another_version_and_a_damaged_ledger_are_refused_with_what_to_do(open_s
 
 def test_what_can_be_made_anew_is_missing_rather_than_wrong(open_store, caplog):
     store = open_store()
-    store.save("graph", Ledger(place=3), [np.arange(3.0)])
+    store.save("graph", Ledger(number=3), [np.arange(3.0)])
     message = store.load("graph", Ledger)
-    assert message.header.place == 3 and message.arrays[0].tolist() == [0, 1, 2]
+    assert message.header.number == 3 and message.arrays[0].tolist() == [0, 1, 2]
     path = store.directory / "graph"
     path.write_bytes(path.read_bytes()[:-1])
     assert store.load("graph", Ledger) is None and "made anew" in caplog.text

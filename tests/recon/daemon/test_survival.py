@@ -12,7 +12,6 @@ import pytest
 
 from splatnode.capture.config import Config as PreviewConfig
 from splatnode.capture.config import encode_preview
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging import network as keys
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
@@ -20,6 +19,7 @@ from splatnode.capture.messaging.messages import FrameHeader, Key, Numbering, en
 from splatnode.capture.messaging.network import CAPTURE_PREVIEW, RECON_CONTROL
 from splatnode.capture.messaging.pubsub import Answer, MarkProblemsSeen, Publisher, ask
 from splatnode.capture.process.terminal import Problems
+from splatnode.capture.status import heartbeats
 from splatnode.recon.config import ReconstructionConfig as Reconstruction
 from splatnode.recon.daemon import checkpoint, ingest, relocalization
 from splatnode.recon.daemon.checkpoint import Store

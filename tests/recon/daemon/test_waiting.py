@@ -13,8 +13,8 @@ from dataclasses import replace
 import msgspec
 import pytest
 
-from splatnode.capture.daemon import heartbeats
 from splatnode.capture.messaging.messages import ReceivedFrame
+from splatnode.capture.status import heartbeats
 from splatnode.recon import incremental
 from splatnode.recon.config import ReconstructionConfig as Recipe
 from splatnode.recon.daemon import ReconState, checkpoint, ledger
@@ -50,7 +50,7 @@ def at_rest(config) -> bool:
 
 def submaps(config) -> list[list[str]]:
     """The keyframes with a camera in each scene."""
-    return sorted(sorted(place["frames_used"]) for place in index(config))
+    return sorted(sorted(active["frames_used"]) for active in index(config))
 
 
 @pytest.mark.parametrize("seeds", [(0, 1), (0, 1, 2)], ids=["two places", "three places"])
@@ -70,7 +70,7 @@ class Node:
     def __init__(self, config, store, recipe=None) -> None:
         self.store, self.recipe = store, recipe or config.reconstruction
         self.output = Output(config, store, lambda _: None, pytest.fail)
-        self.place = ActiveSubmap(config, self.recipe, store, self.output, lambda until_s: None)
+        self.active = ActiveSubmap(config, self.recipe, store, self.output, lambda until_s: None)
 
     def keyframes(self, frames) -> list[ArrivedKeyframe]:
         return [
@@ -84,9 +84,9 @@ def test_keyframes_of_several_places_that_come_together_after_a_scene_begin_one_
     with closing(Store(config.checkpoint)) as store:
         node = Node(config, store)
         arrived = node.keyframes(frames)
-        node.place.add_keyframes(arrived[:3])
-        node.place.add_keyframes(arrived[3:])
-        assert node.place.owed == node.place.under_way == []
+        node.active.add_keyframes(arrived[:3])
+        node.active.add_keyframes(arrived[3:])
+        assert node.active.owed == node.active.under_way == []
         assert (store.scene_id, store.names) == ("scene-0003", {frame.name for frame in frames[6:]})
     for at, scene in enumerate(("scene-0001", "scene-0002")):
         with closing(Store(ledger.find_folder(config.checkpoint, scene))) as store:
@@ -101,9 +101,9 @@ def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(
     names = [frame.name for frame in frames]
     with closing(Store(config.checkpoint)) as store:
         node = Node(config, store)
-        node.place.add_keyframes(node.keyframes(frames))
-        node.place.finalize()
-        assert node.place.state is ReconState.IDLE
+        node.active.add_keyframes(node.keyframes(frames))
+        node.active.finalize()
+        assert node.active.state is ReconState.IDLE
         here = store.names
         assert sorted(here) in (names[:4], names[4:])
     with closing(Store(config.checkpoint)) as store:  # the next process
@@ -111,7 +111,7 @@ def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(
         assert store.names == here and part.name.startswith("scene-0001-")
         output = Output(config, store, lambda _: None, pytest.fail)
         waiting = InactiveSubmaps(
-            store, config.reconstruction, output, LoopDetector(store.directory, config.reconstruction, output.places)
+            store, config.reconstruction, output, LoopDetector(store.directory, config.reconstruction, output.index)
         )
         while waiting.verify_next(BACKGROUND) or waiting.finalize_next(BACKGROUND):
             pass
@@ -167,15 +167,15 @@ def test_fallbacks_that_gained_nothing_are_not_repeated_for_the_same_keyframes_a
 def test_what_gained_nothing_is_kept_as_soon_as_a_scene_was_judged(config, rounds):
     with closing(Store(config.checkpoint)) as store:
         node = Node(config, store)
-        node.place.add_keyframes(node.keyframes(places(seeds=(0, 1))[:4]))
-        node.place.finalize()
+        node.active.add_keyframes(node.keyframes(places(seeds=(0, 1))[:4]))
+        node.active.finalize()
         tried = len(rounds)
     with closing(Store(config.checkpoint)) as store:
         found = checkpoint.restore(store, config.reconstruction)
         again = Node(config, store)
-        again.place.resume(found)
-        again.place.settled = False
-        again.place.finalize()
+        again.active.resume(found)
+        again.active.settled = False
+        again.active.finalize()
     assert tried > 0 and len(rounds) == tried
 
 
@@ -194,14 +194,14 @@ def test_making_a_scene_final_takes_no_more_fallbacks_than_its_budget(config, mo
     frames = photographs()[:3]
     with closing(Store(config.checkpoint)) as store:
         node = Node(msgspec.structs.replace(config, fallback_timeout_s=0.3), store)
-        node.place.add_keyframes(node.keyframes(frames))
+        node.active.add_keyframes(node.keyframes(frames))
         for at in range(2):  # what does not belong to the scene, and is tried with it in several ways
             frame = replace(places(seeds=(0, 1))[3 + at], name=f"other{at}.png", frame_id=10 + at)
-            node.place._work.add_keyframe(prepare(frame, node.recipe))
-            node.place._work.defer_keyframes([frame.name])
+            node.active._work.add_keyframe(prepare(frame, node.recipe))
+            node.active._work.defer_keyframes([frame.name])
         monkeypatch.setattr(incremental, "run_fallbacks", climb_for_ever)
-        node.place.finalize()
-        assert node.place.state in (ReconState.IDLE, ReconState.LOST)
+        node.active.finalize()
+        assert node.active.state in (ReconState.IDLE, ReconState.LOST)
     assert spent and sum(spent) < 0.5
 
 
@@ -232,7 +232,7 @@ def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_a
         node._backlog = keyframes[:5]
         inbox.enqueue([keyframes[5]], threading.Event())
         taken = []
-        monkeypatch.setattr(node.place, "add_keyframes", taken.append)
+        monkeypatch.setattr(node.active, "add_keyframes", taken.append)
         assert node.delay[0] > 0
         for _ in range(3):
             node._process_events(0.0)

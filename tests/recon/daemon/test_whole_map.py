@@ -13,8 +13,14 @@ from msgspec.structs import replace
 
 from splatnode.capture.process.terminal import Problems
 from splatnode.recon.daemon import free_space
-from splatnode.recon.daemon.free_space import FOLDER, GrowingScene, ProvisionalMap, WholeMapper, find_shared_placement
-from splatnode.recon.daemon.relocalization import OccupancyConfig
+from splatnode.recon.daemon.free_space import (
+    FOLDER,
+    GrowingScene,
+    OccupancyConfig,
+    ProvisionalMap,
+    WholeMapper,
+    find_shared_placement,
+)
 from splatnode.recon.occupancy import OccupancyMap, Upright, VoxelState, occupancy_map
 from splatnode.recon.occupancy.files import read_to_map
 from splatnode.recon.result.export.limits import SceneFileError

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.daemon import describe_heartbeat, heartbeats
 from splatnode.capture.process.terminal import ProgressStep
+from splatnode.capture.status import describe_heartbeat, heartbeats
 from splatnode.recon.daemon import FINAL_BASE_S, FINAL_S_A_VIEW, Backlog, Work, WorkMeter, WorkProgress, weigh_final
 from splatnode.recon.optimize import training
 from tests.conftest import ROOT

@@ -19,7 +19,7 @@ from splatnode.recon.daemon.ingest import ArrivedKeyframe, Inbox, RemovedFrame
 from splatnode.recon.estimation import prepare
 
 
-@pytest.mark.parametrize(("asked", "seconds"), [(None, worker.LADDER_S), (20.0, 20.0)])
+@pytest.mark.parametrize(("asked", "seconds"), [(None, worker.FALLBACK_TIMEOUT_S), (20.0, 20.0)])
 def test_more_matches_are_looked_for_within_seconds_since_keyframes_wait(asked, seconds, tmp_path, monkeypatch):
     recipes: list[Recipe] = []
     monkeypatch.setattr(worker, "ActiveSubmap", lambda config, recipe, *rest: recipes.append(recipe))

@@ -10,7 +10,7 @@ import pytest
 
 from splatnode.recon.daemon import MOST_WORLDS, REBUILT, WorldRevisions, explain_moved_cameras, output
 from splatnode.recon.daemon.config import DaemonConfig
-from splatnode.recon.daemon.output import SubmapState
+from splatnode.recon.daemon.submap_index import SubmapState
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Bounds, Code, Verdict, make_ball
 from tests.support.exported import make_snapshot
@@ -98,7 +98,7 @@ def test_writing_the_result_of_a_scene_that_the_camera_left_withdraws_its_poses(
     monkeypatch.setattr(output, "write_result_folder", lambda *rest, **more: None)
     monkeypatch.setattr(output, "_make_submap_record", lambda *rest: None)
     for name in ("update", "link_scene"):
-        monkeypatch.setattr(written.places, name, lambda *rest: None)
+        monkeypatch.setattr(written.index, name, lambda *rest: None)
     monkeypatch.setattr(written._metres, "scale_result", lambda snapshot, work: snapshot)
     final = replace(growing(camera(0), camera(1)), final=True)
     assert written.export(final, None, SimpleNamespace(scene_id=scene_id), SubmapState.FINISHED, ())

@@ -82,7 +82,7 @@ def test_scenes_lie_where_poses_say_or_else_where_the_links_lead(tmp_path, poses
     assert first.name == "scene-0001" and list(first.placements) == ["scene-0001", "scene-0002"]
     there = first.placements["scene-0002"]
     assert np.allclose([there.scale, *there.translation], [0.5, 0.3, -0.1, 0.2]) and np.allclose(there.rotation, TURN)
-    assert list(alone.placements) == ["scene-0003"] and not has_scene(whole.places["scene-0003"])
+    assert list(alone.placements) == ["scene-0003"] and not has_scene(whole.submaps["scene-0003"])
     (link,) = whole.links
     assert link.kind == "chain" and link.retracted is None
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from splatnode.capture import recording
 from splatnode.capture.config import CaptureConfig, PreviewHeader, decode_preview
-from splatnode.capture.daemon import CaptureStatus, Heartbeat
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.messaging import network
@@ -30,6 +29,7 @@ from splatnode.capture.messaging.messages import (
 from splatnode.capture.messaging.network import REQUEST_LIMITS
 from splatnode.capture.messaging.pubsub import Answer, Want
 from splatnode.capture.process.config import ConfigError, load_config
+from splatnode.capture.status import CaptureStatus, Heartbeat
 from splatnode.extras.evaluate.dataset import EvaluationFileError, load_scene
 from splatnode.recon.daemon import ReconStatus
 from splatnode.recon.daemon.checkpoint import Store

@@ -19,12 +19,12 @@ import msgspec
 import numpy as np
 
 from splatnode.capture import film
-from splatnode.capture.daemon import LastRun
 from splatnode.capture.image_header import name_time
 from splatnode.capture.messaging.keyframe_queue import Quarantine, QuarantineConfig
 from splatnode.capture.process.config import record_in
 from splatnode.capture.process.files import NotOwnerOnly
 from splatnode.capture.process.text import is_printable, sanitize_name
+from splatnode.capture.status import LastRun
 from splatnode.command_line import build_parser
 from splatnode.extras import batch
 from splatnode.extras.batch import BatchRecording, read_list
@@ -303,7 +303,7 @@ _WHOLE = Reader((SceneFileError,), ("splatnode.recon.result.submap_index",))
 _REPORTS = Reader((), (f"{_BATCH}.answer",))
 _LEDGERS = Reader((batch.OtherBatch,), (f"{_BATCH}.ledger",))
 _QUARANTINES = Reader((), ("splatnode.capture.messaging.keyframe_queue",))
-_LAST_RUNS = Reader((Refused,), ("splatnode.capture.daemon",))
+_LAST_RUNS = Reader((Refused,), ("splatnode.capture.status",))
 _MANIFESTS = Reader((), ("splatnode.recon.result.export",))
 _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))
 _NAMES = Reader((ValueError,), ("splatnode.capture.image_header", "splatnode.capture.film"))

@@ -19,7 +19,6 @@ import msgspec
 import zmq
 
 from splatnode.capture.config import PreviewHeader
-from splatnode.capture.daemon import CaptureStatus, _Listener
 from splatnode.capture.messaging import network
 from splatnode.capture.messaging.keyframe_queue import KeyframeClient, KeyframeServer, Spool, SpoolConfig
 from splatnode.capture.messaging.messages import MAGIC, Delivery, FrameHeader, Request, plain_header
@@ -34,6 +33,7 @@ from splatnode.capture.messaging.network import (
     runtime_directory,
 )
 from splatnode.capture.messaging.pubsub import Answer, CommandServer, StateClient, StateServer, Subscriber, Want
+from splatnode.capture.status import CaptureStatus, _Listener
 from splatnode.recon.daemon.node import Command
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.attacked import shout

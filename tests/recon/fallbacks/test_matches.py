@@ -1,4 +1,4 @@
-"""Each rung by itself: what it adds, and to which pairs."""
+"""Each fallback by itself: what it adds, and to which pairs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import ReconstructionConfig
-from splatnode.recon.fallbacks import AFFINE_SIMULATION, LEARNED_MATCHES, RUNGS, FallbackState, find_weak_pairs
+from splatnode.recon.fallbacks import AFFINE_SIMULATION, FALLBACKS, LEARNED_MATCHES, FallbackState, find_weak_pairs
 from splatnode.recon.matching.view_graph import ViewGraph
 from tests.support.synthetic import photographs, renumbered, view_graph
 
@@ -28,7 +28,7 @@ def far_aside() -> ViewGraph:
 
 def test_stronger_tilts_connect_what_nothing_else_does(far_aside):
     assert set(far_aside.pairs) == {(0, 1)}
-    *_, after = AFFINE_SIMULATION.climb(FallbackState(far_aside, ReconstructionConfig()), {far_aside.names[2]})
+    *_, after = AFFINE_SIMULATION.extend(FallbackState(far_aside, ReconstructionConfig()), {far_aside.names[2]})
     assert (0, 2) in after.graph.pairs
     np.testing.assert_array_equal(after.graph.pairs[0, 1].matches, far_aside.pairs[0, 1].matches)
     assert set(far_aside.keyframes[2].features.tilt) <= {1.0, 1.6}  # a graph is a value
@@ -42,24 +42,24 @@ def test_only_weak_pairs_of_doubtful_keyframes_are_matched_further(far_aside):
     assert find_weak_pairs(far_aside, set()) == []
 
 
-def test_tilting_is_work_by_what_there_is_to_do(far_aside):
+def test_tilting_costs_what_there_is_to_do(far_aside):
     both = {far_aside.names[2]}
-    *_, once = AFFINE_SIMULATION.climb(FallbackState(far_aside, ReconstructionConfig()), both)
-    *_, twice = AFFINE_SIMULATION.climb(once, both)
-    assert once.work > 0.2  # three photographs of 1000 x 750 pixels are tilted, and compared
-    assert 0.0 < twice.work - once.work < 0.5 * once.work  # and then compared alone
-    first = next(iter(AFFINE_SIMULATION.climb(FallbackState(far_aside, ReconstructionConfig()), both)))
-    assert 0.0 < first.work < once.work
+    *_, once = AFFINE_SIMULATION.extend(FallbackState(far_aside, ReconstructionConfig()), both)
+    *_, twice = AFFINE_SIMULATION.extend(once, both)
+    assert once.cost > 0.2  # three photographs of 1000 x 750 pixels are tilted, and compared
+    assert 0.0 < twice.cost - once.cost < 0.5 * once.cost  # and then compared alone
+    first = next(iter(AFFINE_SIMULATION.extend(FallbackState(far_aside, ReconstructionConfig()), both)))
+    assert 0.0 < first.cost < once.cost
 
 
 def test_a_network_without_weights_says_how_to_get_them(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
-    assert LEARNED_MATCHES.obstacle() in (
+    assert LEARNED_MATCHES.unavailable_reason() in (
         "no weights: splatnode weights fetch xfeat_640x640",
         "pip install onnxruntime",
     )
 
 
-def test_the_table_names_each_rung_once():
-    names = [rung.name for rung in RUNGS]
+def test_the_table_names_each_fallback_once():
+    names = [fallback.name for fallback in FALLBACKS]
     assert len(set(names)) == len(names) and {AFFINE_SIMULATION.name, LEARNED_MATCHES.name} <= set(names)

@@ -1,4 +1,4 @@
-"""The ladder: rungs are climbed while they are needed and there is work left, and the better answer is kept."""
+"""Fallbacks are tried while they are needed and the budget lasts, and the better answer is kept."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ def estimate(code: Code, cameras: int) -> Reconstruction:
 NO_OVERLAP = estimate(Code.NO_OVERLAP, 2)
 
 
-def rung(name: str, parts: int = 1, obstacle: str = "") -> Fallback:
-    """Adds so many pieces of work of 1 each; the seed of its means' configuration counts them all."""
+def make_fallback(name: str, parts: int = 1, reason: str = "") -> Fallback:
+    """Adds so many pairs at a cost of 1 each; the seed of the state's configuration counts them all."""
 
-    def climb(means: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
+    def extend(state: FallbackState, doubtful: Collection[str]) -> Iterator[FallbackState]:
         for _ in range(parts):
-            means = replace(means, config=apply_changes(means.config, {"seed": means.config.seed + 1})).add_work(1.0)
-            yield means
+            state = replace(state, config=apply_changes(state.config, {"seed": state.config.seed + 1})).add_cost(1.0)
+            yield state
 
-    return Fallback(name, climb, lambda: obstacle)
+    return Fallback(name, extend, lambda: reason)
 
 
 @pytest.fixture
@@ -67,24 +67,26 @@ def estimated(monkeypatch):
     return of
 
 
-def working(work: float) -> ReconstructionConfig:
-    return apply_changes(ReconstructionConfig(), {"fallbacks": {"budget": work}})
+def make_config(cost: float) -> ReconstructionConfig:
+    return apply_changes(ReconstructionConfig(), {"fallbacks": {"budget": cost}})
 
 
-def climb(first: Reconstruction, *rungs: Fallback, config: ReconstructionConfig | None = None) -> Reconstruction:
-    return run_fallbacks(first, (), config or working(100.0), rungs=rungs)
+def run(first: Reconstruction, *tried: Fallback, config: ReconstructionConfig | None = None) -> Reconstruction:
+    return run_fallbacks(first, (), config or make_config(100.0), fallbacks=tried)
 
 
-def test_rungs_add_up_until_one_leads_to_an_answer(estimated):
+def test_fallbacks_add_up_until_one_leads_to_an_answer(estimated):
     answer = estimate(Code.OK, 4)
     seeds = estimated(NO_OVERLAP, answer)
-    assert climb(NO_OVERLAP, rung("a", 2), rung("b", 3), rung("c")) is answer
+    assert run(NO_OVERLAP, make_fallback("a", 2), make_fallback("b", 3), make_fallback("c")) is answer
     assert seeds == [2, 5]
 
 
 def test_a_refusal_says_what_was_tried(estimated):
     estimated(NO_OVERLAP)
-    found = climb(NO_OVERLAP, rung("tilts"), rung("networks", obstacle="no weights"), rung("nothing", 0))
+    found = run(
+        NO_OVERLAP, make_fallback("tilts"), make_fallback("networks", reason="no weights"), make_fallback("nothing", 0)
+    )
     assert found.verdict.message == "So it is. Also tried: tilts. Not tried: networks (no weights)."
     assert found.verdict.code is Code.NO_OVERLAP and not found.publishable
 
@@ -95,41 +97,48 @@ def test_a_refusal_says_what_was_tried(estimated):
     ids=lambda found: found.verdict.code.value,
 )
 def test_what_no_match_could_help_is_not_touched(first, estimated):
-    assert climb(first, rung("a")) is first and estimated() == []
+    assert run(first, make_fallback("a")) is first and estimated() == []
 
 
-def test_quick_stops_at_the_first_rung(estimated):
+def test_no_fallbacks_keeps_the_first_estimate(estimated):
     assert (
-        climb(NO_OVERLAP, rung("a"), config=ReconstructionConfig(no_fallbacks=True)) is NO_OVERLAP and estimated() == []
+        run(NO_OVERLAP, make_fallback("a"), config=ReconstructionConfig(no_fallbacks=True)) is NO_OVERLAP
+        and estimated() == []
     )
 
 
-def test_the_work_ends_the_climb_between_pieces_and_between_rungs(estimated):
+def test_the_budget_ends_fallbacks_between_pairs_and_between_fallbacks(estimated):
     seeds = estimated(NO_OVERLAP, NO_OVERLAP)
-    found = climb(NO_OVERLAP, rung("long", 100), rung("late"), config=working(6.0))
+    found = run(NO_OVERLAP, make_fallback("long", 100), make_fallback("late"), config=make_config(6.0))
     assert seeds == [6] and found.verdict.message.endswith("Also tried: long.")
 
 
 @pytest.mark.parametrize(("beyond", "tried"), [(-0.1, [2]), (0.1, [2, 3])])
 def test_to_estimate_again_is_work_too(beyond, tried, estimated):
     seeds = estimated(NO_OVERLAP, NO_OVERLAP)
-    work = 2.0 + fallbacks.CAMERAS * len(NAMES) + beyond
-    climb(NO_OVERLAP, rung("short", 2), rung("late"), config=working(work))
+    cost = 2.0 + fallbacks.CAMERA_COST * len(NAMES) + beyond
+    run(NO_OVERLAP, make_fallback("short", 2), make_fallback("late"), config=make_config(cost))
     assert seeds == tried
 
 
-def test_no_work_is_no_ladder(estimated):
-    assert climb(NO_OVERLAP, rung("a"), config=working(0.0)) is NO_OVERLAP
+def test_without_budget_no_fallback_is_tried(estimated):
+    assert run(NO_OVERLAP, make_fallback("a"), config=make_config(0.0)) is NO_OVERLAP
 
 
-def test_a_deadline_ends_the_climb_and_without_one_no_clock_is_read(estimated, monkeypatch):
+def test_a_deadline_ends_fallbacks_and_without_one_no_clock_is_read(estimated, monkeypatch):
     seeds, clock = estimated(NO_OVERLAP, NO_OVERLAP, NO_OVERLAP), itertools.count(0.0, 1.0)
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
-    run_fallbacks(NO_OVERLAP, (), working(1000.0), run=RunContext(deadline=6.0), rungs=[rung("long", 100)])
+    run_fallbacks(
+        NO_OVERLAP, (), make_config(1000.0), run=RunContext(deadline=6.0), fallbacks=[make_fallback("long", 100)]
+    )
     assert 1 < seeds[0] <= 6 and (read := next(clock)) < 10
-    run_fallbacks(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)])
+    run_fallbacks(NO_OVERLAP, (), make_config(1000.0), fallbacks=[make_fallback("long", 100)])
     assert seeds[1] == 100 and next(clock) == read + 1
-    climb(NO_OVERLAP, rung("long", 100), config=apply_changes(working(1000.0), {"fallbacks": {"timeout_s": 6.0}}))
+    run(
+        NO_OVERLAP,
+        make_fallback("long", 100),
+        config=apply_changes(make_config(1000.0), {"fallbacks": {"timeout_s": 6.0}}),
+    )
     assert 1 < seeds[2] <= 6
 
 
@@ -137,13 +146,13 @@ def test_the_better_answer_is_kept(estimated):
     partial, worse = estimate(Code.OK_PARTIAL, 3), estimate(Code.OK_PARTIAL, 3)
     refusals = [estimate(Code.AMBIGUOUS, 4), estimate(Code.NO_OVERLAP, 1)]
     estimated(refusals[0], worse, refusals[1])
-    kept = climb(partial, rung("a"), rung("b"), rung("c"))
+    kept = run(partial, make_fallback("a"), make_fallback("b"), make_fallback("c"))
     assert kept.registration is partial.registration and kept.verdict.code is Code.OK_PARTIAL
     more = estimate(Code.BASELINE_TOO_SMALL, 4)  # "move further to the side" would be the wrong thing to say
     estimated(more)
-    assert climb(NO_OVERLAP, rung("a")).verdict.code is Code.NO_OVERLAP
+    assert run(NO_OVERLAP, make_fallback("a")).verdict.code is Code.NO_OVERLAP
     estimated(estimate(Code.OK_PARTIAL, 4))
-    assert len(climb(partial, rung("a")).publishable_camera_names) == 4
+    assert len(run(partial, make_fallback("a")).publishable_camera_names) == 4
 
 
 def test_an_answer_that_contradicts_the_accepted_one_is_not_better():
@@ -161,13 +170,13 @@ def test_an_answer_that_contradicts_the_accepted_one_is_not_better():
 
 def test_a_rough_answer_of_weak_matches_is_not_taken(estimated):
     estimated(estimate(Code.OK_ROUGH, 4))
-    assert climb(NO_OVERLAP, rung("a")).verdict.code is Code.NO_OVERLAP
+    assert run(NO_OVERLAP, make_fallback("a")).verdict.code is Code.NO_OVERLAP
 
 
 def test_what_a_few_cameras_leave_uncertain_may_be_mended_by_more(estimated):
     pair, answer = estimate(Code.FOCAL_SUSPECT, 2), estimate(Code.OK, 4)
     estimated(answer)
-    assert climb(pair, rung("a")) is answer
+    assert run(pair, make_fallback("a")) is answer
 
 
 def test_an_accepted_camera_is_not_given_up_for_two_others():
@@ -178,7 +187,7 @@ def test_an_accepted_camera_is_not_given_up_for_two_others():
     assert choose_better_reconstruction(one, without_first) is one and len(without_first.publishable_camera_names) == 3
 
 
-def test_pause_may_abandon_the_climb(estimated):
+def test_pause_may_abandon_fallbacks(estimated):
     class Abandoned(Exception):
         pass
 
@@ -187,7 +196,7 @@ def test_pause_may_abandon_the_climb(estimated):
 
     estimated(NO_OVERLAP)
     with pytest.raises(Abandoned):
-        run_fallbacks(NO_OVERLAP, (), ReconstructionConfig(), RunContext(pause), [rung("a")])
+        run_fallbacks(NO_OVERLAP, (), ReconstructionConfig(), RunContext(pause), [make_fallback("a")])
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -197,4 +206,4 @@ def test_photographs_of_three_places_are_refused_with_what_was_tried_unless_quic
     *_, final = reconstruct(frames, ReconstructionConfig(no_fallbacks=quick))
     assert final.verdict.code is Code.NO_OVERLAP
     assert ("stronger tilts" in final.verdict.message) != quick
-    assert (final.seconds["ladder"] > 0.1) != quick
+    assert (final.seconds["fallbacks"] > 0.1) != quick
