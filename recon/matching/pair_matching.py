@@ -80,7 +80,6 @@ class TwoView:
     num_homography: int  # inliers that one homography explains too: a plane, or no parallax
     num_rotation: int  # inliers that a pure rotation with one focal length explains: no parallax
     focal_ratio: float  # shared focal length over the longer side, from this pair alone
-    rotation_focal_ratio: float  # the same if the camera only rotated
 
     @property
     def is_pure_rotation(self) -> bool:
@@ -128,7 +127,7 @@ def estimate(
         return None, log10_nfa
     points1, points2 = points1[inlier], points2[inlier]
     _, plane = cv2.findHomography(points1, points2, cv2.USAC_MAGSAC, config.homography_px * scale)
-    rotation_inliers, rotation_focal = fit_rotation(points1, points2, config.homography_px * scale, longer_side)
+    rotation_inliers, _ = fit_rotation(points1, points2, config.homography_px * scale, longer_side)
     geometry = TwoView(
         matches=matches[inlier],
         points1=points1,
@@ -138,7 +137,6 @@ def estimate(
         num_homography=0 if plane is None else int(plane.sum()),
         num_rotation=rotation_inliers,
         focal_ratio=_estimate_shared_focal(points1, points2, threshold) / longer_side,
-        rotation_focal_ratio=rotation_focal / longer_side,
     )
     return geometry, log10_nfa
 

@@ -256,16 +256,6 @@ class Shifts:
         self._adam.follow({"offsets": _zeros(gaussians)}, origin)
 
 
-def rotate_to_axes(gradients: Tensor, gaussians: Gaussians) -> Tensor:
-    """(N, 3) the derivatives by offsets along the axes, of derivatives by positions `gradients` (N, 3)."""
-    return make_axis_rotation(gaussians)(gradients, to_world=False)
-
-
-def rotate_to_world(offsets: Tensor, gaussians: Gaussians) -> Tensor:
-    """(N, 3) the shifts in the world, of `offsets` (N, 3) along the axes in standard deviations."""
-    return make_axis_rotation(gaussians)(offsets, to_world=True)
-
-
 def make_axis_rotation(gaussians: Gaussians) -> Callable[..., Tensor]:
     """A function of vectors (N, 3) and of `to_world`, by which vectors along the axes of `gaussians` turn into it."""
     quats, log_scales = gaussians.quats.detach(), gaussians.log_scales.detach()

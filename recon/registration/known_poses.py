@@ -330,7 +330,7 @@ def _join_matches(known: TwoView | None, matches: Index, one: Keyframe, other: K
     ratio = _focal(other) / longer_side(other.frame)
     num_candidates = len(matches) if known is None else known.num_candidates
     log10_nfa = 0.0 if known is None else known.log10_nfa
-    return TwoView(matches, points1, points2, num_candidates, log10_nfa, 0, 0, ratio, ratio)
+    return TwoView(matches, points1, points2, num_candidates, log10_nfa, 0, 0, ratio)
 
 
 def _focal(keyframe: Keyframe) -> float:

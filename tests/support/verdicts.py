@@ -42,7 +42,6 @@ def pair(matches: int = 200, turned: bool = False) -> TwoView:
         num_homography=matches if turned else matches // 2,
         num_rotation=matches if turned else matches // 10,
         focal_ratio=1.0,
-        rotation_focal_ratio=1.0,
     )
 
 

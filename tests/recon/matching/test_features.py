@@ -116,7 +116,7 @@ def test_frames_without_features_are_compared_without_a_pair():
 def test_the_motion_of_a_resized_copy_is_none():
     """A frame beside the same frame at half its size: in pixels of one size, nothing moved."""
     points = np.random.default_rng(0).uniform(-300, 300, (9, 2))
-    pair = TwoView(np.zeros((9, 2), np.int64), points, 0.5 * points, 9, -20.0, 9, 9, 1.0, 1.0)
+    pair = TwoView(np.zeros((9, 2), np.int64), points, 0.5 * points, 9, -20.0, 9, 9, 1.0)
     assert pair_matching.median_motion_px(pair, 640, 320) == 0.0
     moved = pair.rescale(1.0, 2.0)
     assert pair_matching.median_motion_px(moved, 640, 640) == 0.0

@@ -7,9 +7,8 @@ from splatnode.recon.optimize.fit import (
     LARGEST_EXTENT,
     Shifts,
     axes_by_torch,
+    make_axis_rotation,
     rotate_by_torch,
-    rotate_to_axes,
-    rotate_to_world,
 )
 from splatnode.recon.scene import Gaussians
 
@@ -36,10 +35,10 @@ def gaussians(quats: list, scales: list) -> Gaussians:
 
 def test_an_offset_goes_along_the_gaussian_s_own_axis_by_its_standard_deviations():
     one = gaussians([QUARTER_TURN], [[0.1, 0.02, 0.03]])
-    assert rotate_to_world(torch.tensor([[2.0, 0.0, 0.0]]), one).numpy() == pytest.approx(
+    assert make_axis_rotation(one)(torch.tensor([[2.0, 0.0, 0.0]]), to_world=True).numpy() == pytest.approx(
         np.array([[0.0, 0.2, 0.0]]), abs=1e-6
     )
-    assert rotate_to_world(torch.tensor([[0.0, 1.0, 0.0]]), one).numpy() == pytest.approx(
+    assert make_axis_rotation(one)(torch.tensor([[0.0, 1.0, 0.0]]), to_world=True).numpy() == pytest.approx(
         np.array([[-0.02, 0.0, 0.0]]), abs=1e-6
     )
 
@@ -49,21 +48,22 @@ def test_derivatives_by_offsets_are_those_by_the_chain_rule():
     offsets = torch.zeros(len(some), 3, requires_grad=True)
     weights = torch.rand(len(some), 3, generator=torch.Generator().manual_seed(1))
     (rotate_by_torch(axes_by_torch(some.quats, some.log_scales), offsets, to_world=True) * weights).sum().backward()
-    assert rotate_to_axes(weights, some).numpy() == pytest.approx(offsets.grad.numpy(), abs=1e-6)
+    assert make_axis_rotation(some)(weights, to_world=False).numpy() == pytest.approx(offsets.grad.numpy(), abs=1e-6)
 
 
 @pytest.mark.parametrize("to_world", [False, True])
 def test_the_core_computes_what_torch_computes(to_world: bool):
     some = random_gaussians()
     vectors = torch.randn(len(some), 3, generator=torch.Generator().manual_seed(2))
-    function = rotate_to_world if to_world else rotate_to_axes
     expected = rotate_by_torch(axes_by_torch(some.quats, some.log_scales), vectors, to_world)
-    assert function(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-5)
+    assert make_axis_rotation(some)(vectors, to_world).numpy() == pytest.approx(expected.numpy(), abs=1e-5)
 
 
 def test_what_is_far_larger_than_the_scene_moves_as_if_it_were_not():
     one = gaussians([[1.0, 0.0, 0.0, 0.0]], [[50.0, 0.01, 0.01]])
-    assert float(rotate_to_world(torch.tensor([[1.0, 0.0, 0.0]]), one)[0, 0]) == pytest.approx(LARGEST_EXTENT)
+    assert float(make_axis_rotation(one)(torch.tensor([[1.0, 0.0, 0.0]]), to_world=True)[0, 0]) == pytest.approx(
+        LARGEST_EXTENT
+    )
 
 
 def test_the_first_step_moves_each_axis_by_the_rate_whatever_the_gradient_s_size():
@@ -92,6 +92,6 @@ def random_gaussians(count: int = 5000) -> Gaussians:
 
 def test_gaussians_on_another_device_are_turned_by_torch(monkeypatch: pytest.MonkeyPatch):
     some, vectors = random_gaussians(20), torch.ones(20, 3)
-    expected = rotate_to_world(vectors, some)
+    expected = make_axis_rotation(some)(vectors, to_world=True)
     monkeypatch.setattr(fit.rasterize, "is_on_cpu", lambda _: False)
-    assert rotate_to_world(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-6)
+    assert make_axis_rotation(some)(vectors, to_world=True).numpy() == pytest.approx(expected.numpy(), abs=1e-6)
