@@ -252,8 +252,8 @@ def describe_heartbeat(room: str, fields: Mapping[str, Any]) -> list[str]:
         name, written = _WORDS.get(key, (key.replace("_", " "), _format_value))
         shown = map(_format_value, value) if isinstance(value, list) else [written(value)]
         lines += [
-            f"  {told:24}{each}"
-            for told, each in zip(itertools.chain([name], itertools.repeat("")), shown, strict=False)
+            f"  {label:24}{each}"
+            for label, each in zip(itertools.chain([name], itertools.repeat("")), shown, strict=False)
         ]
     return lines
 
@@ -577,13 +577,13 @@ class CaptureSession:
         newest = "".join(f"{each.name}: {each.reason}" for each in quarantine.newest(1))
         self._problems.count("requests that were refused", server.refused, server.why_refused)
         self._problems.count("commands that were refused", self._commands.refused, self._commands.why_refused)
-        told = [f"{quarantine.unseen} keyframes were set aside, the last: {newest}"] if quarantine.unseen else []
-        told += (
+        sentences = [f"{quarantine.unseen} keyframes were set aside, the last: {newest}"] if quarantine.unseen else []
+        sentences += (
             [f"{server.num_rejected_consumers} further recons ask for keyframes; stop them"]
             if server.num_rejected_consumers
             else []
         )
-        return sanitize_text("; ".join((*told, *filter(None, [str(self._problems)]))))
+        return sanitize_text("; ".join((*sentences, *filter(None, [str(self._problems)]))))
 
     def _answer(self, _: MarkProblemsSeen) -> Answer:
         self._problems.mark_seen()
