@@ -90,14 +90,14 @@ def estimate_scale_from_motions(
     if sigma > _LEAST_KNOWN:
         return [f"motions between {_format_pair_count(count)} were given, which are not longer than they are unsure"]
     off = np.linalg.norm(scale * steps.scene - steps.given, axis=1)
-    told = [
+    notes = [
         f"the motion from {first} to {second} was left out: it is {off[i]:.2g} m and {steps.turned_deg[i]:.2g} degrees "
         "off"
         for i, (first, second) in enumerate(steps.names)
         if not kept[i]
     ]
     unit = Measurement(scale, math.hypot(sigma, shared), f"motions between {_format_pair_count(int(kept.sum()))}")
-    return [unit, *told]
+    return [unit, *notes]
 
 
 def _format_pair_count(count: int) -> str:
@@ -251,7 +251,7 @@ class PoseAlignment:
     unit: Measurement
     to_world: Similarity  # from the scene to the world of the poses
     centre: Array  # (3,) mean of the cameras that count, in the scene
-    told: tuple[str, ...]  # a sentence for each pose that was left out
+    notes: tuple[str, ...]  # a sentence for each pose that was left out
     placement: PosePlacement | None = None  # by the errors that the poses have; None: nothing is known of these
 
     def rescale(self, scale: float) -> Similarity:
@@ -347,13 +347,13 @@ def align_to_poses(
     kept = placement.fits
     by, sigma = _refine_similarity(pairs, by, kept, position_m, scattered_deg, sigmas.drift)
     off_m, off_deg = pairs.compute_errors(by)
-    told = tuple(
+    notes = tuple(
         f"the pose of {name} was left out: it is {_format_error(off_m[i], off_deg[i], scattered_deg[i])} off"
         for i, name in enumerate(names)
         if not kept[i]
     )
     unit = Measurement(by.scale, sigma, f"poses of {kept.sum()} photographs")
-    return PoseAlignment(unit, placement.place(by.scale), pairs.scene[kept, :3, 3].mean(0), told, placement)
+    return PoseAlignment(unit, placement.place(by.scale), pairs.scene[kept, :3, 3].mean(0), notes, placement)
 
 
 def _describe_noise(

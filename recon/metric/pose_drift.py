@@ -196,10 +196,10 @@ def _estimate_factors(scene: Array, given: Array, by: Similarity, noise: PoseNoi
 
     own_turn, step_turn = _find_likeliest(score_turns)
     parts = _make_turn_covariances(given, noise, NoiseFactors(own_turn, step_turn))
-    told = np.linalg.solve(parts.turns, parts.both.T).T  # of the shifts by the turns
-    left = parts.by_turns - told @ parts.both.T
-    shifts = (errors[3 * count :] - told @ errors[: 3 * count])[:, None]
-    shift_design, adding = design[3 * count :] - told @ design[: 3 * count], _sum_variances(noise, 1)
+    regression = np.linalg.solve(parts.turns, parts.both.T).T  # of the shifts on the turns
+    left = parts.by_turns - regression @ parts.both.T
+    shifts = (errors[3 * count :] - regression @ errors[: 3 * count])[:, None]
+    shift_design, adding = design[3 * count :] - regression @ design[: 3 * count], _sum_variances(noise, 1)
 
     def score_shifts(own: float, step: float) -> float:
         covariance = np.diag(_own_variances(noise, own, 1)) + step**2 * adding

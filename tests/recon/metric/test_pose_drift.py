@@ -107,7 +107,7 @@ def test_errors_of_each_pose_s_own_are_averaged():
     assert np.median(off[10]) < 0.02
     assert np.median(off[90]) < 0.02  # on a way nine times as long
     _, found = align(0, 90, NONE, (0.01, 1.0))
-    assert found.placement is not None and found.told == ()
+    assert found.placement is not None and found.notes == ()
     factors = found.placement.factors
     assert (factors.own_turn, factors.own_shift) == (0.5, 1.0)
     assert factors.step_turn <= 0.25 and factors.step_shift <= 0.25
@@ -136,7 +136,7 @@ def test_a_pose_that_is_far_off_is_named_and_moves_nothing(wrong):
     given[wrong][:3, 3] += [0.6, -0.6, 0.53]
     found = align_to_poses(views, dict(zip(views, given, strict=True)), TOLD)
     assert isinstance(found, PoseAlignment) and isinstance(right, PoseAlignment)
-    (told,) = found.told
+    (told,) = found.notes
     assert told.startswith(f"the pose of {wrong:03d} was left out: it is ")
     # Without the first pose the second one is as near the start as is known
     assert find_worst_m(found.rescale(UNIT), views, Ts) < find_worst_m(right.rescale(UNIT), views, Ts) + 0.02
