@@ -281,9 +281,9 @@ class Video:
 
     def _pixel_aspect(self) -> Fraction:
         """Width of a pixel over its height; 1 where the video tells none, or one that is not believed."""
-        told = self._stream.sample_aspect_ratio or self._stream.codec_context.sample_aspect_ratio
+        aspect = self._stream.sample_aspect_ratio or self._stream.codec_context.sample_aspect_ratio
         low, high = _SQUARE_RANGE
-        return told if told and low <= told <= high else Fraction(1)
+        return aspect if aspect and low <= aspect <= high else Fraction(1)
 
     def _ends_early(self, timeline: _Timeline) -> bool:
         """Whether fewer packets were there than it states; where it states its duration alone, much less of that."""

@@ -321,13 +321,13 @@ class CaptureSession:
         newest = "".join(f"{each.name}: {each.reason}" for each in quarantine.newest(1))
         self._problems.count("requests that were refused", server.refused, server.why_refused)
         self._problems.count("commands that were refused", self._commands.refused, self._commands.why_refused)
-        told = [f"{quarantine.unseen} keyframes were set aside, the last: {newest}"] if quarantine.unseen else []
-        told += (
+        sentences = [f"{quarantine.unseen} keyframes were set aside, the last: {newest}"] if quarantine.unseen else []
+        sentences += (
             [f"{server.num_rejected_consumers} further recons ask for keyframes; stop them"]
             if server.num_rejected_consumers
             else []
         )
-        return sanitize_text("; ".join((*told, *filter(None, [str(self._problems)]))))
+        return sanitize_text("; ".join((*sentences, *filter(None, [str(self._problems)]))))
 
     def _answer(self, _: MarkProblemsSeen) -> Answer:
         self._problems.mark_seen()

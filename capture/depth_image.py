@@ -334,8 +334,8 @@ def find_depth_files(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     found = {name: files[Path(name).stem] for name in names if Path(name).stem in files}
     if not found:
         raise ValueError(f"no depth image in {fspath(folder)!r} has the name of a photograph; name both alike")
-    if told := describe_few_pairs(len(found), len(names)):
-        notify(log, told)
+    if notice := describe_few_pairs(len(found), len(names)):
+        notify(log, notice)
     return found
 
 

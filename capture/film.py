@@ -123,8 +123,8 @@ def camera(path: Path) -> tuple[str, dict[str, Any]]:
 
     Raises ValueError for a part of a video that is no range of seconds.
     """
-    kind, _, told = _find_camera(path)
-    return kind, told
+    kind, _, camera_config = _find_camera(path)
+    return kind, camera_config
 
 
 def _find_camera(path: Path) -> tuple[str, Any, dict[str, Any]]:
@@ -139,8 +139,8 @@ def _find_camera(path: Path) -> tuple[str, Any, dict[str, Any]]:
 def _parse_seconds(file: Path, part: str) -> dict[str, float]:
     """From when to when a part of a video is. Raises ValueError."""
     found = _SECONDS.fullmatch(part)
-    told = {} if found is None else {"start_s": found[1], "end_s": found[2]}
-    span = {name: float(text) for name, text in told.items() if text}
+    bounds = {} if found is None else {"start_s": found[1], "end_s": found[2]}
+    span = {name: float(text) for name, text in bounds.items() if text}
     if not span or span.get("start_s", 0.0) >= span.get("end_s", math.inf):
         raise ValueError(
             f"{sanitize_text(str(file))!r}: behind the # must be seconds of the video, the first before the last, "
@@ -152,8 +152,8 @@ def _parse_seconds(file: Path, part: str) -> dict[str, float]:
 
 def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
     """Its frames. Raises FileNotFoundError, or ValueError where they cannot be had."""
-    _, module, told = _find_camera(path)
-    return module.stream(module.Config(**told))
+    _, module, camera_config = _find_camera(path)
+    return module.stream(module.Config(**camera_config))
 
 
 # Several cameras of one robot as one stream: a folder or a film of each, their images in the order of their times.
@@ -315,18 +315,18 @@ def _list_times(cameras: Sequence[CameraSource]) -> dict[tuple[str, str], Stamp]
     Where not all have a time of one clock, or those of one camera have the same, times do not tell which were taken
     together: those of one name were, then, ten a second.
     """
-    told: dict[tuple[str, str], Stamp | None] = {}
+    stamps: dict[tuple[str, str], Stamp | None] = {}
     for camera in cameras:
-        told |= {(camera.camera_id, name): stamp for name, stamp in _read_times(camera.path).items()}
-    known = {key: stamp for key, stamp in told.items() if stamp is not None}
+        stamps |= {(camera.camera_id, name): stamp for name, stamp in _read_times(camera.path).items()}
+    known = {key: stamp for key, stamp in stamps.items() if stamp is not None}
     one_clock = len({stamp.clock for stamp in known.values()}) == 1
-    told_apart = len({(camera_id, stamp.ns) for (camera_id, _), stamp in known.items()}) == len(told)
-    if one_clock and told_apart:
+    are_distinct = len({(camera_id, stamp.ns) for (camera_id, _), stamp in known.items()}) == len(stamps)
+    if one_clock and are_distinct:
         return known
-    stems = sorted({Path(name).stem for _, name in told}, key=lambda stem: folder.natural_order(Path(stem)))
+    stems = sorted({Path(name).stem for _, name in stamps}, key=lambda stem: folder.natural_order(Path(stem)))
     places = {stem: place for place, stem in enumerate(stems)}
     step = folder.DEFAULT_STEP_NS
-    return {key: Stamp(places[Path(key[1]).stem] * step, Clock.RECORDING) for key in told}
+    return {key: Stamp(places[Path(key[1]).stem] * step, Clock.RECORDING) for key in stamps}
 
 
 def _select_times(times: _Times, names: Sequence[str]) -> _Times:

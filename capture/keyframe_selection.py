@@ -521,8 +521,8 @@ class Choice:
         """For people: how many, and why."""
         taken = ", ".join(f"{count} {reason}" for reason, count in self.taken.items())
         others = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
-        told = f"{len(self.names)} of {self.examined} {self.what}s are keyframes ({taken})"
-        return f"{told}; the others: {others}" if others else told
+        summary = f"{len(self.names)} of {self.examined} {self.what}s are keyframes ({taken})"
+        return f"{summary}; the others: {others}" if others else summary
 
 
 def choose(

@@ -511,14 +511,14 @@ def _parse_own(shown: str, content: Mapping[str, Any]) -> Intrinsics:
     """A lens, also below `intrinsics` or `camera`, as the configuration of a capture has it."""
     nested = content.get("camera")
     content = nested if isinstance(nested, dict) and "intrinsics" in nested else content
-    told = content.get("intrinsics", content)
-    told = {"source": "calibration", **told} if isinstance(told, dict) else told
+    fields = content.get("intrinsics", content)
+    fields = {"source": "calibration", **fields} if isinstance(fields, dict) else fields
     known = {field.name for field in dataclasses.fields(Intrinsics)}
     try:
-        lens = record_of(told, Intrinsics)
+        lens = record_of(fields, Intrinsics)
     except msgspec.ValidationError as error:
         raise UnusableLens(f"{shown} must give {_READ}: {error}") from error
-    if unknown := sorted(set(told) - known):
+    if unknown := sorted(set(fields) - known):
         raise UnusableLens(
             f"{shown}: a lens has no {', '.join(map(sanitize_text, unknown))}; there are {', '.join(sorted(known))}"
         )

@@ -80,7 +80,7 @@ MOST_POSES = 1_000_000  # of a file: those of five hours at 60 a second
 _LONGEST_GAP_S = 1.0  # between two poses, over which a time between them is interpolated
 _NEAREST_S = 0.02  # of a time to the one pose that counts where there is none on its other side
 _LARGEST_DEG = 180.0  # of a sigma
-_UNTOLD = math.nan, math.nan
+_NO_SIGMAS = math.nan, math.nan
 _FARTHEST_M = 1e9  # of a coordinate
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras: x right, y up, z back
 _Row = tuple[float, float, float, float]
@@ -136,12 +136,12 @@ class Trajectory:
     def sigmas_of(self, frame: Frame) -> tuple[float, float] | None:
         """Returns the sigmas of one frame's pose, metres and degrees: between two poses the larger; None: not told."""
         if self.by_name or self.by_camera:
-            told = self.sigmas_by_name.get(self.names(frame.name))
+            sigmas = self.sigmas_by_name.get(self.names(frame.name))
         else:
             time = self._time_of(frame) if len(self.sigmas) else None
             near = np.zeros((0, 2)) if time is None else self.sigmas[self._neighbours(time)]
-            told = near.max(0) if len(near) and (near > 0).all() else None
-        return None if told is None or not np.isfinite(told).all() else (float(told[0]), float(told[1]))
+            sigmas = near.max(0) if len(near) and (near > 0).all() else None
+        return None if sigmas is None or not np.isfinite(sigmas).all() else (float(sigmas[0]), float(sigmas[1]))
 
     def _time_of(self, frame: Frame) -> float | None:
         """The time at which the frame has a pose, seconds; or its number, where times are numbers."""
@@ -240,8 +240,10 @@ def _read(path: Path, data: bytes) -> Trajectory:
         content = record_in(data, _Transforms)
         _check_count(len(content.frames))
         matrices = np.array([each.transform_matrix for each in content.frames], np.float64).reshape(-1, 4, 4)
-        told = any(each.sigma_m is not None or each.sigma_deg is not None for each in content.frames)
-        sigmas = np.array([(each.sigma_m, each.sigma_deg) for each in content.frames], np.float64) if told else None
+        has_sigmas = any(each.sigma_m is not None or each.sigma_deg is not None for each in content.frames)
+        sigmas = (
+            np.array([(each.sigma_m, each.sigma_deg) for each in content.frames], np.float64) if has_sigmas else None
+        )
         return _make_named_trajectory([each.file_path for each in content.frames], matrices @ _OPENGL, sigmas)
     if path.suffix == ".bin":
         return _parse_colmap(binary_images(data))
@@ -280,8 +282,12 @@ def _make_named_trajectory(
         if name not in shared:
             by_name[name] = place
     _check(names, Ts)
-    told = None if sigmas is None else _check_sigmas(names, sigmas)
-    known = {} if told is None else {key: told[at] for key, at in (by_name | by_camera).items() if told[at, 0] > 0}
+    sigma_rows = None if sigmas is None else _check_sigmas(names, sigmas)
+    known = (
+        {}
+        if sigma_rows is None
+        else {key: sigma_rows[at] for key, at in (by_name | by_camera).items() if sigma_rows[at, 0] > 0}
+    )
     poses = ({key: Ts[place] for key, place in places.items()} for places in (by_name, by_camera))
     return Trajectory(next(poses), by_camera=next(poses), sigmas_by_name=known)
 
@@ -297,7 +303,7 @@ def _parse_colmap(rows: Iterable[ImageRow]) -> Trajectory:
 
 
 def _parse_tum(text: str) -> Trajectory:
-    names, numbers, told = [], array("d"), array("d")
+    names, numbers, sigma_numbers = [], array("d"), array("d")
     for line in each_line(text):
         if line.strip() and not line.lstrip().startswith("#"):
             name, *motion = line.split(maxsplit=10)
@@ -306,10 +312,10 @@ def _parse_tum(text: str) -> Trajectory:
             x, y, z, qx, qy, qz, qw, *sigmas = map(float, motion)
             _add(names, name)
             numbers.extend((x, y, z, qw, qx, qy, qz))
-            told.extend(sigmas or _UNTOLD)
+            sigma_numbers.extend(sigmas or _NO_SIGMAS)
     if not names:
         raise ValueError("each line must have eight values, and there must be one")
-    Ts, by_line = _motions(numbers), np.array(told, np.float64).reshape(-1, 2)
+    Ts, by_line = _motions(numbers), np.array(sigma_numbers, np.float64).reshape(-1, 2)
     try:
         seconds = np.array([float(name) for name in names])
     except ValueError:  # names of photographs in place of times
@@ -323,16 +329,16 @@ def _parse_tum(text: str) -> Trajectory:
 
 def _check_sigmas(names: Sequence[str], sigmas: Sequence[Sequence[float]] | Array) -> Array:
     """(M, 2) metres and degrees; NaN where a pose tells none. Raises ValueError where some are no sigmas."""
-    told = np.asarray(sigmas, np.float64).reshape(-1, 2)
-    untold = np.isnan(told).all(1)
-    usable = (told > 0).all(1) & (told[:, 0] <= LARGEST_M) & (told[:, 1] <= _LARGEST_DEG)
-    for index in np.flatnonzero(~(untold | usable)):
-        got = " and ".join("nothing" if math.isnan(value) else f"{value:g}" for value in told[index])
+    rows = np.asarray(sigmas, np.float64).reshape(-1, 2)
+    is_absent = np.isnan(rows).all(1)
+    usable = (rows > 0).all(1) & (rows[:, 0] <= LARGEST_M) & (rows[:, 1] <= _LARGEST_DEG)
+    for index in np.flatnonzero(~(is_absent | usable)):
+        got = " and ".join("nothing" if math.isnan(value) else f"{value:g}" for value in rows[index])
         raise ValueError(
             f"the sigmas of the pose of {sanitize_text(names[int(index)], 100)} must be metres and degrees above 0, "
             f"up to {LARGEST_M:g} and {_LARGEST_DEG:g}; got {got}"
         )
-    return told
+    return rows
 
 
 def _add(names: list[str], name: str) -> None:

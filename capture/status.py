@@ -222,8 +222,8 @@ def describe_heartbeat(room: str, fields: Mapping[str, Any]) -> list[str]:
         name, written = _WORDS.get(key, (key.replace("_", " "), _format_value))
         shown = map(_format_value, value) if isinstance(value, list) else [written(value)]
         lines += [
-            f"  {told:24}{each}"
-            for told, each in zip(itertools.chain([name], itertools.repeat("")), shown, strict=False)
+            f"  {label:24}{each}"
+            for label, each in zip(itertools.chain([name], itertools.repeat("")), shown, strict=False)
         ]
     return lines
 

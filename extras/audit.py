@@ -499,9 +499,9 @@ def localize_camera(
         elif first is None:
             first = CameraSighting(frame.name, found)
         elif (since := measure_motion(first.placed, found)).is_significant:
-            told = f"since {first.photograph} it moved by {since.format_motion(landmarks.unit, landmarks.metric)}"
+            phrase = f"since {first.photograph} it moved by {since.format_motion(landmarks.unit, landmarks.metric)}"
             return SightingFailure(
-                frame.name, MOVING, f"{told}: only a camera that stands still in a recording can be compared"
+                frame.name, MOVING, f"{phrase}: only a camera that stands still in a recording can be compared"
             )
     if first is not None:
         return first

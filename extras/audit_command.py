@@ -183,14 +183,14 @@ def draw_audit(audit: Audit) -> bytes:
         y = _TOP + row * _LINE
         parts.append(f'<text x="{_LEFT - 8}" y="{y + 18}" text-anchor="end">{_escape_name(camera)}</text>')
         not_seen = {number: f"{each.code}: {each.message}" for number, each in audit.not_seen.get(camera, {}).items()}
-        for number, told in {**audit.unreadable, **not_seen}.items():
-            parts.append(_draw_cell(number, y, _NOT_SEEN, told))
+        for number, title in {**audit.unreadable, **not_seen}.items():
+            parts.append(_draw_cell(number, y, _NOT_SEEN, title))
         for index, period in enumerate(audit.periods.get(camera, ())):
-            told = (
+            title = (
                 "where it stood first" if period.came_by is None else f"moved by {format_amount(audit, period.came_by)}"
             )
             for number in period.recordings:
-                parts.append(_draw_cell(number, y, _COLOURS[index % len(_COLOURS)], told))
+                parts.append(_draw_cell(number, y, _COLOURS[index % len(_COLOURS)], title))
             if period.came_by is not None:
                 x = _LEFT + period.recordings[0] * _CELL - _GAP / 2
                 parts.append(
@@ -205,10 +205,10 @@ def draw_audit(audit: Audit) -> bytes:
     return "\n".join([*parts, "</svg>\n"]).encode()
 
 
-def _draw_cell(number: int, y: float, colour: str, told: str) -> str:
+def _draw_cell(number: int, y: float, colour: str, title: str) -> str:
     x = _LEFT + number * _CELL
     rectangle = f'<rect x="{x}" y="{y}" width="{_CELL - _GAP}" height="{_CELL}" fill="{colour}">'
-    return f"{rectangle}<title>{html.escape(told)}</title></rect>"
+    return f"{rectangle}<title>{html.escape(title)}</title></rect>"
 
 
 def _escape_name(name: str) -> str:

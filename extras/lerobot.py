@@ -142,8 +142,8 @@ class Feature(msgspec.Struct, frozen=True):
 
     @property
     def is_film(self) -> bool:
-        told = {**(self.video_info or {}), **(self.info or {})}
-        return self.dtype == "video" and not (told.get("is_depth_map") or told.get("video.is_depth_map"))
+        info = {**(self.video_info or {}), **(self.info or {})}
+        return self.dtype == "video" and not (info.get("is_depth_map") or info.get("video.is_depth_map"))
 
 
 class Info(msgspec.Struct, frozen=True):

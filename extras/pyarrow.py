@@ -42,16 +42,16 @@ def open_bounded_table(path: Path) -> Iterator[pq.ParquetFile]:
     with open_regular(path, UnusableTable) as stream:
         _check_directory(stream)
         with pq.ParquetFile(stream, memory_map=False, pre_buffer=False) as table:
-            told = table.metadata
+            metadata = table.metadata
             for count, most, what in (
-                (told.num_rows, MOST_ROWS, "rows"),
-                (told.num_row_groups, _MOST_GROUPS, "row groups"),
-                (told.num_columns, _MOST_COLUMNS, "columns"),
+                (metadata.num_rows, MOST_ROWS, "rows"),
+                (metadata.num_row_groups, _MOST_GROUPS, "row groups"),
+                (metadata.num_columns, _MOST_COLUMNS, "columns"),
             ):
                 if not 0 <= count <= most:
                     raise UnusableTable(f"a table must have at most {most} {what}, it has {count}; split it")
-            for index in range(told.num_row_groups):
-                if not 0 <= (size := told.row_group(index).total_byte_size) <= _MOST_GROUP_BYTES:
+            for index in range(metadata.num_row_groups):
+                if not 0 <= (size := metadata.row_group(index).total_byte_size) <= _MOST_GROUP_BYTES:
                     raise UnusableTable(
                         f"a row group must have at most {_MOST_GROUP_BYTES} bytes, one has {size}; write smaller ones"
                     )

@@ -223,7 +223,7 @@ def _replay(args: argparse.Namespace, request: Request, config: ReconstructionCo
     trajectory = None if args.poses is None else read_poses(args.poses)
     known = _load_scale_evidence(args, given, trajectory)
     own = {} if trajectory is None else trajectory.find_sigmas(given.frames)
-    if known.poses is not None and trusts_poses(args, told=bool(own)):
+    if known.poses is not None and trusts_poses(args, has_file_sigmas=bool(own)):
         given = add_poses(given, known.poses, args.poses_sigma, own)
         known = replace(known, poses=None)  # they are the photographs' own now
         config = apply_changes(config, {"registration": {"trust_poses": True, **collect_drift_changes(args)}})
@@ -457,9 +457,9 @@ def replay_map(args: argparse.Namespace, request: Request, config: Reconstructio
         frames = _write_frames(source, args.out) if source.photographs is None else source.frames()
         if rig is not None:
             frames = map(partial(place_on_rig, rig=rig), frames)
-        told = _ProgressPrinter(args.json, len(source.choice.names))
+        printer = _ProgressPrinter(args.json, len(source.choice.names))
         with _limit_log_level():
-            make_scenes(frames, source.identity(config, rig), make_node_config(config, args.out), told)
+            make_scenes(frames, source.identity(config, rig), make_node_config(config, args.out), printer)
         progress("")
         reports = write_maps(args.out, args.out, partial(compute_gaussian_limit, args), quiet=args.json)
         report = _make_report(source, args.out, reports, time.monotonic() - began_s)

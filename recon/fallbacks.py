@@ -40,7 +40,7 @@ from splatnode.recon.matching.view_graph import Matcher, Pair, ViewGraph, match_
 from splatnode.recon.networks import Weights, depth_anything, find_mismatch, locate_weights
 from splatnode.recon.optimize.losses import semantic
 from splatnode.recon.priors import xfeat
-from splatnode.recon.registration.known_poses import has_told_lens
+from splatnode.recon.registration.known_poses import has_calibrated_lens
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.threads import BACKGROUND, RunContext
 
@@ -388,7 +388,7 @@ def _needs_depth(estimate: Reconstruction) -> bool:
 def _advise_lens(estimate: Reconstruction) -> Reconstruction:
     """Appends to the advice that depth images could place the cameras, where they came without a lens that was told."""
     frames = [keyframe.frame for keyframe in estimate.graph.keyframes if keyframe.frame.depth is not None]
-    if len(frames) < 2 or any(map(has_told_lens, frames)):
+    if len(frames) < 2 or any(map(has_calibrated_lens, frames)):
         return estimate
     advice = f"{estimate.verdict.advice} {LENS_FOR_DEPTH}".strip()
     return replace(estimate, verdict=replace(estimate.verdict, advice=advice))

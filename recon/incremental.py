@@ -82,10 +82,10 @@ class ReconstructionCache:
         refused = [known for known in self.refused if known != names]
         return replace(memory, refused=(*refused, names)[-REMEMBERED_REFUSED:])
 
-    def add_fruitless_fallback(self, start: str, told: str) -> ReconstructionCache:
-        """Adds a start from which fallbacks gained nothing; `told` is what the verdict says of them."""
+    def add_fruitless_fallback(self, start: str, sentence: str) -> ReconstructionCache:
+        """Adds a start from which fallbacks gained nothing; `sentence` is what the verdict says of them."""
         others = [each for each in self.fruitless if each[0] != start]
-        return replace(self, fruitless=(*others, (start, told))[-REMEMBERED_FRUITLESS:])
+        return replace(self, fruitless=(*others, (start, sentence))[-REMEMBERED_FRUITLESS:])
 
     def find_fruitless_fallback(self, start: str) -> str | None:
         """Returns what the verdict said of fruitless fallbacks from this start; None without such."""
@@ -226,9 +226,9 @@ class IncrementalReconstruction:
         newest, num_features = len(self.graph.keyframes) - 1, len(keyframe.features.points)
         sharing = len(self.graph.partners(newest))
         compared = newest - sum(newest in pair for pair in self.graph.pending)
-        told = f"shares points with {sharing} of the {compared} photographs that it was compared with"
-        told = told if compared else "the first photograph"
-        log.info("%s: %s (%d image features)", keyframe.name, told, num_features)
+        description = f"shares points with {sharing} of the {compared} photographs that it was compared with"
+        description = description if compared else "the first photograph"
+        log.info("%s: %s (%d image features)", keyframe.name, description, num_features)
         self.clock.lap("poses")
 
     def match_pending_pairs(self, run: RunContext = BACKGROUND) -> None:
@@ -304,10 +304,14 @@ class IncrementalReconstruction:
     def _run_fallbacks(self, estimate: Reconstruction, rejected: Sequence[Rejected], run: RunContext) -> Reconstruction:
         """The estimate after what else there is to try, unless that gained nothing from the same start before."""
         start, memory = make_fallback_key(estimate.graph, self.config), self._known.memory
-        told = memory.find_fruitless_fallback(start)
-        if told is not None:
+        sentence = memory.find_fruitless_fallback(start)
+        if sentence is not None:
             verdict = estimate.verdict
-            return replace(estimate, verdict=replace(verdict, message=verdict.message + told)) if told else estimate
+            return (
+                replace(estimate, verdict=replace(verdict, message=verdict.message + sentence))
+                if sentence
+                else estimate
+            )
         left_s = self._fallbacks_left_s
         if left_s <= 0:
             return estimate
@@ -321,8 +325,8 @@ class IncrementalReconstruction:
         finally:
             self._fallbacks_left_s -= timer.spent_s
         if found.registration is estimate.registration and (found is not estimate or timer.spent_s > WORTH_S):
-            told = found.verdict.message.removeprefix(estimate.verdict.message)
-            self._known = replace(self._known, memory=memory.add_fruitless_fallback(start, told))
+            sentence = found.verdict.message.removeprefix(estimate.verdict.message)
+            self._known = replace(self._known, memory=memory.add_fruitless_fallback(start, sentence))
         return found
 
     def estimate_quickly(self) -> Reconstruction | None:

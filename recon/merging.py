@@ -195,16 +195,16 @@ def _combine_scales(scale: Scale, worst: _Sigmas | None, first: str, further: in
     if not scale.metric:
         return scale
     scenes = "a further scene hangs" if further == 1 else f"{further} further scenes hang"
-    told = f"{scale.source or 'metres'}, in {first}; {scenes} on it by links, "
+    source = f"{scale.source or 'metres'}, in {first}; {scenes} on it by links, "
     if scale.interval_95 is None or worst is None or worst.scale > _MOST_SIGMA:
         return _set_source(
-            replace(scale, interval_95=None), f"{told}and how well the metres are known there is not told"
+            replace(scale, interval_95=None), f"{source}and how well the metres are known there is not told"
         )
     low, high = scale.interval_95
     of_links = TWO_SIDED_95 * worst.scale
     wider = math.exp(-math.hypot(math.log(low), of_links)), math.exp(math.hypot(math.log(high), of_links))
-    told += f"known to {format_rounded_up(100 * (wider[1] - 1.0))} % in all"
-    return _set_source(replace(scale, interval_95=wider), told)
+    source += f"known to {format_rounded_up(100 * (wider[1] - 1.0))} % in all"
+    return _set_source(replace(scale, interval_95=wider), source)
 
 
 def _set_source(scale: Scale, source: str) -> Scale:

@@ -191,9 +191,11 @@ def create_initial_scene(
     images = {keyframe.name: keyframe.image for keyframe in keyframes}
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
-    told = compute_exposure_priors(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
+    metadata_exposures = compute_exposure_priors(
+        keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps
+    )
     exposures, headroom = scene_exposure.apply_headroom(
-        images, scene_exposure.estimate_exposures(pointmaps, images, config.exposure_compensation, told)
+        images, scene_exposure.estimate_exposures(pointmaps, images, config.exposure_compensation, metadata_exposures)
     )
     images = scene_exposure.compensate_images(images, exposures)
     seen_through = _find_transient_masks(pointmaps, images, masks, config) if all_at_hand else {}
@@ -347,8 +349,8 @@ def _find_rig(conclusion: ReconstructionSummary) -> OnRig | None:
     if rig is None:
         return None
     mounts = {each.camera_id: each for each in reversed(rig.mounts)}
-    told = tuple((m.camera_id, m.T_rig_camera, m.sigma, m.sigma_deg) for m in reversed(mounts.values()))
-    return OnRig(told, rig.metres_per_unit, rig.scale_sigma, rig.num_given)
+    mount_rows = tuple((m.camera_id, m.T_rig_camera, m.sigma, m.sigma_deg) for m in reversed(mounts.values()))
+    return OnRig(mount_rows, rig.metres_per_unit, rig.scale_sigma, rig.num_given)
 
 
 def _falloffs(scene: Scene) -> dict[str, float]:

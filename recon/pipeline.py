@@ -229,11 +229,11 @@ class OfflineResult:
         """
         files = self.source.files() if self.snapshot.verdict.publishable else {}
         lie_in = self.source.photographs or (out / IMAGES if files else None)
-        told: dict[str, object] = {"photographs": None if lie_in is None else _encode_path(lie_in.resolve())}
+        extra_fields: dict[str, object] = {"photographs": None if lie_in is None else _encode_path(lie_in.resolve())}
         if self.source.choice is not None:
-            told["selection"] = self.source.choice.record()
+            extra_fields["selection"] = self.source.choice.record()
         return write_result_folder(
-            self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, told=told
+            self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, extra_fields=extra_fields
         )
 
 

@@ -277,14 +277,14 @@ def add_poses(
     def add_pose(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
         if not isinstance(frame, Frame) or frame.name not in poses:
             return frame
-        told = own.get(frame.name, sigmas)
-        if told is None:
+        pose_sigmas = own.get(frame.name, sigmas)
+        if pose_sigmas is None:
             raise ValueError(
                 f"some poses tell how unsure they are, and that of {sanitize_name(frame.name)} does not: tell it for "
                 "each, or give --poses-sigma (poses_sigma) for those that do not"
             )
         try:
-            return replace(frame, given_pose=make_given_pose(poses[frame.name], *told))
+            return replace(frame, given_pose=make_given_pose(poses[frame.name], *pose_sigmas))
         except ValueError as error:
             raise ValueError(f"{sanitize_name(frame.name)}: {error}") from error
 
@@ -545,8 +545,8 @@ def add_mounts(given: Source, rig: Rig) -> Source:
     Raises ValueError where it tells it of no camera of the frames.
     """
     _check_mounts(rig, [each.camera_id for each in given.frames if isinstance(each, Frame)])
-    told = {each.name: rig.find_mount(each.camera_id) for each in given.frames if isinstance(each, Frame)}
-    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := told[each.name]) else each
+    mounts = {each.name: rig.find_mount(each.camera_id) for each in given.frames if isinstance(each, Frame)}
+    frames = (replace(each, T_base_camera=mount) if isinstance(each, Frame) and (mount := mounts[each.name]) else each
               for each in given.frames)  # fmt: skip
     return replace(given, frames=tuple(frames))
 
@@ -619,17 +619,17 @@ def choose_rig(file: Path | None, cameras: CameraSet | None, tell: Tell) -> Rig 
     if file is not None:
         return read_rig(file)
     try:
-        told = None if cameras is None else cameras.find_rig()
+        log_rig = None if cameras is None else cameras.find_rig()
     except ValueError as error:
         tell(f"no rig is known before, the images tell: {error}")
         return None
-    if told is None:
+    if log_rig is None:
         return None
     tell(
-        f"the static transforms of the recording tell where its {len(told.cameras)} cameras stand, "
+        f"the static transforms of the recording tell where its {len(log_rig.cameras)} cameras stand, "
         f"within {100 * DRAWN_SIGMA_M:g} cm and {DRAWN_SIGMA_DEG:g} degrees (--rig FILE in place of these)"
     )
-    return Rig(tuple(replace(each, sigma_m=DRAWN_SIGMA_M, sigma_deg=DRAWN_SIGMA_DEG) for each in told.cameras))
+    return Rig(tuple(replace(each, sigma_m=DRAWN_SIGMA_M, sigma_deg=DRAWN_SIGMA_DEG) for each in log_rig.cameras))
 
 
 def hold_rig(config: ReconstructionConfig, rig: Rig) -> ReconstructionConfig:

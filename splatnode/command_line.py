@@ -56,8 +56,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    words, told = replace_former_words(sys.argv[1:] if argv is None else argv, former_names.VERBS, former_names.FLAGS)
-    for sentence in told:
+    words, sentences = replace_former_words(
+        sys.argv[1:] if argv is None else argv, former_names.VERBS, former_names.FLAGS
+    )
+    for sentence in sentences:
         say(f"splatnode: {sentence}", error=True)
     parser = build_parser(words[0] if words else None)
     args = parser.parse_args(words)

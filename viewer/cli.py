@@ -245,7 +245,7 @@ def update_picture(
 
 def _wait_for_moments(source: Source, say: Callable[[str], None]) -> Iterator[Moment]:
     """Those that come; says what it waits for before the first one, after a second and when the node is heard of."""
-    began_s, came, told = time.monotonic(), False, ""
+    began_s, came, last_line = time.monotonic(), False, ""
     while True:
         moment = source.take()
         if moment is not None:
@@ -255,8 +255,8 @@ def _wait_for_moments(source: Source, say: Callable[[str], None]) -> Iterator[Mo
             return
         else:
             line = session.waiting_line(source.age_s if source.age_s == math.inf else 0.0)
-            if not came and line != told and time.monotonic() - began_s >= _PATIENCE_S:
-                told = line
+            if not came and line != last_line and time.monotonic() - began_s >= _PATIENCE_S:
+                last_line = line
                 say(line)
             time.sleep(_WAIT_S)
 

@@ -147,8 +147,8 @@ class LiveSource:
                 message = self._client.poll(_POLL_S)
                 heartbeat = self._heartbeats.latest(0)
                 if heartbeat is not None:
-                    told = {world.scene_id: world for world in heartbeat.header.worlds}
-                    self.worlds = heartbeat.header.session, told
+                    worlds = {world.scene_id: world for world in heartbeat.header.worlds}
+                    self.worlds = heartbeat.header.session, worlds
                 if heartbeat is not None and heartbeat.header.tracked != last:
                     last = heartbeat.header.tracked
                     self._tracked = last and parse_camera(last)

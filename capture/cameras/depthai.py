@@ -307,7 +307,7 @@ class DepthConverter:
     """
 
     def __init__(self, noise: DepthNoise, within_s: float) -> None:
-        self._noise, self._within_s, self._is_told = noise, within_s, False
+        self._noise, self._within_s, self._has_warned = noise, within_s, False
 
     def __call__(self, group: Any, frame_id: int) -> Frame | DroppedFrame:
         frame = convert_frame(group["colour"], frame_id)
@@ -316,9 +316,9 @@ class DepthConverter:
         try:
             return self._attach_depth(frame, group)
         except ValueError as error:
-            if not self._is_told:
+            if not self._has_warned:
                 event(log, logging.WARNING, "depth_left_out", name=frame.name, reason=sanitize_text(error))
-                self._is_told = True
+                self._has_warned = True
             return frame
 
     def _attach_depth(self, frame: Frame, group: Any) -> Frame:

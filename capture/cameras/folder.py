@@ -88,7 +88,7 @@ class RgbdFolder:
     intrinsics: Intrinsics | None = None  # of the photographs, for their size
     depth_intrinsics: Intrinsics | None = None  # of the depth camera; None: depth is aligned with the photographs
     noise: str = "structured_light"  # the kind of the depth camera
-    told: str = ""  # what people should know of the pairs; empty: nothing
+    notice: str = ""  # what people should know of the pairs; empty: nothing
 
     def attach_depth(self, item: Frame | DroppedFrame, file: str) -> Frame | DroppedFrame:
         """The photograph of `file` with its depth image; without, which the log tells, where that cannot be used."""
@@ -142,8 +142,8 @@ def _open_tum(folder: Path) -> RgbdFolder:
         offsets.append(near[0] - time)
         if abs(near[0] - time) <= _TUM_APART_S:
             found[Path(file).name] = folder / near[1]
-    told = _describe_pairs(len(found), offsets)
-    return RgbdFolder("TUM RGB-D", places.pop(), found, 1.0 / _TUM_STEPS, told=told)
+    notice = _describe_pairs(len(found), offsets)
+    return RgbdFolder("TUM RGB-D", places.pop(), found, 1.0 / _TUM_STEPS, notice=notice)
 
 
 def _describe_pairs(num_found: int, offsets: Sequence[float]) -> str:
@@ -191,8 +191,8 @@ def _open_scannet(folder: Path) -> RgbdFolder:
     for name in ("color", "depth"):
         path, first = folder / "intrinsic" / f"intrinsic_{name}.txt", _first_size(folder / name)
         lenses.append(_make_lens(_read_matrix(path), first, str(path)) if path.is_file() and first else None)
-    paired, told = _pair(folder / "color", _list_by_stem(folder / "depth"))
-    return RgbdFolder("ScanNet", folder / "color", paired, None, lenses[0], lenses[1], told=told)
+    paired, notice = _pair(folder / "color", _list_by_stem(folder / "depth"))
+    return RgbdFolder("ScanNet", folder / "color", paired, None, lenses[0], lenses[1], notice=notice)
 
 
 class _Metadata(msgspec.Struct, frozen=True):
@@ -207,15 +207,15 @@ def _open_record3d(folder: Path) -> RgbdFolder:
     """rgb/N.jpg, depth/N.exr in metres, smaller and aligned, and metadata.json with the lens of the photographs."""
     path = folder / "metadata.json"
     with guard_untrusted(RgbdFolderError, str(path)):
-        told = record_in(read_bounded(path, _MAX_TEXT_BYTES, RgbdFolderError, str(path)), _Metadata)
-    lens = _make_lens(np.array(told.K).reshape(3, 3).T, (told.w, told.h), str(path))
+        metadata = record_in(read_bounded(path, _MAX_TEXT_BYTES, RgbdFolderError, str(path)), _Metadata)
+    lens = _make_lens(np.array(metadata.K).reshape(3, 3).T, (metadata.w, metadata.h), str(path))
     depths = _list_by_stem(folder / "depth")
     if not depths:
         raise RgbdFolderError(
             f"{str(folder / 'depth')!r} has no depth images (.exr, .png, .npy): export from Record3D as EXR and RGB"
         )
-    paired, told = _pair(folder / "rgb", depths)
-    return RgbdFolder("Record3D", folder / "rgb", paired, None, lens, noise="lidar", told=told)
+    paired, notice = _pair(folder / "rgb", depths)
+    return RgbdFolder("Record3D", folder / "rgb", paired, None, lens, noise="lidar", notice=notice)
 
 
 def _list_by_stem(folder: Path) -> dict[str, Path]:
@@ -339,8 +339,8 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         )
     rgbd = find_rgbd_folder(config.folder)
     if rgbd is not None:
-        if rgbd.told:
-            notify(log, rgbd.told)
+        if rgbd.notice:
+            notify(log, rgbd.notice)
         lens = config.intrinsics or rgbd.intrinsics
         config = msgspec.structs.replace(config, folder=rgbd.photographs, intrinsics=lens)
     paths = select_images(config.folder, config.names)  # at once, before the first frame, so that mistakes show at once

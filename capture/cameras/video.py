@@ -86,8 +86,8 @@ def _begin(first: VideoFrame, config: Config) -> None:
         check_fits(config.intrinsics, [(width, height)])
     if first.pixel_aspect != 1.0:
         shape = f"{first.pixel_aspect:.4g} times as wide as high"
-        told = {"video": config.file.name, "pixels": shape, "frames": f"{width}x{height}"}
-        event(log, logging.WARNING, "pixels_made_square", **told)
+        fields = {"video": config.file.name, "pixels": shape, "frames": f"{width}x{height}"}
+        event(log, logging.WARNING, "pixels_made_square", **fields)
 
 
 def _stem(config: Config) -> str:

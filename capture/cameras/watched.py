@@ -232,10 +232,10 @@ def _read_sidecar(path: Path) -> Sidecar:
 
 def _apply_sidecar(made: Frame, sidecar: Sidecar) -> Frame | DroppedFrame:
     """The frame with what the file beside its image tells. Dropped where the lens is of another aspect ratio."""
-    told = {name: value for name in sidecar.__struct_fields__ if (value := getattr(sidecar, name)) is not None}
-    lens = told.pop("intrinsics", None)
+    fields = {name: value for name in sidecar.__struct_fields__ if (value := getattr(sidecar, name)) is not None}
+    lens = fields.pop("intrinsics", None)
     try:
-        made = replace(made, **told)
+        made = replace(made, **fields)
         if lens is not None:
             check_fits(lens, [(made.width, made.height)])
             made = assign_lens(made, lens)
@@ -260,8 +260,8 @@ def _decode_frame(name: str, data: bytes, written_at: Stamp, config: Config, fra
         intrinsics = config.intrinsics.resized(width, height)
     captured_at = decoded.captured_at or name_time(name) or written_at
     known = image, intrinsics, data if used is None else None, captured_at
-    told = {"exposure": decoded.exposure, "camera": decoded.camera, "camera_id": config.camera_id}
-    item = make_frame(frame_id, name, time.monotonic_ns(), *known, **told)
+    metadata = {"exposure": decoded.exposure, "camera": decoded.camera, "camera_id": config.camera_id}
+    item = make_frame(frame_id, name, time.monotonic_ns(), *known, **metadata)
     return apply_alpha_mask(item, decoded.mask)
 
 

@@ -150,10 +150,10 @@ def _peer(descriptor: int) -> _Peer | None:
 def _is_let_in(descriptor: int) -> bool:
     try:
         with _lent(descriptor) as connection:
-            told = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
+            tcp_info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO_BYTES)
     except OSError:
         return False
-    return len(told) >= _ACKED.size and _ACKED.unpack_from(told)[0] > _SAID_TO_ANYBODY
+    return len(tcp_info) >= _ACKED.size and _ACKED.unpack_from(tcp_info)[0] > _SAID_TO_ANYBODY
 
 
 SECRET, PUBLIC, SERVER, ALLOWED = "secret.key", "public.key", "server.key", "allowed"

@@ -169,10 +169,10 @@ def replace_former_words(
     for word in argv[1:end]:
         flag, equals, value = word.partition("=")
         words.append(of_verb.get(flag, flag) + equals + value)
-    told = {old: new for old, new in zip(argv, words, strict=False) if old != new}
+    replacements = {old: new for old, new in zip(argv, words, strict=False) if old != new}
     sentences = [
         f"{old.partition('=')[0]} is called {new.partition('=')[0]} now; the former name is read in this release only"
-        for old, new in told.items()
+        for old, new in replacements.items()
     ]
     return [*words, *argv[max(1, end) :]], sentences
 

@@ -27,13 +27,13 @@ def command(module: str, *arguments: str) -> list[str]:
     return make_isolated_command(start.__file__, json.dumps(_user_folders()), module, *arguments)
 
 
-def make_isolated_command(*told: str) -> list[str]:
-    """The command of an isolated Python that is `told` what to run, such as a script, or -m and a module.
+def make_isolated_command(*arguments: str) -> list[str]:
+    """The command of an isolated Python with these `arguments`, such as a script, or -m and a module.
 
     It has none of the user's places, and does not know this splatnode unless that is installed.
     """
     kept = [*(["-B"] if sys.dont_write_bytecode else []), *(["-X", "utf8"] if sys.flags.utf8_mode else [])]
-    return [sys.executable, "-I", *kept, *told]  # $PYTHON... do not count there
+    return [sys.executable, "-I", *kept, *arguments]  # $PYTHON... do not count there
 
 
 def place_of(module: str) -> str | None:

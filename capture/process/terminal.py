@@ -257,10 +257,10 @@ def add_remaining_time(tell: Tell) -> Tell:
         return tell
     remaining = RemainingTime()
 
-    def tell_with_rest(told: ProgressStep | str) -> None:
-        if isinstance(told, ProgressStep) and told.left_s is None:
-            told = replace(told, left_s=remaining.estimate(told, time.monotonic()))
-        tell(told)
+    def tell_with_rest(step: ProgressStep | str) -> None:
+        if isinstance(step, ProgressStep) and step.left_s is None:
+            step = replace(step, left_s=remaining.estimate(step, time.monotonic()))
+        tell(step)
 
     return tell_with_rest
 
@@ -274,26 +274,26 @@ class ProgressPrinter:
     def __init__(self) -> None:
         self._step, self._began_s, self._shown_s = ProgressStep(""), 0.0, 0.0
 
-    def __call__(self, told: ProgressStep | str) -> None:
-        if isinstance(told, str):
+    def __call__(self, step: ProgressStep | str) -> None:
+        if isinstance(step, str):
             self._end_step()
-            say(told)
+            say(step)
             return
-        now_s, begins = time.monotonic(), told.doing != self._step.doing
+        now_s, begins = time.monotonic(), step.doing != self._step.doing
         if begins:
             self._end_step()
             self._began_s = now_s
-        self._step = told
+        self._step = step
         if not is_interactive():
-            if begins or (told.is_under_way and now_s >= self._shown_s + _LINE_EVERY_S):
+            if begins or (step.is_under_way and now_s >= self._shown_s + _LINE_EVERY_S):
                 self._shown_s = now_s
-                say(told.announcement if begins else told.sentence, error=True)
+                say(step.announcement if begins else step.sentence, error=True)
             return
         if begins:
             progress("")
-        if begins or told.done == told.of or now_s >= self._shown_s + _SHOW_EVERY_S:
+        if begins or step.done == step.of or now_s >= self._shown_s + _SHOW_EVERY_S:
             self._shown_s = now_s
-            progress(f"{told} ({format_times(told, now_s - self._began_s)})")
+            progress(f"{step} ({format_times(step, now_s - self._began_s)})")
 
     def _end_step(self) -> None:
         """Ends the step that was reported last, whether or not all of it was done."""
@@ -313,9 +313,9 @@ def show_progress(quiet: bool = False) -> Iterator[Tell]:
     if quiet:
         yield ignore_progress
         return
-    told = ProgressPrinter()
-    with _each_second(told.tick):
-        yield told
+    printer = ProgressPrinter()
+    with _each_second(printer.tick):
+        yield printer
 
 
 @contextlib.contextmanager
@@ -422,8 +422,8 @@ class _Event:
     @property
     def plain_text(self) -> str:
         """`another place: before scene-0001, now scene-0002`; fields that say nothing are left out."""
-        told = [f"{key} {_short(value)}" for key, value in self.fields.items() if value not in ("", None)]
-        return ": ".join(filter(None, (self.what.replace("_", " "), ", ".join(told))))
+        parts = [f"{key} {_short(value)}" for key, value in self.fields.items() if value not in ("", None)]
+        return ": ".join(filter(None, (self.what.replace("_", " "), ", ".join(parts))))
 
 
 class StructuredLines(logging.Formatter):
@@ -509,8 +509,8 @@ class Problems:
         """One sentence for all that nobody has seen; empty where there is nothing."""
         with self._lock:
             unseen = {kind: total - self._seen.get(kind, 0) for kind, total in self._totals.items()}
-            told = [f"{count} {kind}, the last: {self._newest[kind]}" for kind, count in unseen.items() if count > 0]
-        return sanitize_text("; ".join(told), LONGEST_TEXT)
+            parts = [f"{count} {kind}, the last: {self._newest[kind]}" for kind, count in unseen.items() if count > 0]
+        return sanitize_text("; ".join(parts), LONGEST_TEXT)
 
 
 def is_logged(count: int) -> bool:

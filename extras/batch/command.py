@@ -340,20 +340,20 @@ def _write_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_p
     """Raises OSError, UnusableLog, ModuleNotFoundError without mcap."""
     from splatnode.extras.batch import mcap
 
-    told: list[Message] = []
+    messages: list[Message] = []
     schemas: dict[str, str] = {}
     for topic, row in parts:
         names = {kind: f"{topic}/splatnode/{kind}" for kind in ("pose", "calibration", "verdict")}
         schemas |= {names["pose"]: "PoseInFrame", names["calibration"]: "CameraCalibration", names["verdict"]: "Log"}
-        told += _make_topic_messages(file, topic, row, out, names)
-    told.sort(key=lambda each: each[1])
+        messages += _make_topic_messages(file, topic, row, out, names)
+    messages.sort(key=lambda each: each[1])
     target = file if in_place else file.with_name(file.stem + OWN_SUFFIX)
     with replacing(target) as temporary:
         if target.exists():
-            mcap.write_with_messages(target, temporary, told, schemas)
+            mcap.write_with_messages(target, temporary, messages, schemas)
             shutil.copymode(target, temporary)
         else:
-            temporary.write_bytes(mcap.encode_messages(told, schemas))
+            temporary.write_bytes(mcap.encode_messages(messages, schemas))
     where = "topics of that file" if in_place else str(target)
     return f"{len(parts)} topics of {file} have cameras in {where}"
 
@@ -417,25 +417,25 @@ def replay(options: Sequence[str], recording: BatchRecording, folder: Path) -> S
     return python.command("splatnode", "replay", recording.source, "--out", str(folder), *options)
 
 
-def run_batch(args: argparse.Namespace, found: list[BatchRecording], work: Work, told_command: list[str]) -> int:
+def run_batch(args: argparse.Namespace, found: list[BatchRecording], work: Work, ledger_command: list[str]) -> int:
     """Runs `work` for the recordings that have not come to an end, then writes the tables of all.
 
     `args` has out, resume, retry, cores, max_memory, timeout_s, write_back, in_place, ray, results and json;
-    `told_command` is what the ledger says of it.
+    `ledger_command` is what the ledger says of it.
     Raises ValueError, OtherBatch, OSError.
     """
     running = _run_locally(args, work) if args.ray is None else _run_on_ray(args, work)
     with hold_result_folder(args.out):
         _check_new(args.out, args.resume or args.retry)
-        with Ledger(args.out, told_command) as ledger, running as run, show_progress(quiet=args.json) as tell:
+        with Ledger(args.out, ledger_command) as ledger, running as run, show_progress(quiet=args.json) as tell:
             run_again = {None, FAILED} if args.retry else {None}
             todo = [recording for recording in found if ledger.verdict(recording) in run_again]
             if len(todo) < len(found):
                 tell(f"{len(found) - len(todo)} of {len(found)} recordings came to an end before")
-            for told in _run(todo, run, ledger, tell):
+            for line in _run(todo, run, ledger, tell):
                 if not args.json:
                     clear_progress()
-                    say(told)
+                    say(line)
             tell(ProgressStep("writing the tables"))
             counts = _write_tables(args.out, found, ledger, tell)
             all_written = not args.write_back or _write_back(args, ledger.rows(found), tell)

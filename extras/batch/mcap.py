@@ -84,11 +84,11 @@ def _contents(stream: IO[bytes], left_out: Collection[str]) -> Iterator[tuple]:
             metadata = tuple(record.metadata.items())
             channels[record.id] = record.topic, record.message_encoding, metadata, schemas[record.schema_id]
         elif isinstance(record, Record) and record.channel_id in channels:
-            told = record.log_time, record.publish_time, record.sequence, record.data
-            yield "message", channels[record.channel_id], *told
+            fields = record.log_time, record.publish_time, record.sequence, record.data
+            yield "message", channels[record.channel_id], *fields
         elif isinstance(record, Attachment):
-            told = record.create_time, record.log_time, record.name, record.media_type, record.data
-            yield "attachment", *told
+            fields = record.create_time, record.log_time, record.name, record.media_type, record.data
+            yield "attachment", *fields
         elif isinstance(record, Metadata):
             yield "metadata", record.name, tuple(record.metadata.items())
 

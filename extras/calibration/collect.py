@@ -351,11 +351,11 @@ def lens_file(choice: Choice, coverage: Coverage, board: Board) -> str:
         "distance_mm": [round(float(end)) for end in (estimate.distances_mm.min(), estimate.distances_mm.max())],
         "covered_percent": round(100 * coverage.share),
     }
-    told = {"intrinsics": intrinsics, "calibration": calibration}
+    content = {"intrinsics": intrinsics, "calibration": calibration}
     grid = [f'  - "{line}"' for line in coverage.text_rows]
     return "\n".join(
         [
-            _HEAD + yaml.safe_dump(told, sort_keys=False, default_flow_style=None, width=110).rstrip(),
+            _HEAD + yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=110).rstrip(),
             "  covered: # the picture: # where the board was seen, . where not, blank where there is no picture",
             *grid,
             "",
@@ -377,7 +377,7 @@ def describe_choice(choice: Choice, coverage: Coverage) -> list[str]:
     worst = float(np.max(pixel_sigmas(estimate, coverage.outermost)))
     trials = ", ".join(f"{trial.estimate.model.name} {trial.validation_rms_px:.3f}" for trial in choice.trials)
     lines = [
-        f"{estimate.model.name} ({estimate.model.told}) from {len(estimate.names)} views: {numbers} pixels",
+        f"{estimate.model.name} ({estimate.model.description}) from {len(estimate.names)} views: {numbers} pixels",
         f"corners are {estimate.rms_px:.3f} pixels (rms) from where this lens shows them; in views that were held out: "
         f"{trials}",
         f"the picture's corners are known to {worst:.2f} pixels (standard deviation), the focal length to "
@@ -467,8 +467,8 @@ def _camera(source: Path) -> dict[str, Any]:
         raise ValueError(f"{source} is one photograph; give the folder of all that show the board")
     if not film.is_film(source) and not is_data_set(source):
         return {"kind": "folder", "folder": source}
-    kind, told = film.camera(source)
-    return {"kind": kind, **told}
+    kind, camera_config = film.camera(source)
+    return {"kind": kind, **camera_config}
 
 
 def _is_moving(camera: Camera) -> bool:

@@ -254,7 +254,7 @@ class Model:
     name: str
     kind: str  # Intrinsics.model
     num_terms: int
-    told: str
+    description: str
 
     @property
     def num_numbers(self) -> int:

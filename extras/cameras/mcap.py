@@ -87,11 +87,11 @@ def survey_images(file: Path) -> ImageSurvey:
     ]
     if damage is not None and not heads and not photographs:
         raise damage
-    told = {name: head for name, head in heads.items() if head is not None}
-    depths = [topic for topic in there if topic.name in told and is_depth_image(told[topic.name])]
+    readable_heads = {name: head for name, head in heads.items() if head is not None}
+    depths = [topic for topic in there if topic.name in readable_heads and is_depth_image(readable_heads[topic.name])]
     copies = {f"{topic.name}{behind}" for topic in depths for behind in (*COPIES, PACKED_DEPTH)}
     kept = tuple(topic for topic in depths if topic.name not in copies)
-    return ImageSurvey(tuple(photographs), kept, {name: head.sensor for name, head in told.items()})
+    return ImageSurvey(tuple(photographs), kept, {name: head.sensor for name, head in readable_heads.items()})
 
 
 def _read_firsts(file: Path, names: Collection[str]) -> Iterator[Message]:
@@ -131,11 +131,11 @@ def read_sensor(file: Path, topic: Topic) -> str:
 
 def read_topic_lens(file: Path, topic: Topic) -> Intrinsics | None:
     """Reads the lens of the topic's camera; where it cannot be used, logs that and returns None."""
-    told = {each.name for each in topics(file) if each.kind in CALIBRATIONS}
+    calibration_names = {each.name for each in topics(file) if each.kind in CALIBRATIONS}
     known: dict[str, Calibration] = {}
     sensor = read_sensor(file, topic)
     with contextlib.suppress(UnusableLog):  # what there is before the damage counts
-        for first in _read_firsts(file, told):
+        for first in _read_firsts(file, calibration_names):
             name = first.topic.name
             try:
                 with guard_untrusted(UnusableMessage):
@@ -432,16 +432,16 @@ def open_depth(
 
 
 def _tell_pairs(depth: Topic, place: DepthPlace, pairs: DepthPairs, within_s: float) -> None:
-    told = {"topic": sanitize_text(depth.name), "images": f"{pairs.count} of {len(pairs.depth_of)}"}
+    fields = {"topic": sanitize_text(depth.name), "images": f"{pairs.count} of {len(pairs.depth_of)}"}
     if pairs.count:
         offsets = np.array(pairs.offsets_ns) / 1e6
-        told["later_ms"] = f"{np.median(offsets):.1f}"
-        told["most_ms"] = f"{np.abs(offsets).max():.1f}"
+        fields["later_ms"] = f"{np.median(offsets):.1f}"
+        fields["most_ms"] = f"{np.abs(offsets).max():.1f}"
     elif pairs.nearest_ns is not None:
-        told["nearest_ms"] = f"{pairs.nearest_ns / 1e6:.1f}"
-    told["within_ms"] = f"{1000 * within_s:g}"
-    told["place"] = f"{'its own' if place.intrinsics else 'aligned'}, by {place.known_by}"
-    event(log, logging.INFO if pairs.count else logging.WARNING, "depth_images", **told)
+        fields["nearest_ms"] = f"{pairs.nearest_ns / 1e6:.1f}"
+    fields["within_ms"] = f"{1000 * within_s:g}"
+    fields["place"] = f"{'its own' if place.intrinsics else 'aligned'}, by {place.known_by}"
+    event(log, logging.INFO if pairs.count else logging.WARNING, "depth_images", **fields)
 
 
 SUFFIX = ".mcap"
@@ -533,7 +533,7 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
     robot, sensor = read_robot_motion(config.file), read_sensor(config.file, topic)
     if not (robot.says_nothing or robot.has_frame(sensor)):
         event(log, logging.WARNING, "camera_not_on_robot", topic=sanitize_text(topic.name), frame=sanitize_text(sensor))
-    index, told = 0, False
+    index, has_warned = 0, False
     times = read_times(config.file, topic)
     depth = _open_depth(config, topic, times)
     try:
@@ -544,10 +544,10 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
                 item = _add_motion(item, robot, sensor, config, at_ns)
             if depth is not None and isinstance(item, Frame):
                 item = depth.attach_depth(item, index)
-            if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
+            if isinstance(item, Frame) and known is not None and item.intrinsics is None and not has_warned:
                 sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
                 event(log, logging.WARNING, "lens_of_another_size", topic=sanitize_text(topic.name), **sizes)
-                told = True
+                has_warned = True
             yield item
             index += 1
     except UnusableLog as error:

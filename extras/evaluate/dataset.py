@@ -261,8 +261,8 @@ def _read_cameras_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
 def _read_transforms_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
     content = read_json(path, _TransformsJson, "a transforms.json of nerfstudio")
     for view in content.frames:
-        told = {key: getattr(view, key) for key in _Lens.__struct_fields__}
-        values = {key: getattr(content, key) if value is None else value for key, value in told.items()}
+        view_values = {key: getattr(view, key) for key in _Lens.__struct_fields__}
+        values = {key: getattr(content, key) if value is None else value for key, value in view_values.items()}
         shown = sanitize_text(view.file_path)
         missing = [key for key in ("w", "h", "fl_x") if values[key] is None]
         missing += ["transform_matrix"] if view.transform_matrix is None else []

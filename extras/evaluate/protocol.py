@@ -249,8 +249,8 @@ def fit_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
 
     What is white in `truth` may have been brighter, and does not count; where nothing does, the gain is 1.
     """
-    told = used[..., None] & (truth < SATURATED / 255.0)
-    seen, known = image * told, truth * told
+    is_usable = used[..., None] & (truth < SATURATED / 255.0)
+    seen, known = image * is_usable, truth * is_usable
     squares = (seen * seen).sum((0, 1))
     fitting = (seen * known).sum((0, 1)) / squares.clamp_min(1e-12)
     return torch.where(squares > 0, fitting, 1.0).clamp_min(1e-3)

@@ -585,8 +585,8 @@ def merge_benches(benches: Sequence[Bench]) -> Bench:
     commands = dict.fromkeys(bench.command for bench in benches)
     common: dict[str, Any] = {}
     for name in ("by_region", "checkpoints", "device"):
-        told = {getattr(bench, name) for bench in benches}
-        common[name] = told.pop() if len(told) == 1 else None
+        values = {getattr(bench, name) for bench in benches}
+        common[name] = values.pop() if len(values) == 1 else None
     splits = {key: split for bench in benches for key, split in bench.splits.items()}
     return Bench(rows, benches[0].settings, machine, "; ".join(commands), **common, splits=splits)
 

@@ -704,7 +704,9 @@ def _demo(args: argparse.Namespace, tell: Tell) -> int:
         if snapshot.verdict.publishable:
             tell(f"measuring it on {len(split.test)} views that it has not seen")
             write_held_out_images(capture, place)
-            report = write(told={"held_out": evaluate_held_out_views(snapshot, capture, split, config.device, tell)})
+            report = write(
+                extra_fields={"held_out": evaluate_held_out_views(snapshot, capture, split, config.device, tell)}
+            )
         if args.json:
             print(json.dumps(report))
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED

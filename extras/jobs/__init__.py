@@ -139,8 +139,8 @@ class Child:
 
 def make_launch_command(command: Sequence[str], cores: Sequence[int]) -> list[str]:
     """The command that runs `command` on `cores` until this process ends: see `launch`."""
-    told = [launch.__file__, str(os.getpid()), ",".join(map(str, cores))]
-    return python.make_isolated_command("-S", *told, *command)
+    arguments = [launch.__file__, str(os.getpid()), ",".join(map(str, cores))]
+    return python.make_isolated_command("-S", *arguments, *command)
 
 
 def wait_for_end(child: Child, limits: Limits) -> End:
@@ -478,10 +478,10 @@ class _Template:
 
     def listen(self, timeout_s: float | None) -> None:
         """Takes in what the template has told; None: waits until it tells anything."""
-        told = self._process.stdout
-        assert told is not None
-        while self._alive and select.select([told], [], [], timeout_s)[0]:
-            read, timeout_s = told.read(65536), 0.0
+        output = self._process.stdout
+        assert output is not None
+        while self._alive and select.select([output], [], [], timeout_s)[0]:
+            read, timeout_s = output.read(65536), 0.0
             self._alive = bool(read)
             *lines, self._rest = (self._rest + (read or b"")).split(b"\n")
             for pid, *code in (map(int, line.split()) for line in lines):

@@ -58,7 +58,7 @@ def module_of(call: IO[bytes]) -> str:
 
 def main() -> None:
     """Ends when standard input does."""
-    told = os.fdopen(os.dup(1), "w")
+    output = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what an import prints is no answer
     ends, woken = socket.socketpair()
     for end in (ends, woken):
@@ -74,7 +74,7 @@ def main() -> None:
             if ends in ready:
                 with contextlib.suppress(BlockingIOError):
                     ends.recv(1024)
-                _tell_ends(told)
+                _tell_ends(output)
             if 0 in ready:
                 read = os.read(0, 65536)
                 if not read:
@@ -82,7 +82,7 @@ def main() -> None:
                 *lines, rest = (rest + read).split(b"\n")
                 for line in lines:
                     folder, cores = json.loads(line)
-                    _tell(told, _copy(Path(folder), cores))
+                    _tell(output, _copy(Path(folder), cores))
 
 
 def _copy(folder: Path, cores: list[int]) -> int:
@@ -119,15 +119,15 @@ def _become(folder: Path, cores: list[int], template: int) -> NoReturn:
         os._exit(code)
 
 
-def _tell_ends(told: IO[str]) -> None:
+def _tell_ends(output: IO[str]) -> None:
     with contextlib.suppress(ChildProcessError):  # there is none any more
         while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-            _tell(told, ended[0], os.waitstatus_to_exitcode(ended[1]))
+            _tell(output, ended[0], os.waitstatus_to_exitcode(ended[1]))
 
 
-def _tell(told: IO[str], *numbers: int) -> None:
-    told.write(" ".join(map(str, numbers)) + "\n")
-    told.flush()
+def _tell(output: IO[str], *numbers: int) -> None:
+    output.write(" ".join(map(str, numbers)) + "\n")
+    output.flush()
 
 
 if __name__ == "__main__":

@@ -166,13 +166,14 @@ def unpack_chunks(records: Iterable[Any], stream: IO[bytes]) -> Iterator[Any]:
     from mcap.records import Chunk
 
     num_bytes = os.fstat(stream.fileno()).st_size
-    most, told = _MOST_TIMES * num_bytes + _MOST_BYTES, 0
+    most, declared_size = _MOST_TIMES * num_bytes + _MOST_BYTES, 0
     for record in records:
         if isinstance(record, Chunk):
-            told += record.uncompressed_size
-            if told > most:
+            declared_size += record.uncompressed_size
+            if declared_size > most:
                 raise UnusableLog(
-                    f"its {num_bytes} bytes may be decompressed to {most}, its chunks say that they hold {told} or more"
+                    f"its {num_bytes} bytes may be decompressed to {most}, its chunks say that they hold "
+                    f"{declared_size} or more"
                 )
         yield from unpack_chunk(record)
 
@@ -219,21 +220,21 @@ def _inside(chunk: Any) -> Iterator[Any]:
 
 def _decompress_chunk(chunk: Any) -> Any:
     """The chunk as one that is not compressed: no more of it is decompressed than it says that it holds."""
-    told, is_whole = chunk.uncompressed_size, True
+    declared_size, is_whole = chunk.uncompressed_size, True
     if chunk.compression == "lz4":
         import lz4.frame
 
         decompressor = lz4.frame.LZ4FrameDecompressor()
-        data = decompressor.decompress(chunk.data, max_length=told + 1)
+        data = decompressor.decompress(chunk.data, max_length=declared_size + 1)
         is_whole = decompressor.eof
     elif chunk.compression == "zstd":
         import zstandard
 
-        data = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(chunk.data)).read(told + 1)
+        data = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(chunk.data)).read(declared_size + 1)
     else:  # none, or one that mcap does not know and names
         return chunk
-    if len(data) != told or not is_whole:
-        raise UnusableLog(f"a chunk says that it holds {told} bytes, and holds more or fewer")
+    if len(data) != declared_size or not is_whole:
+        raise UnusableLog(f"a chunk says that it holds {declared_size} bytes, and holds more or fewer")
     return replace(chunk, compression="", data=data)
 
 

@@ -426,8 +426,8 @@ def read_rows(data: bytes, layout: Layout, num_bytes: int, max_pixels: int) -> n
 
 def parse_compressed_image(data: bytes) -> Picture:
     values = Cdr(data)
-    captured_ns, sensor, told = values.time_ns(), values.text(), values.text()
-    return Picture(sensor, captured_ns, values.bytes(), None, told)
+    captured_ns, sensor, format_text = values.time_ns(), values.text(), values.text()
+    return Picture(sensor, captured_ns, values.bytes(), None, format_text)
 
 
 def parse_raw_image(data: bytes) -> Picture:
@@ -501,25 +501,25 @@ def read_times(file: Path, topic: Topic) -> tuple[MessageTime, ...]:
     counts it from its own beginning; it is the log's where no header of the topic tells any. Where all headers tell one
     time, the stream has the times of the log. Raises OSError; a damaged file is read as far as it goes.
     """
-    told: list[tuple[int, int | None]] = []  # the log's time, and the header's; None: it cannot be read
+    header_stamps: list[tuple[int, int | None]] = []  # the log's time, and the header's; None: it cannot be read
     with suppress(UnusableLog):
         for message in messages(file, {topic.name}):
             try:
-                told.append((message.log_ns, read_picture(message).captured_ns))
+                header_stamps.append((message.log_ns, read_picture(message).captured_ns))
             except UnusableMessage:
-                told.append((message.log_ns, None))
-    headers = [header for _, header in told if header is not None]
+                header_stamps.append((message.log_ns, None))
+    headers = [header for _, header in header_stamps if header is not None]
     latest = max(headers, default=0)
     is_one_time = len(headers) > 1 and min(headers) == latest
     found: list[MessageTime] = []
-    for place, (log_ns, header) in enumerate(told):
+    for place, (log_ns, header) in enumerate(header_stamps):
         # A header of 0 is the beginning of a simulation, or was never filled in where others tell the time of day.
-        is_told = header is not None and latest > 0 and (header > 0 or latest < EARLIEST_UTC_NS)
-        captured_ns = header if is_told and header is not None else log_ns
+        uses_header = header is not None and latest > 0 and (header > 0 or latest < EARLIEST_UTC_NS)
+        captured_ns = header if uses_header and header is not None else log_ns
         stream_ns = log_ns if is_one_time else captured_ns
         if header is None and found and not is_one_time:
             stream_ns = found[-1].stream_ns  # it is left out, where it lies
-        found.append(MessageTime(place, log_ns, stream_ns, _stamp(captured_ns), is_told and not is_one_time))
+        found.append(MessageTime(place, log_ns, stream_ns, _stamp(captured_ns), uses_header and not is_one_time))
     return tuple(sorted(found, key=lambda each: each.stream_ns))
 
 
@@ -601,9 +601,9 @@ def _decode_depth_rows(data: bytes, layout: Layout) -> npt.NDArray:
     return values.astype(kind, copy=False)
 
 
-def _decode_file(data: bytes, told: str, encoding: str) -> npt.NDArray:
+def _decode_file(data: bytes, format_text: str, encoding: str) -> npt.NDArray:
     """Decodes what a sender of this format packed. Raises UnusableMessage."""
-    way = told.partition(";")[2]
+    way = format_text.partition(";")[2]
     if "rvl" in way.lower():
         raise UnusableMessage(
             "depth that was packed by RVL is not read; log the raw topic, or compressedDepth with the format png"
@@ -623,7 +623,7 @@ def _decode_file(data: bytes, told: str, encoding: str) -> npt.NDArray:
     if encoding != _METRES:
         return values
     if not is_packed:
-        raise UnusableMessage(f"a file of {_METRES} must be {_PACKED}, it is {sanitize_text(told, 40)}")
+        raise UnusableMessage(f"a file of {_METRES} must be {_PACKED}, it is {sanitize_text(format_text, 40)}")
     _, a, b = _DEPTH_HEAD.unpack_from(data)
     if not (0 < a < np.inf and abs(b) < np.inf):
         raise UnusableMessage(f"{_PACKED} of {_METRES} must tell how depth was packed, it has a = {a:g} and b = {b:g}")

@@ -152,10 +152,10 @@ def read_static_transforms(file: Path) -> dict[str, Transform]:
     Of ROS what is on tf_static, of Foxglove what never changes. Raises UnusableMessage where a message cannot be read,
     and what reading the file raises.
     """
-    told = [topic for topic in topics(file) if topic.kind in TRANSFORMS and may_be_static(topic)]
+    static_topics = [topic for topic in topics(file) if topic.kind in TRANSFORMS and may_be_static(topic)]
     found: dict[str, Transform] = {}
     moving: set[str] = set()
-    for message in messages(file, {topic.name for topic in told}):
+    for message in messages(file, {topic.name for topic in static_topics}):
         if message.topic.kind not in TRANSFORMS:
             continue
         with guard_untrusted(UnusableMessage, sanitize_text(message.topic.name)):
@@ -414,10 +414,10 @@ def read_robot_motion(file: Path) -> RobotMotion:
 
 
 def _add_transforms(message: Message, found: RobotMotion) -> int:
-    told = TRANSFORMS[message.topic.kind](message.data)
-    for each in told:
+    transforms = TRANSFORMS[message.topic.kind](message.data)
+    for each in transforms:
         _add_link(found, each, message)
-    return len(told)
+    return len(transforms)
 
 
 def _add_link(found: RobotMotion, each: Transform, message: Message) -> None:

@@ -98,7 +98,7 @@ class DiskSpace:
 
     def __init__(self, config: DaemonConfig, store: Store) -> None:
         self._config, self._store = config, store
-        self._told = ""
+        self._problem = ""
 
     def describe_problem(self) -> str:
         """Describes what may not fit and where; empty where there is room for all. A change is logged."""
@@ -111,11 +111,11 @@ class DiskSpace:
             )
         except OSError as error:
             if is_shortage(error):  # this time it is not known
-                return self._told and f"{self._told}: make room on the disk"
+                return self._problem and f"{self._problem}: make room on the disk"
             problem = f"the disk does not tell how much is free ({error.strerror or error})"
-        if bool(problem) != bool(self._told):
+        if bool(problem) != bool(self._problem):
             event(log, logging.WARNING if problem else logging.INFO, "disk_space", problem=problem or "none")
-        self._told = problem
+        self._problem = problem
         return problem and f"{problem}: make room on the disk"
 
 
@@ -275,7 +275,10 @@ class Daemon:
         self._merged_s = -math.inf  # monotonic: when it was last seen at work
         self.finished = False  # as it was asked to, and not stopped
         self.left = ""  # what a node that finishes could not do
-        self._heart, self._told = Unfailing("the heartbeat"), ReconState.LOADING.value  # the service manager's
+        self._heart, self._service_status = (
+            Unfailing("the heartbeat"),
+            ReconState.LOADING.value,
+        )  # the service manager's
 
     def __enter__(self) -> Daemon:
         return self
@@ -309,7 +312,7 @@ class Daemon:
                     next_status_s = time.monotonic() + self._config.status_interval_s
                     self._heart.do(self._beat)
                     if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager restarts it
-                        manager.alive(self._told)
+                        manager.alive(self._service_status)
         finally:
             self._stopping.set()
             manager.stopping()
@@ -356,7 +359,7 @@ class Daemon:
 
     def _beat(self) -> None:
         status = self._make_status()
-        self._told = f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}"
+        self._service_status = f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}"
         self._heartbeat.send(status)
 
     def _start_thread(self, run: Callable[[], None]) -> threading.Thread:

@@ -58,7 +58,7 @@ class MetricScaler:
 
     def __init__(self, config: MetricConfig) -> None:
         self._config = config
-        self._told: WeakKeyDictionary[Frame, Evidence] = WeakKeyDictionary()
+        self._evidence: WeakKeyDictionary[Frame, Evidence] = WeakKeyDictionary()
 
     def scale_snapshot(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """Returns the snapshot for viewers, in metres where a scale source is available, else unchanged.
@@ -82,9 +82,9 @@ class MetricScaler:
     def collect_evidence(self, keyframes: Sequence[Keyframe]) -> Evidence:
         """Collects the keyframes' scale evidence: markers, poses, motions, gravity, mounts and so on."""
         for frame in (each.frame for each in keyframes):
-            if frame not in self._told:
-                self._told[frame] = gather_evidence((frame,), self._config)
-        return reduce(Evidence.merge, (self._told[each.frame] for each in keyframes), NOTHING)
+            if frame not in self._evidence:
+                self._evidence[frame] = gather_evidence((frame,), self._config)
+        return reduce(Evidence.merge, (self._evidence[each.frame] for each in keyframes), NOTHING)
 
 
 PROVISIONAL = "-provisional"  # ends the name of a result folder whose scene is not final
@@ -162,7 +162,7 @@ class Output:
             write_result_folder(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)
-            self.index.update(_make_submap_record(store, state, folder.name, measured, kept))
+            self.index.update(describe_submap(store, state, folder.name, measured, kept))
             if verified:
                 self.index.link_scene(store.scene_id, before)
         except OSError as error:
@@ -176,7 +176,7 @@ class Output:
 
     def update_index(self, snapshot: Snapshot, state: SubmapState, kept: Sequence[str]) -> None:
         """Writes into the index what is known of the active submap, which has no result in a folder."""
-        self._write_index(lambda: self.index.update(_make_submap_record(self._store, state, None, snapshot, kept)))
+        self._write_index(lambda: self.index.update(describe_submap(self._store, state, None, snapshot, kept)))
 
     def add_split_submap(self, scene_id: str, names: Sequence[str]) -> None:
         """Writes into the index that these keyframes of an inactive submap are one of their own."""
@@ -197,9 +197,10 @@ def _why(error: OSError) -> str:
     return SHORT_OF_MEMORY if is_shortage(error) else f"{error.strerror}: make room on the disk"
 
 
-def _make_submap_record(
+def describe_submap(
     store: Store, state: SubmapState, folder: str | None, snapshot: Snapshot, kept: Sequence[str]
 ) -> SubmapRecord:
+    """Describes the submap of this checkpoint as the snapshot shows it; `kept` are the names of its keyframes."""
     ledger = store.ledger
     return make_submap_record(
         store.scene_id, state, folder, snapshot, kept, store.frames_dropped, ledger.follows, ledger.shared
@@ -218,7 +219,7 @@ class OccupancyPublisher:
     def __init__(self, server: StateServer, numbering: Numbering) -> None:
         """`numbering`: of the maps alone, in the session of the scenes."""
         self._server, self._numbering = server, numbering
-        self._told: tuple[str, OccupancyResult | ProvisionalMap | str] | None = None  # scene, and its map or why not
+        self._sent: tuple[str, OccupancyResult | ProvisionalMap | str] | None = None  # scene, and its map or why not
 
     def serve(self) -> None:
         """Replies to who asks."""
@@ -237,9 +238,9 @@ class OccupancyPublisher:
         """
         scene_id = NO_SCENE if shown is None else shown.scene_id
         now = _match_shown_scene(found, shown, growing)
-        if (scene_id, now) == self._told:
+        if (scene_id, now) == self._sent:
             return
-        self._told = scene_id, now
+        self._sent = scene_id, now
         numbers = self._numbering.next()
         if not isinstance(now, str):
             now = self._send_map(now, scene_id, sequence, numbers)

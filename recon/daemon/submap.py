@@ -25,9 +25,9 @@ from splatnode.recon.daemon.checkpoint import Store
 from splatnode.recon.daemon.config import DaemonConfig
 from splatnode.recon.daemon.ingest import ArrivedKeyframe
 from splatnode.recon.daemon.loop_closure import LoopDetector
-from splatnode.recon.daemon.output import Output
+from splatnode.recon.daemon.output import Output, describe_submap
 from splatnode.recon.daemon.relocalization import FinalScene
-from splatnode.recon.daemon.submap_index import SubmapState
+from splatnode.recon.daemon.submap_index import SubmapRecord, SubmapState
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -328,6 +328,7 @@ class ActiveSubmap:
         self._exported_s = time.monotonic()
         self._fallbacks: tuple[tuple[str, str], ...] = ()  # those without a gain that the checkpoint has
         self._shown: Snapshot | None = None  # last
+        self.record: SubmapRecord | None = None  # of what was shown last, also where no file has it yet
         self.settled = True  # nothing can be made better before the next keyframe
         self.under_way: list[ArrivedKeyframe] = []  # keyframes that are being worked in, and that no scene shows yet
         self.owed: list[ArrivedKeyframe] = []  # keyframes that a step that failed did not work in
@@ -485,7 +486,7 @@ class ActiveSubmap:
         else:
             self._output.mark_finished(before)
         self._store.leave_submap(first, shared)
-        self._final.names, self._compared, self._shown = frozenset(), frozenset(), None
+        self._final.names, self._compared, self._shown, self.record = frozenset(), frozenset(), None, None
         return before
 
     def export_provisionally(self) -> None:
@@ -621,4 +622,5 @@ class ActiveSubmap:
         snapshot = self._work.snapshot(self._store.frames_dropped, final)
         measured = self._output.publish(snapshot, self._work)
         self.finished, self._shown = FinalScene(measured, self._work.graph.keyframes) if final else None, snapshot
+        self.record = describe_submap(self._store, SubmapState.HERE, None, snapshot, sorted(self._store.names))
         return snapshot

@@ -116,8 +116,11 @@ class Worker:
 
     @property
     def newest_submaps(self) -> tuple[SubmapStatus, ...]:
-        """The status of the newest submaps, each as of when it was last worked on."""
-        return tuple(each.status for each in self._output.index.select_newest(PLACES))
+        """The status of the newest submaps, each as of when it was last worked on; the active one as it is shown."""
+        records = {each.scene_id: each for each in self._output.index.select_newest(PLACES)}
+        if (active := self.active.record) is not None:
+            records[active.scene_id] = active
+        return tuple(each.status for each in records.values())[-PLACES:]
 
     @property
     def current_map(self) -> OccupancyResult | str:

@@ -589,9 +589,9 @@ def locate(args: argparse.Namespace) -> int:
     say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
     if args.json is not None:
         world = replace(StoredResult.create_from_path(args.result).scale(), metric=landmarks.metric)
-        told = {"result": str(args.result), "unit": world.unit, "scale": world.word, "frame": None}  # nobody tells it
-        told |= world.frame.record() if (args.result / "cameras.json").is_file() else {}
-        write_file(args.json, json_bytes({**told, "photographs": records}))
+        fields = {"result": str(args.result), "unit": world.unit, "scale": world.word, "frame": None}  # nobody tells it
+        fields |= world.frame.record() if (args.result / "cameras.json").is_file() else {}
+        write_file(args.json, json_bytes({**fields, "photographs": records}))
         say(f"results: {args.json}")
     return EXIT_REFUSED if refused else EXIT_GOOD
 

@@ -422,7 +422,7 @@ _FOCALS = np.geomspace(0.45, 4.1, 10)  # over the longer side, 96 to 14 degrees 
 _LOG_ASPECTS = -0.575, -0.405, -0.29, -0.14, 0.14, 0.29, 0.405, 0.575
 _SAME_SHAPE = 0.01  # largest difference of two images' height over width
 _SAME_FOCAL = 0.15  # of log focals: an EXIF focal length that may be of the result's own lens
-_TOLD_APART = 0.002  # log focals of a result's lenses that are tried one by one
+_DISTINCT_FOCAL = 0.002  # least difference of the log focals of a result's lenses that are tried one by one
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,7 +468,7 @@ def find_scene_lenses(lenses: KnownLenses, width: int, height: int, intrinsics: 
             continue
         if intrinsics is not None and abs(np.log(intrinsics.fx / side / focal)) > _SAME_FOCAL:
             continue
-        if any(abs(np.log(lens.focal / side / focal)) < _TOLD_APART for lens in found):
+        if any(abs(np.log(lens.focal / side / focal)) < _DISTINCT_FOCAL for lens in found):
             continue
         moved = shift * side if upright else np.zeros(2)
         sigmas = _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA, _SHIFT_SIGMA * side

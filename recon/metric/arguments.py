@@ -70,8 +70,8 @@ def _parse_direction(text: str) -> tuple[float, float, float]:
 
 def collect_frame_changes(args: argparse.Namespace) -> dict[str, Any]:
     """Collects the changes that --frame and --gravity set."""
-    told = {"frame": args.frame, "gravity": None if args.gravity is None else _parse_direction(args.gravity)}
-    return {key: value for key, value in told.items() if value is not None}
+    changes = {"frame": args.frame, "gravity": None if args.gravity is None else _parse_direction(args.gravity)}
+    return {key: value for key, value in changes.items() if value is not None}
 
 
 def add_baseline(parser: argparse.ArgumentParser) -> argparse.Action:
@@ -169,12 +169,12 @@ def collect_drift_changes(args: argparse.Namespace) -> dict[str, float]:
     return dict(zip(("poses_drift", "poses_drift_deg"), args.poses_drift, strict=True))
 
 
-def trusts_poses(args: argparse.Namespace, told: bool = False) -> bool:
+def trusts_poses(args: argparse.Namespace, has_file_sigmas: bool = False) -> bool:
     """Whether the given poses hold the cameras: who says how unsure they are trusts them so far.
 
-    `told`: their file says it.
+    `has_file_sigmas`: their file says it of some.
     """
-    return (told or args.poses_sigma is not None) and not args.check_poses
+    return (has_file_sigmas or args.poses_sigma is not None) and not args.check_poses
 
 
 def collect_metric_changes(args: argparse.Namespace) -> dict[str, Any]:

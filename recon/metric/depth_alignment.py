@@ -24,7 +24,7 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.process.text import sanitize_text
 from splatnode.recon.geometry import cross_matrix, invert_pose
 from splatnode.recon.metric.depth_fit import DepthView, fit_planes, warp_depth
-from splatnode.recon.registration.known_poses import has_told_lens
+from splatnode.recon.registration.known_poses import has_calibrated_lens
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -74,7 +74,7 @@ def make_depth_cloud(frame: Frame) -> DepthCloud | None:
     None without depth or a lens that was told, or where too little is measured.
     """
     lens = frame.intrinsics
-    if frame.depth is None or lens is None or not has_told_lens(frame):
+    if frame.depth is None or lens is None or not has_calibrated_lens(frame):
         return None
     scale = _SIDE / max(frame.width, frame.height)
     width, height = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
@@ -495,10 +495,10 @@ def _trim_information(J: Array, weight: Array) -> Array:
     must not tell what all others leave open.
     """
     _, directions = np.linalg.eigh((J * weight[:, None]).T @ J)
-    told = weight[:, None] * (J @ directions) ** 2
+    contributions = weight[:, None] * (J @ directions) ** 2
     few = max(1, round(_DISTRUSTED * int((weight > 0).sum())))
-    told.partition(len(told) - few, axis=0)
-    return (directions * told[:-few].sum(0)) @ directions.T
+    contributions.partition(len(contributions) - few, axis=0)
+    return (directions * contributions[:-few].sum(0)) @ directions.T
 
 
 # All cameras together.
@@ -566,23 +566,23 @@ def place_beside(
     """
     clouds = _collect_clouds(frames)
     poses = {k: known[cloud.name] for k, cloud in enumerate(clouds) if cloud.name in known}
-    told = sorted(poses)
-    if len(told) < 2 or any(_is_contradicted(clouds, poses, i, told) for i in told):
+    anchors = sorted(poses)
+    if len(anchors) < 2 or any(_is_contradicted(clouds, poses, i, anchors) for i in anchors):
         return ()
     for k in range(len(clouds)):
         pause()
-        if k not in poses and (T := _place_between(clouds, {i: poses[i] for i in told}, k)) is not None:
+        if k not in poses and (T := _place_between(clouds, {i: poses[i] for i in anchors}, k)) is not None:
             poses[k] = T
-    for _ in range(_ROUNDS if len(poses) > len(told) else 0):
+    for _ in range(_ROUNDS if len(poses) > len(anchors) else 0):
         pause()
-        poses, _ = _adjust(clouds, poses, [*told, *(k for k in sorted(poses) if k not in told)], len(told))
+        poses, _ = _adjust(clouds, poses, [*anchors, *(k for k in sorted(poses) if k not in anchors)], len(anchors))
     found = []
-    for k in sorted(set(poses) - set(told)):
+    for k in sorted(set(poses) - set(anchors)):
         pause()
-        _, covariance = _adjust(clouds, poses, [*told, k], len(told))
+        _, covariance = _adjust(clouds, poses, [*anchors, k], len(anchors))
         ((sigma_m, sigma_deg),) = _compute_sigmas(covariance[-6:, -6:])
         is_open = sigma_m > _MOST_SIGMA * np.median(clouds[k].points[:, 2]) or sigma_deg > _MOST_SIGMA_DEG
-        if is_open or _is_contradicted(clouds, poses, k, told):
+        if is_open or _is_contradicted(clouds, poses, k, anchors):
             continue
         sigma_m, sigma_deg = float(np.hypot(sigma_m, _LEAST_SIGMA_M)), float(np.hypot(sigma_deg, _LEAST_SIGMA_DEG))
         found.append(PlacedCamera(clouds[k].name, poses[k], sigma_m, sigma_deg, clouds[k].scale_sigma))

@@ -263,9 +263,9 @@ def _fit_samples(camera_id: str, views: Sequence[DepthView], samples: _Samples, 
     known = np.isfinite(ratio)
     if known.sum() < LEAST_POINTS:
         return _explain_few(views, int(known.sum()))
-    count, told = int(known.sum()), float(np.median(_compute_told_noise(views, samples)[known]))
-    if told > _MOST_NOISE:
-        return _explain_noise(camera_id, names, count, told)
+    count, camera_noise = int(known.sum()), float(np.median(_compute_camera_noise(views, samples)[known]))
+    if camera_noise > _MOST_NOISE:
+        return _explain_noise(camera_id, names, count, camera_noise)
     if _is_along_ray(samples, scale):
         return _explain_rays(camera_id, names, count)
     mean, mean_sigma = _average(ratio[known], sigma[known])
@@ -282,7 +282,7 @@ def _fit_samples(camera_id: str, views: Sequence[DepthView], samples: _Samples, 
     return DepthFit(camera_id, names, unit, float(np.hypot(mean_sigma, noise)), parted)
 
 
-def _compute_told_noise(views: Sequence[DepthView], samples: _Samples) -> Array:
+def _compute_camera_noise(views: Sequence[DepthView], samples: _Samples) -> Array:
     """(M,) the standard deviation of each depth by its camera's noise, as a share of the depth that the scene tells."""
     z = np.exp(samples.log_z)
     noises = np.stack([view.depth.noise.compute_sigma(z) for view in views])

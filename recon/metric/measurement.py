@@ -483,12 +483,12 @@ def estimate_scale_from_markers(
     if not sightings:
         return [f"no marker of {format_length(side_m)} was found in the photographs"]
     numbers = sorted({each.marker for each in sightings})
-    told = [
+    results = [
         _estimate_scale_from_marker(number, views, [each for each in sightings if each.marker == number], side_m)
         for number in numbers
     ]
-    single = [each for each in told if isinstance(each, Measurement)]
-    silent = [each for each in told if isinstance(each, str)]
+    single = [each for each in results if isinstance(each, Measurement)]
+    silent = [each for each in results if isinstance(each, str)]
     agreed = combine_measurements(single) if single else ""
     if not isinstance(agreed, Measurement):
         return [*single, *silent]

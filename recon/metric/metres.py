@@ -169,8 +169,8 @@ def estimate_scale_from_depth(
     )
     of_scene = compute_scale_sigma(list(views.values()))
     agreed = combine_measurements(others) if others else None
-    told = [measure_by_depth(fit, of_scene, agreed if isinstance(agreed, Measurement) else None) for fit in fits]
-    return [said for said, _ in told], tuple(check for _, check in told)
+    results = [measure_by_depth(fit, of_scene, agreed if isinstance(agreed, Measurement) else None) for fit in fits]
+    return [said for said, _ in results], tuple(check for _, check in results)
 
 
 def _make_depth_view(name: str, view: MetricView, landmarks: Landmarks, own: CameraDepth) -> DepthView:
@@ -382,17 +382,17 @@ def _chain_motions(snapshot: Snapshot, evidence: Evidence) -> dict[str, Array] |
 
     One chain is of one camera. Else the start is the camera's own frame.
     """
-    told = {each.name: evidence.motions[each.name] for each in snapshot.cameras if each.name in evidence.motions}
-    chains = sorted({each.chain for each in told.values()})
-    if len(told) < 2 or len(chains) != 1:
+    motions = {each.name: evidence.motions[each.name] for each in snapshot.cameras if each.name in evidence.motions}
+    chains = sorted({each.chain for each in motions.values()})
+    if len(motions) < 2 or len(chains) != 1:
         return _Missing(
-            f"{len(told)} images of the scene have motions, of {len(chains)} chains: two images of one chain are the "
-            "least, and several chains have no frame in common",
+            f"{len(motions)} images of the scene have motions, of {len(chains)} chains: two images of one chain are "
+            "the least, and several chains have no frame in common",
             f"Give poses, or motions of one camera. {USE_FIRST}",
         )
-    if all(name in evidence.mounts for name in told):
-        return {name: evidence.mounts[name] @ each.matrix for name, each in told.items()}
-    return {name: each.matrix for name, each in told.items()}
+    if all(name in evidence.mounts for name in motions):
+        return {name: evidence.mounts[name] @ each.matrix for name, each in motions.items()}
+    return {name: each.matrix for name, each in motions.items()}
 
 
 def _find_upright(snapshot: Snapshot, _config: MetricConfig, _evidence: Evidence) -> _Found | _Missing:
@@ -467,8 +467,12 @@ def collect_gravities(snapshot: Snapshot, config: MetricConfig, evidence: Eviden
 def find_up(snapshot: Snapshot, config: MetricConfig, evidence: Evidence) -> Up | None:
     """Up in the world of the cameras by gravity; None where it is not known."""
     up = estimate_up(make_metric_views(snapshot), collect_gravities(snapshot, config, evidence))
-    is_told = config.gravity is not None and not any(each.name in evidence.gravities for each in snapshot.cameras)
-    return replace(up, source="gravity as it was told for the first image") if up is not None and is_told else up
+    is_config_gravity = config.gravity is not None and not any(
+        each.name in evidence.gravities for each in snapshot.cameras
+    )
+    return (
+        replace(up, source="gravity as it was told for the first image") if up is not None and is_config_gravity else up
+    )
 
 
 def transform_rigidly(snapshot: Snapshot, T: Array) -> Snapshot:
@@ -514,12 +518,12 @@ def _apply_metric_scale(snapshot: Snapshot, config: MetricConfig, evidence: Evid
     said, aligned = _collect_measurements(snapshot, config, evidence) if len(snapshot.cameras) else ([], None)
     if evidence.depths and len(snapshot.cameras):
         others = [each for each in said if isinstance(each, Measurement)]
-        told, checks = estimate_scale_from_depth(
+        depth_results, checks = estimate_scale_from_depth(
             make_metric_views(snapshot), snapshot.landmarks, evidence.depths, others
         )
         if snapshot.given is not None and snapshot.given.from_depth:
-            told, checks = [], tuple(map(_describe_placing, checks))  # they give the unit already
-        said, snapshot = said + told, replace(snapshot, depth_checks=checks)
+            depth_results, checks = [], tuple(map(_describe_placing, checks))  # they give the unit already
+        said, snapshot = said + depth_results, replace(snapshot, depth_checks=checks)
     if not said:
         return snapshot
     measurements = [each for each in said if isinstance(each, Measurement)]
@@ -575,7 +579,7 @@ def _collect_measurements(
         if isinstance(found, PoseAlignment) and (offset := _explain_too_far(snapshot, found)):
             found = offset
         aligned = None if isinstance(found, str) else found
-        said += [found] if isinstance(found, str) else [found.unit, *found.told]
+        said += [found] if isinstance(found, str) else [found.unit, *found.notes]
     if snapshot.rig is not None and snapshot.rig.metres_per_unit is not None:
         known = f"the given rig of {snapshot.rig.num_given} cameras"
         said.append(Measurement(snapshot.rig.metres_per_unit, snapshot.rig.scale_sigma, known))

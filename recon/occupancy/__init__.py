@@ -610,10 +610,10 @@ def occupancy_map(
     """
     seen = _load_depth_observations(snapshot)
     points, unit = _sample(seen)
-    told, how = _up(snapshot) if up is None else (up, GIVEN)
+    direction, how = _up(snapshot) if up is None else (up, GIVEN)
     Ts = [camera.T_world_camera for camera in snapshot.cameras]
     own = make_level_frame(Ts, points, unit, snapshot.scale.frame) if up is None else None
-    frame = own or upright(Ts, points, told, unit, how)
+    frame = own or upright(Ts, points, direction, unit, how)
     T = frame.T_world_map
     centres = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras])
     layout = choose_layout(

@@ -431,7 +431,7 @@ class _ExposureCompensatedLoss:
 
     loss: Callable[[Tensor], Tensor]
     target: Tensor  # (height, width, 3) the photograph
-    told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
+    is_usable: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
     # (height, width, 3) of the render: the photograph where it is saturated, else infinite. None: nothing is saturated
     cap: Tensor | None
     prior: Tensor | None  # (3,) as much as the weight of a gain of 1 of the photograph, squared; None: nothing is left
@@ -443,7 +443,7 @@ class _ExposureCompensatedLoss:
 
     def _gains(self, rgb: Tensor, prior: Tensor) -> Tensor:
         """(3,) in closed form; 1 for a channel of which the photograph tells nothing but black."""
-        seen = rgb * self.told
+        seen = rgb * self.is_usable
         known = (seen * self.target).sum((0, 1)) + prior
         gains = known / ((seen * seen).sum((0, 1)) + prior).clamp_min(1e-12)
         return torch.where(prior > 0, gains, 1.0)
@@ -480,20 +480,22 @@ def make_training_image(
     perceptual = perceptual_loss(measure, target, weights, keep)
     if view.exposure is None:
         return TrainingImage(K, width, height, loss, perceptual)
-    told = torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)
+    is_usable = (
+        torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)
+    )
     cap = None
     if view.exposure.saturated is not None:
         share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        told = told & torch.from_numpy(share == 0).to(device)
-        cap = torch.where(told, torch.inf, target)
+        is_usable = is_usable & torch.from_numpy(share == 0).to(device)
+        cap = torch.where(is_usable, torch.inf, target)
     taken_out = max(view.exposure.falloff / 2.0, *(abs(math.log(gain / headroom)) for gain in view.exposure.gains))
     if taken_out < _MIN_TONED and view.exposure.saturated is None:
         return TrainingImage(K, width, height, loss, perceptual)
     prior = None
     if taken_out >= _MIN_TONED:
-        known = target * told
+        known = target * is_usable
         prior = _PRIOR * (math.log(2.0) / taken_out) ** 2 * (known * known).sum((0, 1))
-    exposed = partial(_ExposureCompensatedLoss, target=target, told=told, cap=cap, prior=prior)
+    exposed = partial(_ExposureCompensatedLoss, target=target, is_usable=is_usable, cap=cap, prior=prior)
     return TrainingImage(K, width, height, exposed(loss), perceptual and exposed(perceptual))
 
 

@@ -16,7 +16,7 @@ from splatnode.recon.registration import bundle_adjustment
 
 Array = npt.NDArray[np.float64]
 
-TOLD = ("given", "calibration")  # sources of a lens that is known
+CALIBRATION_SOURCES = ("given", "calibration")  # sources of a lens that is known
 _LEAST_POSES = 2  # that tell a scale
 _LEAST_SPREAD = 1e-9  # metres, in place of 0
 
@@ -178,12 +178,12 @@ def _let_drift(
 
 def has_pose(keyframe: Keyframe) -> bool:
     """Whether a pose may hold its camera: it came with one, and with its lens."""
-    return keyframe.frame.given_pose is not None and has_told_lens(keyframe.frame)
+    return keyframe.frame.given_pose is not None and has_calibrated_lens(keyframe.frame)
 
 
-def has_told_lens(frame: Frame) -> bool:
-    """Whether the lens of a frame was told: given, or by its camera's calibration."""
-    return frame.intrinsics is not None and frame.intrinsics.source in TOLD
+def has_calibrated_lens(frame: Frame) -> bool:
+    """Whether the lens of a frame was given, or is that of its camera's calibration."""
+    return frame.intrinsics is not None and frame.intrinsics.source in CALIBRATION_SOURCES
 
 
 def distance(problem: bundle_adjustment.Problem, registered: Sequence[int]) -> float:

@@ -142,7 +142,7 @@ class PosedMap:
 # Of a false alarm: 3.9 sigmas. Of 190 false poses 3 more are named than by 1e-5, and none of 204 sets of true ones
 LEAST_PROBABILITY = 1e-4
 _DOUBTED = 1e-2  # probability below which a pose widens the bounds of its camera to where images alone have it
-_TOLD = 0.05  # least share of a pose's variance that images must take away for a direction to count
+_LEAST_SHARE = 0.05  # least share of a pose's variance that images must take away for a direction to count
 _SMALLEST = 1e-300  # of a probability, whose sigmas are finite
 
 
@@ -182,12 +182,12 @@ def residuals(
         known = whiten @ by_pose @ blocks[camera] @ by_pose.T @ whiten.T
         of_residual = np.eye(6) - known if held[camera] else np.eye(6) + known
         variances, directions = np.linalg.eigh((of_residual + of_residual.T) / 2.0)
-        counts = variances > _TOLD
+        counts = variances > _LEAST_SHARE
         squared = float(((directions.T @ error)[counts] ** 2 / variances[counts]).sum())
         probability = float(chdtrc(counts.sum(), squared)) if counts.any() else 1.0
         # An observation with the covariance I that is taken away moves x by C (I - C)^-1 (x - g)
-        told = directions[:, counts]
-        moved = known @ told @ ((told.T @ error) / variances[counts])
+        axes = directions[:, counts]
+        moved = known @ axes @ ((axes.T @ error) / variances[counts])
         found[camera] = Residual(turn, shift, probability, squared, np.linalg.solve(whiten, moved))
     return found
 

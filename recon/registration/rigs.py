@@ -184,7 +184,8 @@ def _split(poses: RelativePoses, positions: list[int]) -> list[list[int]]:
 
 # A rig that is given, against what the images tell of it: which of it is believed, and how long its unit is.
 
-Told = Mapping[str, tuple[Array, Array, Array]]  # rotation, centre and covariance in the reference's frame, by camera
+# Rotation, centre and covariance in the reference's frame, by camera
+MountPoses = Mapping[str, tuple[Array, Array, Array]]
 
 _ROUNDS = 20  # of the fit of the scale
 _LEAST_BASELINE = 2.0  # sigmas by which two cameras must be apart to tell a scale
@@ -221,41 +222,41 @@ class GivenMounts:
         turn, shift = (float(np.sqrt(np.trace(covariance[b, b]) / 3.0)) for b in (slice(0, 3), slice(3, 6)))
         return rotation.T, centre / self.metres_per_unit, (turn, shift / self.metres_per_unit)
 
-    def fit_scale(self, told: Told) -> tuple[float | None, float]:
+    def fit_scale(self, mount_poses: MountPoses) -> tuple[float | None, float]:
         """Metres a unit of the map, and the standard deviation of its logarithm."""
-        chosen = {camera: told[camera] for camera in self.believed if camera in told}
+        chosen = {camera: mount_poses[camera] for camera in self.believed if camera in mount_poses}
         fitted = _fit(chosen, self.believed, list(chosen)) if self.metres_per_unit is not None and chosen else None
         return (None, np.inf) if fitted is None else fitted[:2]
 
 
-def fit_given_rig(rig: Rig | None, reference: str, told: Told) -> GivenMounts:
+def fit_given_rig(rig: Rig | None, reference: str, mount_poses: MountPoses) -> GivenMounts:
     """Which given mounts the images do not contradict: those of all cameras, or of all but the one that is wrong."""
     known = {} if rig is None else {each.camera_id: each for each in rig.cameras if each.matrix is not None}
-    names = [camera for camera in (reference, *sorted(told)) if camera in known]
+    names = [camera for camera in (reference, *sorted(mount_poses)) if camera in known]
     if len(names) < 2:
         return GivenMounts({}, (), None, reference)
-    fits = [chosen for chosen in _choices(names) if _is_consistent(known, told, chosen, reference)]
+    fits = [chosen for chosen in _choices(names) if _is_consistent(known, mount_poses, chosen, reference)]
     best = [chosen for chosen in fits if len(chosen) == len(fits[0])]
     if len(best) != 1:
-        residuals = [_measure_residual(known, told, camera, names[0], reference) for camera in names[1:]]
+        residuals = [_measure_residual(known, mount_poses, camera, names[0], reference) for camera in names[1:]]
         turned = {camera: _invert(each) for camera, each in known.items()}
-        is_inverse = _is_consistent(turned, told, names, reference)
+        is_inverse = _is_consistent(turned, mount_poses, names, reference)
         return GivenMounts({}, tuple(names), None, reference, tuple(residuals), is_inverse)
     believed = _relative_to(known, reference, best[0]) if reference in best[0] else {}
-    fitted = _fit(told, believed, list(believed)) if believed else None
+    fitted = _fit(mount_poses, believed, list(believed)) if believed else None
     refuted = tuple(camera for camera in names if camera not in best[0])
     first = reference if reference in best[0] else best[0][0]
-    residuals = tuple(_measure_residual(known, told, camera, first, reference) for camera in refuted)
+    residuals = tuple(_measure_residual(known, mount_poses, camera, first, reference) for camera in refuted)
     return GivenMounts(believed, refuted, None if fitted is None else fitted[0], reference, residuals)
 
 
 def _measure_residual(
-    known: Mapping[str, RigCamera], told: Told, camera: str, first: str, reference: str
+    known: Mapping[str, RigCamera], mount_poses: MountPoses, camera: str, first: str, reference: str
 ) -> MountResidual:
     """How far the given pose of a camera beside `first` is from the images', in the unit that fits all given ones."""
     given = _relative_to(known, first, list(known))
-    seen = {c: told[c] if first == reference else _between(told, first, c, reference)
-            for c in given if c == reference or c in told}  # fmt: skip
+    seen = {c: mount_poses[c] if first == reference else _between(mount_poses, first, c, reference)
+            for c in given if c == reference or c in mount_poses}  # fmt: skip
     lengths = [(float(np.linalg.norm(given[c][1])), float(np.linalg.norm(seen[c][1]))) for c in seen]
     unit = sum(apart for _, apart in lengths)
     scale = sum(metres for metres, _ in lengths) / unit if unit > 0.0 else 0.0
@@ -283,10 +284,16 @@ def _choices(names: Sequence[str]) -> list[tuple[str, ...]]:
     return [tuple(names), *few]
 
 
-def _is_consistent(known: Mapping[str, RigCamera], told: Told, chosen: Sequence[str], reference: str) -> bool:
+def _is_consistent(
+    known: Mapping[str, RigCamera], mount_poses: MountPoses, chosen: Sequence[str], reference: str
+) -> bool:
     first = reference if reference in chosen else chosen[0]
     given = _relative_to(known, first, chosen)
-    seen = told if first == reference else {c: _between(told, first, c, reference) for c in chosen if c != first}
+    seen = (
+        mount_poses
+        if first == reference
+        else {c: _between(mount_poses, first, c, reference) for c in chosen if c != first}
+    )
     fitted = _fit(seen, given, list(given))
     if fitted is None:
         # Cameras in one place tell no scale: only how they are turned can be compared.
@@ -321,13 +328,13 @@ def _matrix(camera: RigCamera) -> Array:
     return camera.matrix
 
 
-def _between(told: Told, first: str, camera: str, reference: str) -> tuple[Array, Array, Array]:
-    """The pose of a camera in the frame of `first`, both told in that of the reference."""
-    R, c, covariance = told[first]
+def _between(mount_poses: MountPoses, first: str, camera: str, reference: str) -> tuple[Array, Array, Array]:
+    """The pose of a camera in the frame of `first`, from both poses in that of the reference."""
+    R, c, covariance = mount_poses[first]
     if camera == reference:
         other, centre, of_other = np.eye(3), np.zeros(3), np.zeros((6, 6))
     else:
-        other, centre, of_other = told[camera]
+        other, centre, of_other = mount_poses[camera]
     away = centre - c
     by = np.eye(6)
     by[3:, :3] = cross_matrix(away[None])[0]
@@ -340,7 +347,7 @@ def _turn_probability(seen: tuple[Array, Array, Array], given: tuple[Array, Arra
     return float(chdtrc(3, turn @ np.linalg.solve((seen[2] + given[2])[:3, :3], turn)))
 
 
-def _fit(seen: Told, given: Told, names: Sequence[str]) -> tuple[float, float, float] | None:
+def _fit(seen: MountPoses, given: MountPoses, names: Sequence[str]) -> tuple[float, float, float] | None:
     """Metres a unit, the standard deviation of its logarithm, and the probability of what is left; None: no scale."""
     cameras = [camera for camera in names if camera in seen]
     if not cameras:
@@ -499,19 +506,19 @@ def adjust_with_rig(
         return None
     mounts = {camera: poses for (first, camera), poses in measured.items() if first == reference}
     split = {c: [part for part in poses.mounts if len(part) >= _LEAST_SETS] for c, poses in mounts.items()}
-    told = {c: [mounts[c].select(part).mean() for part in parts] for c, parts in split.items() if parts}
-    if not told:
+    mount_means = {c: [mounts[c].select(part).mean() for part in parts] for c, parts in split.items() if parts}
+    if not mount_means:
         return None
-    given = fit_given_rig(rig, reference, {camera: means[0] for camera, means in told.items()})
+    given = fit_given_rig(rig, reference, {camera: means[0] for camera, means in mount_means.items()})
     estimate = replace(
         found.estimate, rotations=found.estimate.rotations.copy(), translations=found.estimate.translations.copy()
     )
-    constraint, labels = _constrain(estimate, sets, reference, mounts, split, told, given, distance, found.views)
+    constraint, labels = _constrain(estimate, sets, reference, mounts, split, mount_means, given, distance, found.views)
     estimate = replace(estimate, rig=constraint)
     estimate = bundle_adjustment.adjust(estimate, found.prior, found.loss, found.views[0])
     adjusted = replace(found, estimate=estimate)
-    told_of_rig = _describe(adjusted, sets, labels, measured, reference, given)
-    return (adjusted, told_of_rig) if told_of_rig.is_finite else None
+    rig_estimate = _describe(adjusted, sets, labels, measured, reference, given)
+    return (adjusted, rig_estimate) if rig_estimate.is_finite else None
 
 
 def _measure(found: Map, sets: _Sets, joint: Array, distance: float) -> dict[tuple[str, str], RelativePoses]:
@@ -549,7 +556,7 @@ def _constrain(
     reference: str,
     mounts: dict[str, RelativePoses],
     split: dict[str, list[list[int]]],
-    told: dict[str, list[tuple[Array, Array, Array]]],
+    mount_means: dict[str, list[tuple[Array, Array, Array]]],
     given: GivenMounts,
     distance: float,
     registered: Sequence[int],
@@ -567,7 +574,7 @@ def _constrain(
     for views in sets.views:
         if reference in views:
             of_mount[views[reference]], sigmas[views[reference]] = 0, stiff
-    for camera, means in told.items():
+    for camera, means in mount_means.items():
         poses = mounts[camera]
         scatter = np.sqrt(poses.scatter)
         for at, (part, (rotation, centre, _)) in enumerate(zip(split[camera], means, strict=True)):
@@ -627,14 +634,16 @@ def _describe(
         tied = rig.sigmas[rig.mount_of_camera == at]
         scatter = (float(tied[0, 0]), float(tied[0, 1])) if len(tied) else (0.0, 0.0)
         mounts.append(Mount(camera, T, covariances[at], own, is_held, scatter))
-    told = {}
+    mount_poses = {}
     for mount in mounts[1:]:
-        told.setdefault(mount.camera_id, (mount.T_rig_camera[:3, :3], mount.T_rig_camera[:3, 3], mount.covariance))
-    again = given.fit_scale(told)
+        mount_poses.setdefault(
+            mount.camera_id, (mount.T_rig_camera[:3, :3], mount.T_rig_camera[:3, 3], mount.covariance)
+        )
+    again = given.fit_scale(mount_poses)
     placed = tuple(v for v in range(len(problem.rotations)) if rig.set_of_camera[v] >= 0 and v not in adjusted.views)
     changes = _find_changes(sets, measured, reference)
-    told_of_given = given.residuals, given.is_inverse
-    return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed, *told_of_given)
+    contradiction = given.residuals, given.is_inverse
+    return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed, *contradiction)
 
 
 def _mount_covariances(adjusted: Map) -> Array:

@@ -219,14 +219,14 @@ def write_result_folder(
     seed: int,
     preset_name: str,
     photographs: Mapping[str, bytes] = MappingProxyType({}),
-    told: Mapping[str, object] = MappingProxyType({}),
+    extra_fields: Mapping[str, object] = MappingProxyType({}),
 ) -> dict[str, object]:
-    """Writes the result folder and returns its report, of which `told` is a part.
+    """Writes the result folder and returns its report, of which `extra_fields` is a part.
 
     `photographs` are files that a scene has beside it, by their names in the folder. Raises ResultWriteError, with what
     was there before intact.
     """
-    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | dict(told)
+    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | dict(extra_fields)
     preview = make_contact_sheet(snapshot) if snapshot.verdict.publishable else None
     source_frame = sanitize_gaussians(snapshot.gaussians).source_frame  # of those that scene.ply holds
     further = {SOURCES: encode_sources(source_frame), **photographs} if snapshot.verdict.publishable else {}

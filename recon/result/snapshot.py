@@ -395,12 +395,12 @@ LEAST = 0.03  # share of a photograph: less is in the report alone
 
 def describe_moving(shares: Mapping[str, float]) -> str:
     """The photographs of which so much was left out that their user should know; empty where there is none."""
-    told = [share for share in shares.values() if share >= LEAST]
-    if not told:
+    large_shares = [share for share in shares.values() if share >= LEAST]
+    if not large_shares:
         return ""
-    least, most = f"{min(told):.0%}", f"{max(told):.0%}"
+    least, most = f"{min(large_shares):.0%}", f"{max(large_shares):.0%}"
     each = least if least == most else f"{least} to {most}"
-    of = f"{len(told)} photographs" if len(told) > 1 else "a photograph"
+    of = f"{len(large_shares)} photographs" if len(large_shares) > 1 else "a photograph"
     return f"left out of {of}: what moved between them, {each} of each (report.json names them)"
 
 

@@ -158,10 +158,10 @@ def append_consistent_depth(verdict: Verdict, share: float | None, config: Consi
             verdict,
             message=f"{verdict.message} Other views confirm the depth of {format_percent(share)} of the pixels.",
         )
-    told = f"Other views confirm the depth of only {format_percent(share)} of the pixels"
+    sentence = f"Other views confirm the depth of only {format_percent(share)} of the pixels"
     return replace(
         verdict,
-        message=f"{verdict.message} {told}: views away from the cameras are guesses.",
+        message=f"{verdict.message} {sentence}: views away from the cameras are guesses.",
         advice=f"{verdict.advice} {ADVICE}".strip(),
     )
 

@@ -228,8 +228,8 @@ def _estimate_falloff(bins: Collection[_Bin], members: Sequence[int]) -> float:
 SATURATED = 250  # grey level from which a pixel does not tell how bright it was
 PRIOR_SIGMA = 1.0  # of a logarithm of a gain: a photograph that shares nothing keeps its light
 KNOWN_SIGMA = 1e-3  # likewise, of a photograph that is in the scene's light already
-TOLD_SIGMA = 0.15  # likewise, of what a photograph's camera tells of it: the curves of cameras differ
-MOST_TOLD = 2.0  # of its size, from the median of all; what tells more is not believed: 8 bits could not bear it
+METADATA_SIGMA = 0.15  # likewise, of what a photograph's metadata states: the curves of cameras differ
+MOST_METADATA_LOG = 2.0  # of its size, from the median of all; what is more is not believed: 8 bits could not bear it
 OFFSET_SIGMA = 10.0  # of what all cameras tell, together: they only tell how photographs differ
 MOST_CLIPPED = 0.01  # share of the pixels of a photograph that may be told and not kept
 MOST_HEADROOM = 2.0  # beyond, dark things would have too few grey levels
@@ -254,18 +254,20 @@ def estimate_exposures(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
     config: ExposureConfig,
-    told: Mapping[str, float] = _NOTHING,
+    metadata_exposures: Mapping[str, float] = _NOTHING,
 ) -> dict[str, Exposure]:
     """The exposures of `images` (h, w, 3), by name; none where they do not differ by more than `config` says.
 
-    `told` has the logarithms of what cameras say of them, as `compute_exposure_priors` gives them, by name.
+    `metadata_exposures` has the log exposures that cameras state, as `compute_exposure_priors` gives them, by name.
     """
     if not config.enabled or len(pointmaps) < 2:
         return {}
     shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
     falloff, measured = estimate_falloffs(shared, _lens_of(pointmaps), config.least_falloff)
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
-    solved = _solve_log_gains(remove_falloff(shared, measured), priors, _select_metadata_logs(pointmaps, told))
+    solved = _solve_log_gains(
+        remove_falloff(shared, measured), priors, _select_metadata_logs(pointmaps, metadata_exposures)
+    )
     found = solved.subtract_median()
     if not found.exceed(config).any():
         found = replace(found, logs=np.zeros_like(found.logs))
@@ -283,13 +285,13 @@ def estimate_further_exposures(
     further: Mapping[str, float],
     known: Mapping[str, Exposure],
     config: ExposureConfig,
-    told: Mapping[str, float] = _NOTHING,
+    metadata_exposures: Mapping[str, float] = _NOTHING,
 ) -> dict[str, Exposure]:
     """The exposures of the photographs `further`, which join others that have one light already; none needs to differ.
 
     `further` has the falloff of each one's lens, by name, and `known` what was taken out of the others: if that of any
     was changed, each further one's light is. Otherwise it is where it differs from theirs by more than `config` says.
-    `told` is as for `estimate_exposures`, of the photographs as they were taken.
+    `metadata_exposures` is as for `estimate_exposures`, of the photographs as they were taken.
     """
     if not config.enabled:
         return {}
@@ -297,7 +299,9 @@ def estimate_further_exposures(
     priors = np.array([PRIOR_SIGMA if pointmap.name in further else KNOWN_SIGMA for pointmap in pointmaps])
     shared = find_shared_pixels(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
     taken_out = {name: np.log(exposure.gains) for name, exposure in known.items()}
-    found = _solve_log_gains(remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, told, taken_out))
+    found = _solve_log_gains(
+        remove_falloff(shared, falloff), priors, _select_metadata_logs(pointmaps, metadata_exposures, taken_out)
+    )
     each = zip(pointmaps, found.logs, found.sigmas, found.exceed(config), falloff.tolist(), strict=True)
     return {
         pointmap.name: make_exposure(images[pointmap.name], np.exp(own), of_lens, sigmas)
@@ -326,10 +330,10 @@ def apply_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure
     """
     headroom = 1.0
     for name, exposure in exposures.items():
-        told = (images[name] < SATURATED).all(axis=2)
-        if told.any():
+        is_unsaturated = (images[name] < SATURATED).all(axis=2)
+        if is_unsaturated.any():
             share = _relative_light(images[name], np.array(exposure.gains), exposure.falloff)
-            brightest = np.quantile((images[name] / share)[told].max(axis=1), 1.0 - MOST_CLIPPED)
+            brightest = np.quantile((images[name] / share)[is_unsaturated].max(axis=1), 1.0 - MOST_CLIPPED)
             headroom = max(headroom, float(brightest) / SATURATED)
     headroom = min(headroom, MOST_HEADROOM)
     if headroom == 1.0:
@@ -372,30 +376,34 @@ def _relative_light(image: Image, gains: Array, falloff: float) -> Array:
 
 
 def estimate_log_gains(
-    pointmaps: Sequence[Pointmap], pictures: Sequence[Image], told: Mapping[str, float] = _NOTHING
+    pointmaps: Sequence[Pointmap], pictures: Sequence[Image], metadata_exposures: Mapping[str, float] = _NOTHING
 ) -> Array:
     """(V, 3) logarithms of the photographs' gains; the median of each channel is 0.
 
-    `told` is as for `estimate_exposures`.
+    `metadata_exposures` is as for `estimate_exposures`.
     """
     priors = np.full(len(pointmaps), PRIOR_SIGMA)
     shared = find_shared_pixels(pointmaps, pictures)
-    return _solve_log_gains(shared, priors, _select_metadata_logs(pointmaps, told)).subtract_median().logs
+    return _solve_log_gains(shared, priors, _select_metadata_logs(pointmaps, metadata_exposures)).subtract_median().logs
 
 
 def _select_metadata_logs(
-    pointmaps: Sequence[Pointmap], told: Mapping[str, float], taken_out: Mapping[str, Array] = MappingProxyType({})
+    pointmaps: Sequence[Pointmap],
+    metadata_exposures: Mapping[str, float],
+    taken_out: Mapping[str, Array] = MappingProxyType({}),
 ) -> Array:
-    """(V, 3) the logarithms in `told`, without those of the gains that were taken out, about their median.
+    """(V, 3) the logarithms in `metadata_exposures`, without those of gains that were taken out, about their median.
 
-    NaN where nothing is told, or where it is not to be believed.
+    NaN where a camera states none, or where it is not to be believed.
     """
     nothing = np.zeros(3)
-    logs = np.array([told.get(each.name, np.nan) - taken_out.get(each.name, nothing) for each in pointmaps])
+    logs = np.array(
+        [metadata_exposures.get(each.name, np.nan) - taken_out.get(each.name, nothing) for each in pointmaps]
+    )
     known = np.isfinite(logs[:, 0])
     if known.any():
         logs -= np.median(logs[known], axis=0)
-        logs[np.abs(logs).max(axis=1) > MOST_TOLD] = np.nan
+        logs[np.abs(logs).max(axis=1) > MOST_METADATA_LOG] = np.nan
     return logs
 
 
@@ -423,13 +431,13 @@ class _LogGains:
         return (share >= config.most) | (sure & (share >= config.least))
 
 
-def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, told: Array) -> _LogGains:
+def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, prior_log_gains: Array) -> _LogGains:
     """The logarithms of V photographs' gains, each with its standard deviation around 0 in `priors` (V,).
 
-    `told` (V, 3) is what cameras say of them, up to one offset; NaN: nothing. What is far from all the rest counts for
-    little more than what is a few sigmas away.
+    `prior_log_gains` (V, 3) is what cameras say of them, up to one offset; NaN: nothing. What is far from all the rest
+    counts for little more than what is a few sigmas away.
     """
-    count, tellers = len(priors), np.flatnonzero(np.isfinite(told[:, 0]))
+    count, tellers = len(priors), np.flatnonzero(np.isfinite(prior_log_gains[:, 0]))
     factors = np.zeros((len(shared) + len(tellers), count + bool(len(tellers))))
     values, sigmas = np.zeros((2, len(factors), 3))
     for index, each in enumerate(shared):
@@ -437,7 +445,7 @@ def _solve_log_gains(shared: Sequence[SharedPixels], priors: Array, told: Array)
         values[index], sigmas[index] = median_log(each.logs)
     for index, view in enumerate(tellers, start=len(shared)):
         factors[index, [view, -1]] = 1.0, 1.0
-        values[index], sigmas[index] = told[view], TOLD_SIGMA
+        values[index], sigmas[index] = prior_log_gains[view], METADATA_SIGMA
     if len(tellers):
         priors = np.append(priors, OFFSET_SIGMA)
     found = [solve_robust(factors, *channel, priors) for channel in zip(values.T, sigmas.T, strict=True)]
@@ -464,7 +472,7 @@ def compute_exposure_priors(keyframes: Iterable[Keyframe]) -> dict[str, float]:
 
     An exposure with an f-number and one without cannot be compared: those of the kind that is rarer are left out.
     """
-    told = {each.name: each.frame.exposure for each in keyframes if each.frame.exposure is not None}
-    whole = {name for name, exposure in told.items() if exposure.f_number is not None}
-    chosen = whole if 2 * len(whole) >= len(told) else told.keys() - whole
-    return {name: RESPONSE * exposure.log_exposure for name, exposure in told.items() if name in chosen}
+    exposures = {each.name: each.frame.exposure for each in keyframes if each.frame.exposure is not None}
+    whole = {name for name, exposure in exposures.items() if exposure.f_number is not None}
+    chosen = whole if 2 * len(whole) >= len(exposures) else exposures.keys() - whole
+    return {name: RESPONSE * exposure.log_exposure for name, exposure in exposures.items() if name in chosen}

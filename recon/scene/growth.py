@@ -57,8 +57,8 @@ def grow(
     }
     lit = {view.name: view.exposure for view in scene.views if view.exposure is not None}
     falloffs = {name: _falloff(scene, pointmaps[name]) for name in further}
-    told = compute_exposure_priors(graph.keyframes[index] for index in sorted(shown))
-    exposures = scene_exposure.estimate_further_exposures(seen, images, falloffs, lit, lighting, told)
+    metadata_exposures = compute_exposure_priors(graph.keyframes[index] for index in sorted(shown))
+    exposures = scene_exposure.estimate_further_exposures(seen, images, falloffs, lit, lighting, metadata_exposures)
     begun = initialization.initialize_scene(
         seen,
         scene_exposure.compensate_images(images, exposures),

@@ -109,15 +109,15 @@ def _refuse_doubtful_focal(graph: ViewGraph, config: DecisionConfig) -> Verdict 
     given = {
         keyframe.frame.intrinsics.fx if keyframe.frame.intrinsics is not None else None for keyframe in graph.keyframes
     }
-    told = given.pop() if len(given) == 1 else None
+    given_focal = given.pop() if len(given) == 1 else None
     voted = refit.vote_focal(graph.keyframes, list(graph.pairs.values()))
-    if told is None or voted is None or abs(np.log(voted / told)) < config.voted_change:
+    if given_focal is None or voted is None or abs(np.log(voted / given_focal)) < config.voted_change:
         return None
     names = [keyframe.name for keyframe in graph.keyframes]
-    change = 100 * (voted / told - 1.0)
+    change = 100 * (voted / given_focal - 1.0)
     if _select_exif_keyframes(graph):
-        return refuse(verification.WRONG_EXIF, names, given=told, found=voted, change=change)
-    return refuse(verification.WRONG_FOCAL_BY_VOTE, names, given=told, voted=voted, change=change)
+        return refuse(verification.WRONG_EXIF, names, given=given_focal, found=voted, change=change)
+    return refuse(verification.WRONG_FOCAL_BY_VOTE, names, given=given_focal, voted=voted, change=change)
 
 
 # EXIF that the images contradict: it stays as it was when an image is cropped or zoomed afterwards.

@@ -301,9 +301,9 @@ def describe_rig(verdict: Verdict, graph: ViewGraph, rig: RigEstimate) -> Verdic
     if rig.placed:
         sentences.append(f"The rig of {len(ids)} cameras places {len(rig.placed)} more.")
     if rig.changes:
-        told = "; ".join(map(_format_change, rig.changes[:_MOST_NAMED]))
+        phrases = "; ".join(map(_format_change, rig.changes[:_MOST_NAMED]))
         more = f", and {len(rig.changes) - _MOST_NAMED} more" if len(rig.changes) > _MOST_NAMED else ""
-        sentences.append(f"Cameras do not stand on the rig as in most frame sets: {told}{more}.")
+        sentences.append(f"Cameras do not stand on the rig as in most frame sets: {phrases}{more}.")
         advice.append("Fasten these cameras, and calibrate the rig anew.")
     if rig.refuted:
         names = ", ".join(map(sanitize_text, rig.refuted))
@@ -423,10 +423,10 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
         )
         advice.append("Calibrate how the camera sits on what carries it (hand-eye).")
     if given.deviations:
-        told = [_residual(graph, each, placed) for each in given.deviations[:_MOST_NAMED]]
+        phrases = [_residual(graph, each, placed) for each in given.deviations[:_MOST_NAMED]]
         more = f", and {len(given.deviations) - _MOST_NAMED} more" if len(given.deviations) > _MOST_NAMED else ""
         poses = "the poses by depth images" if given.from_depth else "given poses"
-        sentences.append(f"The photographs contradict {poses}: {'; '.join(told)}{more}.")
+        sentences.append(f"The photographs contradict {poses}: {'; '.join(phrases)}{more}.")
         at = "that each depth image goes with its photograph" if given.from_depth else _CHECK_POSES
         advice.append(f"Check {at}.")
     names = tuple(graph.names[each.index] for each in given.deviations)

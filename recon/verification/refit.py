@@ -42,7 +42,7 @@ class BundleFit:
     prior: bundle_adjustment.LensPrior
     loss: bundle_adjustment.BundleAdjustmentConfig
     scale: float  # longer side of the largest frame, whose pixels these are, over REFERENCE_SIDE
-    told: Array  # (G,) focal length that came with the frames; NaN where none did
+    given_focals: Array  # (G,) focal length that came with the frames; NaN where none did
     nominal_sigmas: Array  # (G,) of its logarithm where it is nominal, as EXIF's is; infinite for any other lens
     own: npt.NDArray[np.bool_]  # (G,) lenses of single images, which refute the one that they were taken to share
     units: Array  # (G,) pixels of the largest frame of each lens over those of the largest of all
@@ -88,13 +88,13 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     units = np.array([sides[lens_of_camera == lens].max() for lens in range(count)]) / largest
     enlarged = largest / sides
     focals, aspects, radials, sigmas = np.zeros(count), np.zeros(count), np.zeros((count, 2)), np.zeros(count)
-    told, nominal = np.full(count, np.nan), np.full(count, np.inf)
+    given_focals, nominal = np.full(count, np.nan), np.full(count, np.inf)
     shift_sigmas, aspect_sigmas, own = np.zeros(count), np.zeros(count), np.zeros(count, bool)
     near = np.full(count, -1)
     for camera, lens, by in zip(cameras, lens_of_camera, enlarged, strict=True):
         given = None if camera.own_lens else keyframes[camera.index].frame.intrinsics
         focals[lens], aspects[lens], radials[lens] = by * camera.focal, camera.aspect, camera.radial
-        told[lens] = np.nan if given is None else by * given.fx
+        given_focals[lens] = np.nan if given is None else by * given.fx
         calibrated = given is not None and given.source in ("given", "calibration")
         sigmas[lens] = 0.0 if calibrated else FREE_SIGMA
         nominal[lens] = np.inf if given is None or calibrated else NOMINAL_SIGMA
@@ -120,7 +120,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
     )
     scale = float(largest) / REFERENCE_SIDE
     is_nominal = np.isfinite(nominal)
-    means = np.where(is_nominal, np.log(np.where(is_nominal, told, 1.0)), problem.log_focals)
+    means = np.where(is_nominal, np.log(np.where(is_nominal, given_focals, 1.0)), problem.log_focals)
     prior = bundle_adjustment.LensPrior(
         log_focals=means,
         sigmas=np.minimum(sigmas, nominal),
@@ -137,7 +137,7 @@ def build_fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_
         robust_px=robust_px,
         noise_px=scale * noise * float(np.sqrt(incremental_mapper.FinalAdjustmentConfig().correlated)),
     )
-    return BundleFit(problem, prior, loss, scale, told, nominal, own, units)
+    return BundleFit(problem, prior, loss, scale, given_focals, nominal, own, units)
 
 
 def _tie_near_lenses(numbers: Index, near: Index) -> bundle_adjustment.LensTies | None:
@@ -160,7 +160,7 @@ def compute_nominal_cost(of: BundleFit) -> float:
     known = np.isfinite(of.nominal_sigmas)
     if not known.any():
         return 0.0
-    off = (of.problem.log_focals - np.log(np.where(known, of.told, 1.0))) / of.nominal_sigmas
+    off = (of.problem.log_focals - np.log(np.where(known, of.given_focals, 1.0))) / of.nominal_sigmas
     return float(np.mean(off[known] ** 2))
 
 
@@ -447,19 +447,20 @@ def measure_distortion(fit: BundleFit) -> Distortion:
 
 def free_lenses(fit: BundleFit) -> tuple[FreedLens, ...]:
     """All lenses that came with the frames, set free together. Empty where none did."""
-    told = np.isfinite(fit.told)
-    if not told.any():
+    is_given = np.isfinite(fit.given_focals)
+    if not is_given.any():
         return ()
-    held = adjust(replace(fit, prior=replace(fit.prior, sigmas=np.where(told, 0.0, fit.prior.sigmas))))
-    prior = replace(held.prior, sigmas=np.where(told, FREE_SIGMA, held.prior.sigmas))
-    starts = [held.problem.log_focals + np.where(told, step, 0.0) for step in FREED_LENS_STEPS]
+    held = adjust(replace(fit, prior=replace(fit.prior, sigmas=np.where(is_given, 0.0, fit.prior.sigmas))))
+    prior = replace(held.prior, sigmas=np.where(is_given, FREE_SIGMA, held.prior.sigmas))
+    starts = [held.problem.log_focals + np.where(is_given, step, 0.0) for step in FREED_LENS_STEPS]
     tried = [adjust(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
     free = tried[int(np.argmin([candidate.cost for candidate in tried]))]  # the first NaN, where there is one
     ratio = float(free.cost / max(held.cost, MIN_COST))
-    focals = (fit.told, np.exp(held.problem.log_focals), np.exp(free.problem.log_focals))
+    focals = (fit.given_focals, np.exp(held.problem.log_focals), np.exp(free.problem.log_focals))
     given, registered, found = ((fit.units * each).tolist() for each in focals)
     return tuple(
-        FreedLens(given[g], bool(fit.prior.sigmas[g] == 0), registered[g], found[g], ratio) for g in np.nonzero(told)[0]
+        FreedLens(given[g], bool(fit.prior.sigmas[g] == 0), registered[g], found[g], ratio)
+        for g in np.nonzero(is_given)[0]
     )
 
 

@@ -56,7 +56,7 @@ NOTHING_HEARD = NodeMap("", None, SILENT)
 class ReceivedMap:
     """The newest message about the map, and the message of recon.scene that it belongs to."""
 
-    told: NodeMap
+    node_map: NodeMap
     scene: tuple[str, int] | None = None  # session and sequence
     world: tuple[str, int] | None = None  # session and revision of a provisional one
 
@@ -94,14 +94,16 @@ class LiveMap:
                     continue
                 header: MapHeader = message.header
                 try:
-                    told = NodeMap(header.scene_id, decode_map(message), header.why, **_describe_provisional(header))
+                    node_map = NodeMap(
+                        header.scene_id, decode_map(message), header.why, **_describe_provisional(header)
+                    )
                 except WireError as error:
                     if is_logged(self._refusals.add("maps that were refused", error)):
                         log.warning("a map of the node was refused: %s", error)
-                    told = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
+                    node_map = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
                 growing = None if header.map is None else header.map.provisional
                 world = None if growing is None else (header.session, growing.revision)
-                self._heard = ReceivedMap(told, header.map and (header.session, header.map.scene_sequence), world)
+                self._heard = ReceivedMap(node_map, header.map and (header.session, header.map.scene_sequence), world)
         except Exception as error:
             self._error = error
 
@@ -210,13 +212,13 @@ class Node:
         heard = self._map.newest
         if heard.world is not None:  # it grows with the scene
             session, worlds = self._live.worlds
-            world = worlds.get(heard.told.scene_id)
+            world = worlds.get(heard.node_map.scene_id)
             if world is not None and session == heard.world[0] and world.revision > heard.world[1]:
-                return NodeMap(heard.told.scene_id, None, OUTDATED)
-            return heard.told
-        if heard.told.occupancy is not None and heard.scene != self._live.scene:
-            return NodeMap(heard.told.scene_id, None, OUTDATED)
-        return heard.told
+                return NodeMap(heard.node_map.scene_id, None, OUTDATED)
+            return heard.node_map
+        if heard.node_map.occupancy is not None and heard.scene != self._live.scene:
+            return NodeMap(heard.node_map.scene_id, None, OUTDATED)
+        return heard.node_map
 
     @enter_api()
     def wait_for_map(self, timeout_s: float | None = None) -> NodeMap:

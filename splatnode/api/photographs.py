@@ -66,20 +66,22 @@ class SeveralCameras:
 
     def describe_images(self, names: Sequence[str]) -> dict[str, tuple[str, Stamp | None]]:
         """The camera id and the time of each listed image by its name. Raises TypeError, ValueError."""
-        for what, told in (("camera_ids", self.camera_ids), ("captured_at", self.captured_at)):
-            if told is not None and (isinstance(told, str) or len(told) != len(names)):
-                count = "a text" if isinstance(told, str) else len(told)
+        for what, values in (("camera_ids", self.camera_ids), ("captured_at", self.captured_at)):
+            if values is not None and (isinstance(values, str) or len(values) != len(names)):
+                count = "a text" if isinstance(values, str) else len(values)
                 raise ValueError(f"{what} must be one for each of the {len(names)} images, got {count}")
         ids, stamps = self.camera_ids or [None] * len(names), self.captured_at or [None] * len(names)
         for camera in ids:
             check_camera_id("" if camera is None else camera, "each of camera_ids")
         return {name: (camera or "", stamp) for name, camera, stamp in zip(names, ids, stamps, strict=True)}
 
-    def apply(self, each: Frame | DroppedFrame, told: Mapping[str, tuple[str, Stamp | None]]) -> Frame | DroppedFrame:
+    def apply(
+        self, each: Frame | DroppedFrame, descriptions: Mapping[str, tuple[str, Stamp | None]]
+    ) -> Frame | DroppedFrame:
         """The frame with its camera id and its time, where they were told."""
-        if not isinstance(each, Frame) or each.name not in told:
+        if not isinstance(each, Frame) or each.name not in descriptions:
             return each
-        camera_id, stamp = told[each.name]
+        camera_id, stamp = descriptions[each.name]
         return replace(each, camera_id=camera_id or each.camera_id, captured_at=stamp or each.captured_at)
 
 
@@ -94,12 +96,12 @@ def load_frames(
         raise TypeError(
             "cameras are those of a folder or a film, camera_ids those of a list of images: give one of them"
         )
-    told = several.describe_images(names_of(images)) if listing else {}
+    descriptions = several.describe_images(names_of(images)) if listing else {}
     if all(paths):
         wanted = (several.cameras,) if isinstance(several.cameras, str) else several.cameras
         path, listed, cameras = parse_sources([Path(each) for each in given], wanted, several.tolerance_s)
         found = load_source(Request(path, listed, views, every_frame=every_frame, cameras=cameras), tell)
-        return replace(found, frames=tuple(several.apply(each, told) for each in found.frames))
+        return replace(found, frames=tuple(several.apply(each, descriptions) for each in found.frames))
     if any(paths):
         raise TypeError("images must be all paths or all pictures, got both. Read the files, or write the pictures")
     used = find_range([extent for extent in map(_extent, given) if extent is not None])
@@ -108,7 +110,7 @@ def load_frames(
     frames = [
         make_frame(each, index, picture_name(index), index * STEP_NS, used=used) for index, each in enumerate(given)
     ]
-    framed = [each for each in (several.apply(frame, told) for frame in frames) if isinstance(each, Frame)]
+    framed = [each for each in (several.apply(frame, descriptions) for frame in frames) if isinstance(each, Frame)]
     return select_frames(framed, views, every_frame, tell, several.tolerance_s)
 
 

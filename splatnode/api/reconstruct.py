@@ -130,8 +130,8 @@ def _list_named_sigmas(sigma: Any, images: Images) -> dict[str, Sigmas]:
     names = names_of(images)
     if len(sigma) != len(names):
         raise ValueError(f"poses_sigma must be one for each of the {len(names)} photographs, got {len(sigma)}")
-    told = zip(names, sigma, strict=True)
-    return {name: parse_sigmas(each, "poses_sigma") for name, each in told if each is not None}
+    pairs = zip(names, sigma, strict=True)
+    return {name: parse_sigmas(each, "poses_sigma") for name, each in pairs if each is not None}
 
 
 def _list_named_poses(
@@ -365,8 +365,8 @@ def frame_changes(
 
     Raises TypeError, ValueError.
     """
-    told = None if gravity is None or isinstance(gravity, Mapping) else make_gravity(gravity, None)
-    changes = {"frame": frame, "gravity": None if told is None else list(told.down)}
+    first_gravity = None if gravity is None or isinstance(gravity, Mapping) else make_gravity(gravity, None)
+    changes = {"frame": frame, "gravity": None if first_gravity is None else list(first_gravity.down)}
     return {key: value for key, value in changes.items() if value is not None} | (sigmas_of(poses_sigma) or {}) or None
 
 
@@ -454,18 +454,18 @@ def hold_poses(trusted: bool) -> Mapping[str, bool] | None:
     return {"trust_poses": True} if trusted else None
 
 
-def merge_former_argument(former: str, told: bool | None, present: str, value: bool) -> bool:
+def merge_former_argument(former: str, former_value: bool | None, present: str, value: bool) -> bool:
     """Returns the value of an argument that had a former name, which is notified where it is used.
 
     Raises TypeError where both are given.
     """
-    if told is None:
+    if former_value is None:
         return value
     if value:
         raise TypeError(f"{present} is given twice, once as {former}, its former name; give it once")
     text = f"the argument {former} is called {present} now; the former name is read in this release only"
     notify(log, text, DeprecationWarning)
-    return told
+    return former_value
 
 
 def check_counts(**values: int | None) -> None:

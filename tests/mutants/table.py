@@ -539,7 +539,7 @@ MUTANTS = (
         ("a wrong registration weighs as much as a right one", "WRONG_WEIGHT = 4.0", "WRONG_WEIGHT = 1.0"),
         (
             "the report counts windows with a told lens among the others",
-            "windows = [pair for pair in pairs if pair[0].window and not pair[0].told]",
+            "windows = [pair for pair in pairs if pair[0].window and not pair[0].has_known_lens]",
             "windows = [pair for pair in pairs if pair[0].window]",
         ),
     ),

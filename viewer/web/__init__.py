@@ -96,8 +96,8 @@ class Access:
         The arguments are the headers of those names.
         """
         scheme, _, bearer = (authorization or "").partition(" ")
-        is_told = scheme.lower() == "bearer" and self.is_key(bearer.strip())
-        return self.key is None or is_told or self.is_key(_cookie(cookies, self.cookie))
+        has_bearer_key = scheme.lower() == "bearer" and self.is_key(bearer.strip())
+        return self.key is None or has_bearer_key or self.is_key(_cookie(cookies, self.cookie))
 
 
 def new_key() -> str:
@@ -186,14 +186,16 @@ class Content:
         named = [(name, _lines_of_group(self, name)) for name in _GROUPS] + [
             ("ground", ground_lines(ground(self.moment)))
         ]
-        parts, told, at = [], [], 0
+        parts, entries, at = [], [], 0
         for name, group in named:
             for lines in group:
                 ends = lines.ends.astype("<f4")
                 parts.append(ends.tobytes())
-                told.append({"group": name, "at": at, "count": len(ends), "colour": lines.colour, "width": lines.width})
+                entries.append(
+                    {"group": name, "at": at, "count": len(ends), "colour": lines.colour, "width": lines.width}
+                )
                 at += ends.size
-        text = json.dumps(_describe_scene(self) | {"lines": told}, allow_nan=False).encode()
+        text = json.dumps(_describe_scene(self) | {"lines": entries}, allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
         return b"".join([len(text).to_bytes(4, "little"), text, *parts])
 

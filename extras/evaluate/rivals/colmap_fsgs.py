@@ -55,8 +55,8 @@ def initialize_scene_with_depth(model: SparseModel, seed: int) -> Scene:
         points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]
         points = points[points[:, 2] > 0]
         pixels = points @ K.T
-        told = points if len(points) >= stereo.MIN_SPARSE_POINTS else (model.points - T[:3, 3]) @ T[:3, :3]
-        near, far = stereo.estimate_depth_range(told[:, 2])
+        range_points = points if len(points) >= stereo.MIN_SPARSE_POINTS else (model.points - T[:3, 3]) @ T[:3, :3]
+        near, far = stereo.estimate_depth_range(range_points[:, 2])
         views.append(stereo.StereoView(view.image, K, T, (near, classical.Config().far_margin * far)))
         sparse.append(stereo.SparsePoints(pixels[:, :2] / pixels[:, 2:], points[:, 2]))
     maps = stereo.estimate_depth_maps(views, stereo.StereoConfig(), seed=seed, sparse=sparse)

@@ -293,16 +293,18 @@ def set_intrinsics(photos: Sequence[TrialImage], setting: str) -> list[TrialImag
     """The photographs with what `setting` tells of their true lenses; EXIF knows the focal length alone."""
     if setting == "nothing":
         return [replace(photo, intrinsics=None) for photo in photos]
-    told = []
+    trial_images = []
     for photo in photos:
         height, width = photo.image.shape[:2]
         K = _require_camera(photo).K_for(width, height)
         fx, fy, cx, cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         if setting == "exif":
-            told.append(replace(photo, intrinsics=Intrinsics(width, height, fx, fx, width / 2, height / 2, "exif")))
+            trial_images.append(
+                replace(photo, intrinsics=Intrinsics(width, height, fx, fx, width / 2, height / 2, "exif"))
+            )
         else:
-            told.append(replace(photo, intrinsics=Intrinsics(width, height, fx, fy, cx, cy, "given")))
-    return told
+            trial_images.append(replace(photo, intrinsics=Intrinsics(width, height, fx, fy, cx, cy, "given")))
+    return trial_images
 
 
 def apply_homography(

@@ -56,7 +56,7 @@ class Sample:
     errors: Mapping[str, CameraError]  # by camera; of those that have a true one
     broken: bool = False  # its images break what is assumed of lenses, on purpose: a trial of lens assumptions
     lens_trial: bool = False  # of `lens_assumptions`; else, without a window, of the matrix
-    told: bool = False  # what EXIF or a calibration says of the lens came with the photographs of a window
+    has_known_lens: bool = False  # what EXIF or a calibration says of the lens came with the photographs of a window
 
     @property
     def is_pair(self) -> bool:
@@ -99,9 +99,9 @@ def read_samples(paths: list[Path]) -> list[Sample]:
         content = load_results(path)
         if "rows" in content:
             rows = record_of(content["rows"], list[WindowRow])
-            told = content.get("told", "nothing") != "nothing"
+            has_known_lens = content.get("told", "nothing") != "nothing"
             windows = (make_window_sample(row) for row in rows if row.method == OURS and row.evidence is not None)
-            found += [replace(window, told=told) for window in windows]
+            found += [replace(window, has_known_lens=has_known_lens) for window in windows]
         elif "trials" in content:
             found += list(make_trial_samples(content["trials"]))
         else:
@@ -427,7 +427,7 @@ def pair_held_out_models(samples: Sequence[Sample], numbers: Mapping[str, Verdic
 
 def make_report(pairs: Sequence[Judgement]) -> dict[str, object]:
     """Reports on windows, by number of images and by scene, too, and on the matrix."""
-    windows = [pair for pair in pairs if pair[0].window and not pair[0].told]
+    windows = [pair for pair in pairs if pair[0].window and not pair[0].has_known_lens]
     by_scene = {
         scene: asdict(count_judgements([pair for pair in pairs if pair[0].window and pair[0].scene == scene]))
         for scene in sorted({sample.scene for sample, _ in windows})
@@ -441,7 +441,7 @@ def make_report(pairs: Sequence[Judgement]) -> dict[str, object]:
         "windows": asdict(count_judgements(windows)),
         "windows_by_count": by_count,
         "windows_by_scene": by_scene,
-        "windows_told": asdict(count_judgements([pair for pair in pairs if pair[0].window and pair[0].told])),
+        "windows_told": asdict(count_judgements([pair for pair in pairs if pair[0].window and pair[0].has_known_lens])),
         "matrix": asdict(count_judgements([each for each in pairs if not each[0].window and not each[0].lens_trial])),
         "beyond": [identify_sample(sample) for sample, numbers in pairs if _exceeds_published_bounds(sample, numbers)],
         "right_refused": [identify_sample(s) for s, numbers in right if not is_published(s, numbers)],

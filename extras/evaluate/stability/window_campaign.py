@@ -78,19 +78,24 @@ from splatnode.recon.result.export.staged import hold_result_folder, json_bytes,
 
 # splatnode's answers to windows: the steps of recon/pipeline.py up to the verdict.
 
-Told = Literal["nothing", "exif", "given"]  # of the lens
+LensSetting = Literal["nothing", "exif", "given"]  # what comes with the photographs of the lens
 EXIF_ERROR = 0.03  # by which EXIF's focal length is off at most, of its logarithm
 
 
 def reconstruct_window(
-    place: TrialScene, window: Window, config: ReconstructionConfig, fresh: bool, told: Told, known: Pieces
+    place: TrialScene,
+    window: Window,
+    config: ReconstructionConfig,
+    fresh: bool,
+    lens_setting: LensSetting,
+    known: Pieces,
 ) -> tuple[WindowAnswer, dict[PieceKey, bytes]]:
     """The answer, and what was found for it that is not `known` of the scene. It is called in a process of its own.
 
-    `told`: what comes with the photographs, see `load_window_frames`; `fresh`: measures the seconds from photographs
-    on, too.
+    `lens_setting`: what comes with the photographs, see `load_window_frames`; `fresh`: measures the seconds from
+    photographs on, too.
     """
-    matcher, frames = load_prior(config).matcher, load_window_frames(place, window, told)
+    matcher, frames = load_prior(config).matcher, load_window_frames(place, window, lens_setting)
     kept, _, rejected = screen_all(frames, config.screening)
     keyframes = [prepare(frame, config, load_plain_features(known, frame.name)) for frame in kept]
     graph, found = match_keyframes(keyframes, known, config.matching, matcher)
@@ -104,7 +109,7 @@ def reconstruct_window(
     return WindowAnswer(estimate.verdict, cameras, seconds, timed_on, fresh_seconds, fresh_on, evidence), found
 
 
-def load_window_frames(place: TrialScene, window: Window, told: Told = "nothing") -> list[Frame]:
+def load_window_frames(place: TrialScene, window: Window, lens_setting: LensSetting = "nothing") -> list[Frame]:
     """The photographs without what masks hide; their ids are their positions in the scene.
 
     Nothing is known about the camera; or the true intrinsics are given; or EXIF tells the focal length alone, within
@@ -115,9 +120,9 @@ def load_window_frames(place: TrialScene, window: Window, told: Told = "nothing"
     factor = float(np.exp(generator.uniform(-EXIF_ERROR, EXIF_ERROR)))
     for frame in place.scene.frames(window.names):
         index, intrinsics = place.names.index(frame.name), None
-        if told != "nothing":
+        if lens_setting != "nothing":
             intrinsics = place.scene.cameras[frame.name].intrinsics_for(frame.width, frame.height)
-        if told == "exif" and intrinsics is not None:
+        if lens_setting == "exif" and intrinsics is not None:
             size, focal = (frame.width, frame.height), factor * intrinsics.fx
             intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, "exif")
         frames.append(replace(frame, frame_id=index, stamp_ns=index, intrinsics=intrinsics))
@@ -315,7 +320,7 @@ class Plan:
     per_kind: int = 2  # windows of each scene, count and stride, at most
     counts: tuple[int, ...] = COUNTS
     seed: int = 0  # of the draw of the windows
-    told: Told = "nothing"  # of the lens, to splatnode: see `load_window_frames`
+    lens_setting: LensSetting = "nothing"  # of the lens, to splatnode: see `load_window_frames`
     fresh: bool = False  # measures each window's seconds from photographs on, too
     timeout_s: float = 120.0  # of one method on one window, from the start of its process on
     max_memory_mb: float | None = None  # of the same
@@ -383,7 +388,7 @@ def _run_jobs(plan: Plan, todo: Sequence[Job], engine: Engine, folder: Path) -> 
 
 def _make_work(plan: Plan, job: Job, known: Pieces) -> Work:
     if job.method == OURS:
-        return partial(reconstruct_window, job.place, job.window, plan.config, plan.fresh, plan.told, known)
+        return partial(reconstruct_window, job.place, job.window, plan.config, plan.fresh, plan.lens_setting, known)
 
     return partial(run_rival_on_window, job.place, job.window, job.method, plan.config.seed, plan.fresh, known)
 
@@ -391,7 +396,7 @@ def _make_work(plan: Plan, job: Job, known: Pieces) -> Work:
 class _Rows(msgspec.Struct, frozen=True):
     rows: list[WindowRow]
     machine: dict[str, Any] = {}
-    told: Told = "nothing"
+    told: LensSetting = "nothing"
 
 
 def read_rows(path: Path) -> list[WindowRow]:
@@ -403,7 +408,7 @@ def _resume_rows(out: Path, plan: Plan, cores_each: int) -> list[WindowRow]:
     path = out / FILE
     content = _read_content(path)
     begun = content.rows or (path.exists() and (out / _JOURNAL).exists())
-    if begun and content.told != plan.told:
+    if begun and content.told != plan.lens_setting:
         raise ValueError(f"{path} holds windows with --known-lens {content.told}: give another folder with --out DIR")
     before = content.machine.get("threads")  # which each window had, before a row said so itself
     known = [row.cores or before for row in content.rows if row.seconds is not None]
@@ -427,7 +432,7 @@ def _write(path: Path, plan: Plan, rows: dict[RowKey, WindowRow], asked: Sequenc
         "command": command,
         "machine": describe_machine(),
         "seed": plan.seed,
-        "told": plan.told,
+        "told": plan.lens_setting,
         "summary": summarise(ordered),
         "rows": [{**asdict(row), "right": row.right, "found": row.outcome.value} for row in ordered],
     }
@@ -643,7 +648,7 @@ def run_windows_verb(args: argparse.Namespace) -> int:
         methods,
         per_kind=args.windows_per_kind,
         counts=args.counts,
-        told=args.known_lens,
+        lens_setting=args.known_lens,
         fresh=args.no_cache,
         timeout_s=args.timeout_s,
         max_memory_mb=args.max_memory,

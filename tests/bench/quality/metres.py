@@ -111,7 +111,7 @@ def of_poses(
 def _aligned(found: PoseAlignment | str, truth: float) -> Row:
     if isinstance(found, str):
         return {"told": found, "left_out": []}
-    return {**measured(found.unit, truth), "left_out": [each.split()[3] for each in found.told]}
+    return {**measured(found.unit, truth), "left_out": [each.split()[3] for each in found.notes]}
 
 
 def place(seed: int) -> list[Row]:

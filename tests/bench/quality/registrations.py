@@ -55,10 +55,10 @@ OTHERS = (
 )  # fmt: skip
 
 
-def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, window_campaign.Told]]:
+def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, window_campaign.LensSetting]]:
     """The windows of a place and what is told, in an order in which they share most of what was found."""
-    something: tuple[window_campaign.Told, ...] = ("exif", "given")
-    asked: list[tuple[Window, window_campaign.Told]] = [
+    something: tuple[window_campaign.LensSetting, ...] = ("exif", "given")
+    asked: list[tuple[Window, window_campaign.LensSetting]] = [
         (window, "nothing") for window in place_windows(2, counts=(2, 3, 6, 12))
     ]
     for window in [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]:

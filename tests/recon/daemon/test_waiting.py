@@ -9,6 +9,7 @@ import threading
 import time
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -91,6 +92,22 @@ def test_keyframes_of_several_places_that_come_together_after_a_scene_begin_one_
     for at, scene in enumerate(("scene-0001", "scene-0002")):
         with closing(Store(ledger.find_folder(config.checkpoint, scene))) as store:
             assert store.names == {frame.name for frame in frames[3 * at : 3 * at + 3]}
+
+
+def test_the_status_of_a_submap_that_grows_is_that_of_the_scene_which_is_shown(config):
+    frames = places(msgspec.structs.replace(SMALL, views=4), (0,))
+    with closing(Store(config.checkpoint)) as store:
+        node = Node(config, store)
+        worker, newest = SimpleNamespace(_output=node.output, active=node.active), Worker.newest_submaps.fget
+        assert newest is not None
+        verdicts = []
+        for arrived in node.keyframes(frames):
+            node.active.add_keyframes([arrived])
+            (status,) = newest(worker)
+            verdicts.append((status.scene_id, status.verdict, status.keyframes))
+        assert verdicts[0] == ("scene-0001", "TOO_FEW_VIEWS", 0) and verdicts[-1] == ("scene-0001", "OK", 4)
+        node.active.finalize()
+        assert [each.verdict for each in newest(worker)] == ["OK"]
 
 
 def test_a_place_that_turns_out_to_be_two_while_the_camera_is_there_becomes_two(config, monkeypatch):

@@ -12,8 +12,15 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Motion
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.measurement import MetricView
-from splatnode.recon.metric.odometry import PoseAlignment, PoseSigmas, align_to_motions, align_to_poses
-from splatnode.recon.metric.pose_drift import PoseNoise, fit_placement, part_steps
+from splatnode.recon.metric.odometry import (
+    PoseAlignment,
+    PoseNoise,
+    PoseSigmas,
+    align_to_motions,
+    align_to_poses,
+    fit_placement,
+    part_steps,
+)
 
 TOLD = PoseSigmas(0.01, 2.0, 0.02)  # as nobody tells otherwise
 UNIT = 1.7  # metres a unit of the scene
@@ -107,7 +114,7 @@ def test_errors_of_each_pose_s_own_are_averaged():
     assert np.median(off[10]) < 0.02
     assert np.median(off[90]) < 0.02  # on a way nine times as long
     _, found = align(0, 90, NONE, (0.01, 1.0))
-    assert found.placement is not None and found.told == ()
+    assert found.placement is not None and found.notes == ()
     factors = found.placement.factors
     assert (factors.own_turn, factors.own_shift) == (0.5, 1.0)
     assert factors.step_turn <= 0.25 and factors.step_shift <= 0.25
@@ -136,7 +143,7 @@ def test_a_pose_that_is_far_off_is_named_and_moves_nothing(wrong):
     given[wrong][:3, 3] += [0.6, -0.6, 0.53]
     found = align_to_poses(views, dict(zip(views, given, strict=True)), TOLD)
     assert isinstance(found, PoseAlignment) and isinstance(right, PoseAlignment)
-    (told,) = found.told
+    (told,) = found.notes
     assert told.startswith(f"the pose of {wrong:03d} was left out: it is ")
     # Without the first pose the second one is as near the start as is known
     assert find_worst_m(found.rescale(UNIT), views, Ts) < find_worst_m(right.rescale(UNIT), views, Ts) + 0.02

@@ -46,7 +46,7 @@ def given(seed: int) -> dict[str, np.ndarray]:
 
 def test_true_poses_give_the_unit_and_the_axes():
     found = align_to_poses(views(), dict(zip(NAMES, TRUE, strict=True)), SIGMAS)
-    assert isinstance(found, PoseAlignment) and found.told == () and found.unit.source == "poses of 8 photographs"
+    assert isinstance(found, PoseAlignment) and found.notes == () and found.unit.source == "poses of 8 photographs"
     assert found.unit.metres_per_unit == pytest.approx(UNIT) and 0.005 < found.unit.sigma < 0.03
     metric = apply_metric_scale(scene(), MetricConfig(), Evidence(poses=dict(zip(NAMES, TRUE, strict=True))))
     for camera, T in zip(metric.cameras, TRUE, strict=True):
@@ -66,9 +66,9 @@ def test_a_pose_counts_by_its_own_sigma():
         and isinstance(unsure, PoseAlignment)
         and isinstance(drifting_at_most, PoseAlignment)
     )
-    assert [told.split(" was ")[0] for told in sure.told] == [f"the pose of {NAMES[3]}"]
-    assert unsure.told == () and unsure.unit.metres_per_unit == pytest.approx(UNIT, rel=0.003)
-    assert drifting_at_most.told == () and drifting_at_most.unit.sigma > 1.5 * sure.unit.sigma
+    assert [told.split(" was ")[0] for told in sure.notes] == [f"the pose of {NAMES[3]}"]
+    assert unsure.notes == () and unsure.unit.metres_per_unit == pytest.approx(UNIT, rel=0.003)
+    assert drifting_at_most.notes == () and drifting_at_most.unit.sigma > 1.5 * sure.unit.sigma
     alike = align_to_poses(views(), wrong, tracker, dict.fromkeys(NAMES, (0.01, 2.0)))
     assert isinstance(alike, PoseAlignment) and alike.unit == sure.unit
 
@@ -119,7 +119,7 @@ def test_a_pose_that_is_wrong_by_a_metre_is_named_and_the_rest_stands(wrong):
     poses[NAMES[wrong]][:3, 3] += [0.6, -0.6, 0.53]
     found = align_to_poses(views(), poses, SIGMAS)
     assert isinstance(found, PoseAlignment) and found.unit.metres_per_unit == pytest.approx(UNIT, rel=0.03)
-    (told,) = found.told
+    (told,) = found.notes
     assert told.startswith(f"the pose of {NAMES[wrong]} was left out: it is 1") or "0.9" in told
     metric = apply_metric_scale(scene(), MetricConfig(), Evidence(poses=poses))
     assert metric.scale.metric and NAMES[wrong] in (metric.scale.source or "") and len(metric.cameras) == 8
@@ -130,8 +130,8 @@ def test_a_pose_that_looks_elsewhere_is_named():
     poses[NAMES[4]] = poses[NAMES[4]].copy()
     poses[NAMES[4]][:3, :3] = poses[NAMES[4]][:3, :3] @ Rotation.from_rotvec([0.0, 0.7, 0.0]).as_matrix()
     found = align_to_poses(views(), poses, SIGMAS)
-    assert isinstance(found, PoseAlignment) and len(found.told) == 1
-    assert NAMES[4] in found.told[0] and found.told[0].endswith("degrees off")
+    assert isinstance(found, PoseAlignment) and len(found.notes) == 1
+    assert NAMES[4] in found.notes[0] and found.notes[0].endswith("degrees off")
 
 
 def test_what_poses_cannot_tell_is_said():

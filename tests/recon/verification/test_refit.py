@@ -49,7 +49,7 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
 
 def given(fit: refit.BundleFit) -> refit.BundleFit:
     """The fit with a focal length that is held as it is."""
-    return replace(fit, prior=replace(fit.prior, sigmas=np.zeros(1)), told=np.exp(fit.problem.log_focals))
+    return replace(fit, prior=replace(fit.prior, sigmas=np.zeros(1)), given_focals=np.exp(fit.problem.log_focals))
 
 
 def test_nothing_moves_between_a_fit_and_itself():
@@ -126,7 +126,7 @@ def test_a_given_focal_length_is_found_right_or_wrong(factor):
 
 
 def test_a_nominal_focal_length_is_doubted_too():
-    (freed,) = refit.free_lenses(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
+    (freed,) = refit.free_lenses(replace(made_up(focal=0.8 * FOCAL), given_focals=np.array([0.8 * FOCAL])))
     assert not freed.trusted and freed.found == pytest.approx(FOCAL, rel=0.02) and freed.cost_ratio < 0.5
 
 
@@ -187,7 +187,7 @@ def test_a_lens_that_no_other_camera_shares_keeps_its_prior():
     problem = replace(fit.problem, lens_of_camera=np.arange(4), **four)
     prior = bundle_adjustment.LensPrior(problem.log_focals, np.zeros(4), np.zeros((4, 2)), np.zeros(4))
     alone = replace(
-        fit, problem=problem, prior=prior, told=np.full(4, FOCAL), nominal_sigmas=np.full(4, np.inf),
+        fit, problem=problem, prior=prior, given_focals=np.full(4, FOCAL), nominal_sigmas=np.full(4, np.inf),
         own=np.zeros(4, bool), units=np.ones(4),
     )  # fmt: skip
     assert refit.doubt_common_lenses(alone).focals_rel.max() < 1e-6

@@ -4,7 +4,7 @@ const AGAIN_MS = 1000; // after a failure
 
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
-/** Calls `heard(told)` for every news, `lost(why)` when there is no answer, for ever. */
+/** Calls `heard(news)` for every news, `lost(why)` when there is no answer, for ever. */
 export async function listen(heard, lost) {
   let run = "";
   let number = -1;
@@ -13,9 +13,9 @@ export async function listen(heard, lost) {
       const answer = await fetch(`/told?run=${run}&number=${number}`);
       if (answer.status === 401 || answer.status === 403) lost(await answer.text());
       if (!answer.ok) throw new Error(`status ${answer.status}`);
-      const told = await answer.json();
-      ({ run, number } = told);
-      await heard(told);
+      const news = await answer.json();
+      ({ run, number } = news);
+      await heard(news);
     } catch (error) {
       if (error instanceof TypeError) lost("no connection to splatnode view: trying again");
       await pause(AGAIN_MS);

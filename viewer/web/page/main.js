@@ -38,22 +38,22 @@ const camera = () => shapes?.cameras.find(({ name }) => name === chosen) ?? null
 
 // ---- What is told ----------------------------------------------------------------------------------------------------
 
-async function heard(told) {
-  panel.notice = told.shapes || !picture ? "" : told.said.state ?? "";
-  panel.say(told.said);
-  if (JSON.stringify(tracked) !== JSON.stringify(told.said.tracked ?? [])) {
-    tracked = told.said.tracked ?? [];
+async function heard(news) {
+  panel.notice = news.shapes || !picture ? "" : news.said.state ?? "";
+  panel.say(news.said);
+  if (JSON.stringify(tracked) !== JSON.stringify(news.said.tracked ?? [])) {
+    tracked = news.said.tracked ?? [];
     panel.offer("tracked", tracked.length > 0);
     linesShown = "";
   }
   // Another run of the viewer counts its versions anew.
-  const fresh = told.run !== wanted.run || told.gaussians !== wanted.gaussians;
-  if (told.shapes && (shapes?.run !== told.run || shapes.version !== told.shapes)) await takeShapes(told.shapes, told.run);
-  if (told.gaussians && fresh) {
-    const file = await fetchGaussians(told.gaussians);
+  const fresh = news.run !== wanted.run || news.gaussians !== wanted.gaussians;
+  if (news.shapes && (shapes?.run !== news.run || shapes.version !== news.shapes)) await takeShapes(news.shapes, news.run);
+  if (news.gaussians && fresh) {
+    const file = await fetchGaussians(news.gaussians);
     if (file) {
-      wanted = { run: told.run, gaussians: told.gaussians, age: told.age_s, since: performance.now() };
-      picture?.splats.load(file, told.gaussians, view ? forward(view.T) : [0, 0, 1]);
+      wanted = { run: news.run, gaussians: news.gaussians, age: news.age_s, since: performance.now() };
+      picture?.splats.load(file, news.gaussians, view ? forward(view.T) : [0, 0, 1]);
     }
   }
   redraw();

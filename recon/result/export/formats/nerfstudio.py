@@ -61,8 +61,8 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE
 
 def _make_given_dict(camera: CameraEstimate) -> dict[str, object] | None:
     """The pose that was given for a camera, with this file's axes."""
-    told = make_given_dict(camera)
-    if told is None or camera.given is None:
+    fields = make_given_dict(camera)
+    if fields is None or camera.given is None:
         return None
-    told.pop("T_world_camera")
-    return {"transform_matrix": (camera.given.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(), **told}
+    fields.pop("T_world_camera")
+    return {"transform_matrix": (camera.given.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(), **fields}

@@ -115,7 +115,7 @@ def test_cameras_of_two_worlds_are_grossly_wrong():
 
 def test_the_report_counts_windows_with_a_told_lens_apart():
     samples = make_samples()
-    told = [replace(sample, told=True) for sample in samples[:4]]
+    told = [replace(sample, has_known_lens=True) for sample in samples[:4]]
     matrix = [replace(sample, window=False) for sample in samples[:2]]
     numbers = fitting.fit_without_each_scene(samples)
     report: dict[str, Any] = fitting.make_report(fitting.pair_held_out_models([*samples, *told, *matrix], numbers))

@@ -157,12 +157,12 @@ def test_windows_with_a_given_lens_and_without_are_not_mixed(tmp_path, monkeypat
     assert json.loads(as_it_works[0])["told"] == "nothing", "the file says of what the journal is"
     before = (tmp_path / "windows.json").read_bytes()
     with pytest.raises(ValueError, match=r"windows\.json holds windows with --known-lens nothing"):
-        run_windows(replace(plan, told="given"), places, tmp_path, "command", on)
+        run_windows(replace(plan, lens_setting="given"), places, tmp_path, "command", on)
     assert (tmp_path / "windows.json").read_bytes() == before
     (tmp_path / "windows.json").write_bytes(as_it_works[0])  # as a killed process leaves it: all is in the journal
     (tmp_path / "windows.jsonl").write_text(f"{json.dumps(json.loads(before)['rows'][1])}\n")
     with pytest.raises(ValueError, match="with --known-lens nothing"):
-        run_windows(replace(plan, told="given"), places, tmp_path, "command", on)
+        run_windows(replace(plan, lens_setting="given"), places, tmp_path, "command", on)
     assert run_windows(plan, places, tmp_path, "command", on)[1] == rows[1]
 
 
