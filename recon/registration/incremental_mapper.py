@@ -1,7 +1,7 @@
-"""The map of few views: attempts with several first pairs and focal lengths, of which the best is kept.
+"""Incremental mapping of few views: attempts with several first pairs and focal lengths, of which the best is kept.
 
-With a handful of views there is time to try. Attempts are scored by ALL pairwise matches, those included that a map was
-not built from.
+With a handful of views there is time to try. Attempts are scored by ALL pairwise matches, those included that a model
+was not built from.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from splatnode.recon.registration.mapping_problem import (
     OwnLens,
     Pair,
     Pairs,
-    PartialMap,
     Resection,
+    SparseModel,
 )
 from splatnode.recon.registration.multiview_geometry import Tracks
 from splatnode.recon.registration.self_calibration import CORNER, LEAST_SHIFT
@@ -47,10 +47,10 @@ _FIRST_PAIR_TOLERANCE = 4.0  # with two views and a guessed focal length
 _NEW_VIEW_TOLERANCE = 3.0  # with a view that has just been resected
 SETTLED_TOLERANCE = 2.0  # with views that have been adjusted before
 
-# A bundle adjustment after each view need not converge: the next view changes the map again.
+# A bundle adjustment after each view need not converge: the next view changes the model again.
 _QUICK_ITERATIONS, _QUICK_DECREASE = 10, 1e-3
 
-_MIN_IMPROVEMENT = 1.05  # factor of the score by which another map must be better to replace one
+_MIN_IMPROVEMENT = 1.05  # factor of the score by which another model must be better to replace one
 _MIN_VIEWS = 3  # that must stay when doubtful ones are removed
 
 
@@ -60,15 +60,15 @@ class IncrementalMapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields
     resection: mapping_problem.ResectionConfig = mapping_problem.ResectionConfig()
     triangulation: multiview_geometry.TriangulationConfig = multiview_geometry.TriangulationConfig()
     robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
-    min_points: int = 15  # points that a map needs
+    min_points: int = 15  # points that a model needs
     candidates: int = 3  # views that are resected before the best of them is registered
     min_view_ratio: float = 0.6  # inlier ratio of a view's matches below which it is removed and resected again
     # Standard deviation of log focal while there are two views, which say little about it
     pair_focal_sigma: float = 0.03
 
 
-def grow(problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig) -> PartialMap | None:
-    """A map from the pair `first` on, with every view that can be registered; None where the pair gives too little.
+def grow(problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig) -> SparseModel | None:
+    """A model from the pair `first` on, with every view that can be registered; None where the pair gives too little.
 
     `focals` (one a lens) are in pixels.
     """
@@ -76,8 +76,8 @@ def grow(problem: MapperInput, focals: list[float], first: Pair, config: Increme
     return _repair(problem, extend(problem, partial, config), config) if partial else None
 
 
-def score(problem: MapperInput, partial: PartialMap, zero_px: float) -> float:
-    """The number of matches that the map explains, of all pairs; one with error e counts 1 - (e / zero_px)^2.
+def score(problem: MapperInput, partial: SparseModel, zero_px: float) -> float:
+    """The number of matches that the model explains, of all pairs; one with error e counts 1 - (e / zero_px)^2.
 
     `zero_px` is in pixels at REFERENCE_SIDE; matches with larger errors count 0.
     """
@@ -87,13 +87,13 @@ def score(problem: MapperInput, partial: PartialMap, zero_px: float) -> float:
 
 def adjust(
     problem: MapperInput,
-    partial: PartialMap,
+    partial: SparseModel,
     tracks: Tracks,
     loss: bundle_adjustment.BundleAdjustmentConfig,
     tolerance: float,
     config: multiview_geometry.TriangulationConfig,
-) -> PartialMap:
-    """The map with all points triangulated anew (see `retriangulate` for `tolerance`), then bundle-adjusted."""
+) -> SparseModel:
+    """The model with all points triangulated anew (see `retriangulate` for `tolerance`), then bundle-adjusted."""
     estimate, track_of_point = multiview_geometry.retriangulate(
         partial.estimate, tracks, partial.registered, problem.scale, config, tolerance
     )
@@ -103,8 +103,8 @@ def adjust(
 
 
 def adjust_quickly(
-    problem: MapperInput, partial: PartialMap, tolerance: float, config: IncrementalMapperConfig
-) -> PartialMap:
+    problem: MapperInput, partial: SparseModel, tolerance: float, config: IncrementalMapperConfig
+) -> SparseModel:
     """`adjust` with few tracks and few iterations, for after each view."""
     robust_px = config.robust_px * float(np.median(problem.scale))
     loss = bundle_adjustment.BundleAdjustmentConfig(
@@ -115,8 +115,8 @@ def adjust_quickly(
 
 def _initialise(
     problem: MapperInput, focals: list[float], first: Pair, config: IncrementalMapperConfig
-) -> PartialMap | None:
-    """The map of the pair `first`: its first view is the world's origin, its baseline the unit of length."""
+) -> SparseModel | None:
+    """The model of the pair `first`: its first view is the world's origin, its baseline the unit of length."""
     count = len(problem.views)
     rotation, direction, num_inliers = multiview_geometry.relative_pose(
         problem.pairs[first],
@@ -138,15 +138,15 @@ def _initialise(
     )
     prior = bundle_adjustment.focal_prior(np.log(focals), np.array([lens.sigma for lens in problem.lenses]))
     tight = replace(prior, sigmas=np.minimum(prior.sigmas, config.pair_focal_sigma))
-    start = PartialMap(first, estimate, tight, np.zeros(0, np.int64))
+    start = SparseModel(first, estimate, tight, np.zeros(0, np.int64))
     partial = adjust_quickly(problem, start, _FIRST_PAIR_TOLERANCE, config)
     return replace(partial, prior=prior) if len(partial.estimate.points) >= config.min_points else None
 
 
-def extend(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> PartialMap:
-    """The map with every further view that can be registered.
+def extend(problem: MapperInput, partial: SparseModel, config: IncrementalMapperConfig) -> SparseModel:
+    """The model with every further view that can be registered.
 
-    Of the views that observe most of the map, the one with the highest inlier ratio comes next: a view that repeated
+    Of the views that observe most of the model, the one with the highest inlier ratio comes next: a view that repeated
     structures misplace contradicts some of its neighbours, and waits until more of them are registered.
     """
     failed: set[int] = set()
@@ -166,17 +166,17 @@ def extend(problem: MapperInput, partial: PartialMap, config: IncrementalMapperC
     return partial
 
 
-def _next_views(problem: MapperInput, partial: PartialMap, failed: set[int]) -> list[int]:
-    """The views that are not registered and have not failed; those that observe most of the map's points first."""
+def _next_views(problem: MapperInput, partial: SparseModel, failed: set[int]) -> list[int]:
+    """The views that are not registered and have not failed; those that observe most of the model's points first."""
     tracks = problem.growing_tracks
-    in_map = np.isin(tracks.track_of, partial.track_of_point)
-    counts = np.bincount(tracks.camera_of[in_map], minlength=len(problem.views))
+    in_model = np.isin(tracks.track_of, partial.track_of_point)
+    counts = np.bincount(tracks.camera_of[in_model], minlength=len(problem.views))
     waiting = [view for view in range(len(problem.views)) if view not in partial.registered and view not in failed]
     return sorted(waiting, key=lambda view: (-counts[view], view))
 
 
-def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> PartialMap:
-    """The map after views with low inlier ratios have been removed and resected, where that raises the score.
+def _repair(problem: MapperInput, partial: SparseModel, config: IncrementalMapperConfig) -> SparseModel:
+    """The model after views with low inlier ratios have been removed and resected, where that raises the score.
 
     First all of them at once, because misplaced views may support each other; then one after the other.
     """
@@ -195,14 +195,14 @@ def _repair(problem: MapperInput, partial: PartialMap, config: IncrementalMapper
     return partial
 
 
-def _find_weak_views(problem: MapperInput, partial: PartialMap, config: IncrementalMapperConfig) -> list[int]:
+def _find_weak_views(problem: MapperInput, partial: SparseModel, config: IncrementalMapperConfig) -> list[int]:
     """The registered views with an inlier ratio below `min_view_ratio`, the lowest first."""
     ratios = mapping_problem.inlier_ratios(problem, partial, config.triangulation.max_error_px)
     of_view = {view: mapping_problem.compute_pooled_ratio(ratios, problem.pairs, view) for view in partial.registered}
     return sorted((view for view in of_view if of_view[view] < config.min_view_ratio), key=lambda view: of_view[view])
 
 
-# The last adjustment of a map: more tracks, subpixel observations, lenses as free as their priors leave them.
+# The last adjustment of a model: more tracks, subpixel observations, lenses as free as their priors leave them.
 
 Flags = npt.NDArray[np.bool_]
 
@@ -214,11 +214,11 @@ _MIN_OBSERVATIONS = 6  # of a registered camera: three fix a pose, twice as many
 
 
 class FinalAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The last adjustment of a map: more tracks, subpixel observations, lenses as free as their priors leave them."""
+    """The last adjustment of a model: more tracks, subpixel observations, lenses as free as their priors leave them."""
 
     triangulation: multiview_geometry.TriangulationConfig = multiview_geometry.TriangulationConfig()
     subpixel: subpixel.SubpixelConfig = subpixel.SubpixelConfig()
-    min_points: int = 15  # points that a map needs
+    min_points: int = 15  # points that a model needs
     # Smallest and largest scale of the robust loss, pixels at REFERENCE_SIDE
     robust_range_px: tuple[float, float] = (0.15, 1.5)
     # So many observations tell as much as one with an error of its own, because what lens, shutter and scene do
@@ -231,18 +231,18 @@ class FinalAdjustmentConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=T
 
 
 @dataclass(frozen=True, eq=False)
-class FinalMap:
-    """A map after its last adjustment."""
+class FinalModel:
+    """A model after its last adjustment."""
 
-    map: PartialMap
+    model: SparseModel
     loss: bundle_adjustment.BundleAdjustmentConfig  # of that adjustment
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
 
 
 def run_final_adjustment(
-    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: FinalAdjustmentConfig
-) -> FinalMap | None:
-    """The map of the final tracks, adjusted until it has settled, or None when too few points are left.
+    problem: MapperInput, partial: SparseModel, images: Sequence[PatchImage], config: FinalAdjustmentConfig
+) -> FinalModel | None:
+    """The model of the final tracks, adjusted until it has settled, or None when too few points are left.
 
     `images`, one a view, give subpixel observations; where there are none, the features' positions are kept.
     """
@@ -263,13 +263,13 @@ def run_final_adjustment(
             for _ in range(_REFINED_ADJUSTMENTS):
                 partial = _fit_lens_priors(problem, _adjust_and_filter(problem, partial, config), config)
     loss, errors = _loss(problem, partial.estimate, config), _errors(problem, partial.estimate)
-    return FinalMap(partial, loss, float(np.sqrt(np.mean(errors**2))))
+    return FinalModel(partial, loss, float(np.sqrt(np.mean(errors**2))))
 
 
 def _adjust_final_tracks(
-    problem: MapperInput, partial: PartialMap, tolerance: float, config: FinalAdjustmentConfig
-) -> PartialMap:
-    """The map after an adjustment to the final tracks, its lenses held by what it found of them."""
+    problem: MapperInput, partial: SparseModel, tolerance: float, config: FinalAdjustmentConfig
+) -> SparseModel:
+    """The model after an adjustment to the final tracks, its lenses held by what it found of them."""
     loss = _loss(problem, partial.estimate, config)
     adjusted = adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
     return _fit_lens_priors(problem, adjusted, config)
@@ -292,8 +292,8 @@ def _longer_sides(problem: MapperInput) -> Array:
     return np.array(list(sides), np.float64)
 
 
-def _fit_lens_priors(problem: MapperInput, partial: PartialMap, config: FinalAdjustmentConfig) -> PartialMap:
-    """The map with priors under which distortion and displacement are as likely as they were found.
+def _fit_lens_priors(problem: MapperInput, partial: SparseModel, config: FinalAdjustmentConfig) -> SparseModel:
+    """The model with priors under which distortion and displacement are as likely as they were found.
 
     A prior as wide as what is found lets a parameter stay where observations tell it to within half of what it is;
     any other falls, adjustment by adjustment, to where `config` holds it (MacKay, "Bayesian interpolation", 1992).
@@ -314,8 +314,8 @@ def _find_distorting_lenses(problem: MapperInput, estimate: bundle_adjustment.Pr
     return np.abs(distortion(corners**2, estimate.radials) - 1.0) * corners * focals > LEAST_SHIFT
 
 
-def _free_second_radial(partial: PartialMap, lenses: Flags) -> PartialMap:
-    """The map with the second coefficient free of those of the `lenses` (G,) whose first one is."""
+def _free_second_radial(partial: SparseModel, lenses: Flags) -> SparseModel:
+    """The model with the second coefficient free of those of the `lenses` (G,) whose first one is."""
     sigmas = partial.prior.radial_sigmas.copy()
     sigmas[lenses & (sigmas[:, 0] > 0), 1] = _WIDEST_RADIAL
     return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
@@ -336,8 +336,8 @@ def _loss(
     )
 
 
-def _adjust_and_filter(problem: MapperInput, partial: PartialMap, config: FinalAdjustmentConfig) -> PartialMap:
-    """The map after a bundle adjustment, without observations with large errors and points with fewer than two."""
+def _adjust_and_filter(problem: MapperInput, partial: SparseModel, config: FinalAdjustmentConfig) -> SparseModel:
+    """The model after a bundle adjustment, without observations with large errors and points with fewer than two."""
     loss = _loss(problem, partial.estimate, config)
     estimate = bundle_adjustment.adjust(partial.estimate, partial.prior, loss, partial.registered[0])
     good = _errors(problem, estimate) < config.triangulation.max_error_px
@@ -365,8 +365,9 @@ _MAX_DOUBTED = 8  # views for which other focal lengths are tried at once
 _SAME_LENS = 0.01
 _DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
 _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
-# Of two maps, the median error of the matches of the better one over that of the other, from which on they explain them
-_AS_WELL, _NEARLY = 0.97, 0.9  # as well as each other, and nearly so
+# Of two models, the median error of the matches of the better one over that of the other, from which on they explain
+# them as well as each other, and nearly so
+_AS_WELL, _NEARLY = 0.97, 0.9
 # Difference of log focals from which on a lens is far from a typical one, and from what its pairs vote for
 _FAR_FROM_TYPICAL = 0.8
 _FAR_FROM_VOTE = 0.3
@@ -376,7 +377,7 @@ _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so tha
 
 
 class MapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The map of few views: attempts with several first pairs and focal lengths, of which the best is kept."""
+    """The model of few views: attempts with several first pairs and focal lengths, of which the best is kept."""
 
     incremental: IncrementalMapperConfig = IncrementalMapperConfig()
     finishing: FinalAdjustmentConfig = FinalAdjustmentConfig()
@@ -384,13 +385,13 @@ class MapperConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_final_tracks: int = 1500  # tracks of a view, in the last adjustment
     max_attempts: int = 6  # combinations of first pair and focal length that are tried
     score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
-    same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map
+    same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same model
     same_focal: float = 0.02  # largest difference of the log focals of two such attempts
     own_lenses: self_calibration.OwnLensesConfig = self_calibration.OwnLensesConfig()
 
 
 @dataclass(frozen=True, eq=False)
-class Map:
+class MapperResult:
     """Registered views and points. `estimate` has all views of the problem as cameras; only `views` are valid."""
 
     views: tuple[int, ...]  # the registered ones; the first is the camera that adjustments fixed
@@ -402,8 +403,8 @@ class Map:
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
     num_common: int  # lenses that views were taken to share: those from this number on are of single views
 
-    def relabel(self, number: Sequence[int]) -> Map:
-        """The same map with the views relabelled: new = number[old], a permutation."""
+    def relabel(self, number: Sequence[int]) -> MapperResult:
+        """The same model with the views relabelled: new = number[old], a permutation."""
         old, new = np.argsort(number), np.asarray(number)
         relabelled = replace(
             self.estimate,
@@ -425,23 +426,23 @@ class Map:
         )
 
 
-def build_map(
+def build_model(
     views: Sequence[MapperView],
     lenses: Sequence[Lens],
     pairs: Pairs,
     config: MapperConfig,
     images: Sequence[PatchImage] = (),
     run: RunContext = BACKGROUND,
-) -> Map | None:
-    """The best map of several attempts, or None when no two views can be registered.
+) -> MapperResult | None:
+    """The best model of several attempts, or None when no two views can be registered.
 
     `images`, one a view, make its observations exact to a tenth of a pixel. It pauses between attempts, which may
     raise to abandon the work.
     """
     problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
-    attempts: list[tuple[float, PartialMap]] = []
+    attempts: list[tuple[float, SparseModel]] = []
     for attempt in _attempt_maps(problem, config.max_attempts, config, run):
-        found_again = bool(attempts) and _is_same_map(max(attempts, key=_score)[1], attempt[1], config)
+        found_again = bool(attempts) and _is_same_model(max(attempts, key=_score)[1], attempt[1], config)
         attempts.append(attempt)
         if found_again and len(attempt[1].registered) == len(views):
             break
@@ -449,13 +450,13 @@ def build_map(
     if found is None:
         return None
     found = _try_other_hypotheses(problem, found, images, config, run)
-    return make_map(*found, config.incremental.triangulation.max_error_px, len(lenses))
+    return make_result(*found, config.incremental.triangulation.max_error_px, len(lenses))
 
 
 def _attempt_maps(
     problem: MapperInput, limit: int, config: MapperConfig, run: RunContext
-) -> Iterator[tuple[float, PartialMap]]:
-    """Maps of at most `limit` first pairs and focal lengths, the likeliest first, with their scores."""
+) -> Iterator[tuple[float, SparseModel]]:
+    """Models of at most `limit` first pairs and focal lengths, the likeliest first, with their scores."""
     for first, focals in _starts(problem.lenses, problem.pairs, limit):
         run.pause()
         partial = grow(problem, focals, first, config.incremental)
@@ -465,11 +466,11 @@ def _attempt_maps(
 
 def _finish_best(
     problem: MapperInput,
-    attempts: Sequence[tuple[float, PartialMap]],
+    attempts: Sequence[tuple[float, SparseModel]],
     images: Sequence[PatchImage],
     config: MapperConfig,
     run: RunContext,
-) -> tuple[MapperInput, FinalMap] | None:
+) -> tuple[MapperInput, FinalModel] | None:
     """The best attempt after its last adjustment, with own lenses for its views; None where nothing is left of it."""
     if not attempts:
         return None
@@ -480,17 +481,17 @@ def _finish_best(
 
 def _try_other_hypotheses(
     problem: MapperInput,
-    found: tuple[MapperInput, FinalMap],
+    found: tuple[MapperInput, FinalModel],
     images: Sequence[PatchImage],
     config: MapperConfig,
     run: RunContext,
-) -> tuple[MapperInput, FinalMap]:
+) -> tuple[MapperInput, FinalModel]:
     """Both as `problem` gives them from other focal lengths, where lenses came out far from these and it fits better.
 
     Images with slightly different lenses can pass for images through one lens that is much longer, which no small
     change of that lens shows. The other focal lengths are held until images have lenses of their own.
     """
-    for focals in _list_other_focals(problem, found[1].map.estimate.log_focals):
+    for focals in _list_other_focals(problem, found[1].model.estimate.log_focals):
         run.pause()
         held = [
             lens if focal is None else replace(lens, focals=(focal,), sigma=_HELD_SIGMA)
@@ -501,13 +502,13 @@ def _try_other_hypotheses(
         other = _finish_best(started, attempts, images, config, run)
         if other is None:
             continue
-        sigmas = other[1].map.prior.sigmas.copy()
+        sigmas = other[1].model.prior.sigmas.copy()
         sigmas[: len(held)] = [lens.sigma for lens in problem.lenses]
-        free = replace(other[1].map, prior=replace(other[1].map.prior, sigmas=sigmas))
+        free = replace(other[1].model, prior=replace(other[1].model.prior, sigmas=sigmas))
         finished = run_final_adjustment(other[0], free, images, config.finishing)
         if finished is None:
             continue
-        before, after = _score_of(found[0], found[1].map, config), _score_of(other[0], finished.map, config)
+        before, after = _score_of(found[0], found[1].model, config), _score_of(other[0], finished.model, config)
         if after * _AS_WELL > before:
             found = other[0], finished
     return found
@@ -530,21 +531,21 @@ def _list_other_focals(problem: MapperInput, log_focals: Array) -> list[list[flo
 
 def give_own_lenses(
     problem: MapperInput,
-    finished: FinalMap,
+    finished: FinalModel,
     images: Sequence[PatchImage],
     config: MapperConfig,
     run: RunContext = BACKGROUND,
-) -> tuple[MapperInput, FinalMap]:
+) -> tuple[MapperInput, FinalModel]:
     """Both, with lenses of their own for the views that refute the common one, or with pixels that are not square.
 
-    Each can pass for the other in part. Where another aspect alone explains much, the map is continued from it, too,
+    Each can pass for the other in part. Where another aspect alone explains much, the model is continued from it, too,
     and the one that explains the matches better is kept; as well with fewer lenses is better, too. Where it explains
     them nearly as well with fewer lenses, the aspect counts as unknown.
     """
     own = _separate_lenses(problem, finished, images, config, run)
-    stretched = self_calibration.free_aspects(finished.map, finished.loss, config.own_lenses)
+    stretched = self_calibration.free_aspects(finished.model, finished.loss, config.own_lenses)
     if stretched is None:
-        problem, stretched = own[0], self_calibration.free_aspects(own[1].map, own[1].loss, config.own_lenses)
+        problem, stretched = own[0], self_calibration.free_aspects(own[1].model, own[1].loss, config.own_lenses)
     if stretched is None:
         return own
     if len(stretched.registered) < len(problem.views):
@@ -559,22 +560,22 @@ def give_own_lenses(
 
 
 def _choose_aspect(
-    own: tuple[MapperInput, FinalMap], other: tuple[MapperInput, FinalMap], config: MapperConfig
-) -> tuple[MapperInput, FinalMap]:
-    """The one of two maps that explains the matches better; `other` was continued from pixels that are not square."""
-    if not self_calibration.is_stretched(other[1].map, config.own_lenses):
+    own: tuple[MapperInput, FinalModel], other: tuple[MapperInput, FinalModel], config: MapperConfig
+) -> tuple[MapperInput, FinalModel]:
+    """The one of two models that explains the matches better; `other` was continued from pixels that are not square."""
+    if not self_calibration.is_stretched(other[1].model, config.own_lenses):
         return own
-    before, after = (_median_error(problem, found.map) for problem, found in (own, other))
+    before, after = (_median_error(problem, found.model) for problem, found in (own, other))
     simpler = len(other[0].lenses) < len(own[0].lenses)  # an aspect that does what several lenses do is no chance
     if after < before / _AS_WELL if simpler else after < before * _AS_WELL:
         return other
     if simpler and after < before / _NEARLY:
-        prior = self_calibration.free_aspect_prior(own[1].map, config.own_lenses)
-        return own[0], replace(own[1], map=replace(own[1].map, prior=prior))
+        prior = self_calibration.free_aspect_prior(own[1].model, config.own_lenses)
+        return own[0], replace(own[1], model=replace(own[1].model, prior=prior))
     return own
 
 
-def _median_error(problem: MapperInput, partial: PartialMap) -> float:
+def _median_error(problem: MapperInput, partial: SparseModel) -> float:
     """The median Sampson error of all matches, pixels at REFERENCE_SIDE; infinite are those of missing views."""
     errors = mapping_problem.pair_errors(problem, partial)
     return float(
@@ -584,11 +585,11 @@ def _median_error(problem: MapperInput, partial: PartialMap) -> float:
 
 def _separate_lenses(
     problem: MapperInput,
-    finished: FinalMap,
+    finished: FinalModel,
     images: Sequence[PatchImage],
     config: MapperConfig,
     run: RunContext,
-) -> tuple[MapperInput, FinalMap]:
+) -> tuple[MapperInput, FinalModel]:
     """Both, with lenses of their own for the views that refute the common one.
 
     First for views that hardly fit and fit better with another focal length, then for those whose observations say so.
@@ -597,16 +598,16 @@ def _separate_lenses(
     for _ in range(_MAX_SPLITS):
         run.pause()
         before = finished
-        for search in searches if _find_doubtful_views(problem, finished.map, config) else ():
-            found = search(problem, finished.map, images, config)
+        for search in searches if _find_doubtful_views(problem, finished.model, config) else ():
+            found = search(problem, finished.model, images, config)
             if found is None:
                 continue
-            if _score_of(found[0], found[1].map, config) > _score_of(problem, finished.map, config):
+            if _score_of(found[0], found[1].model, config) > _score_of(problem, finished.model, config):
                 problem, finished = found
         searches = [_try_other_focals]
-        freed = self_calibration.free_lenses(problem, finished.map, finished.loss, config.own_lenses)
+        freed = self_calibration.free_lenses(problem, finished.model, finished.loss, config.own_lenses)
         if freed.refuting_views.any() or freed.displaced.any():
-            apart, partial = self_calibration.split_lenses(problem, finished.map, freed, config.own_lenses)
+            apart, partial = self_calibration.split_lenses(problem, finished.model, freed, config.own_lenses)
             again = run_final_adjustment(apart, partial, images, config.finishing)
             if again is not None:
                 problem, finished = apart, again
@@ -615,7 +616,7 @@ def _separate_lenses(
     return problem, finished
 
 
-def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> list[int]:
+def _find_doubtful_views(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> list[int]:
     """The views that are not registered, or whose matches hardly fit; those first that fit least."""
     ratios = mapping_problem.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
     of_view = {
@@ -626,8 +627,8 @@ def _find_doubtful_views(problem: MapperInput, partial: PartialMap, config: Mapp
 
 
 def _try_coarse_lenses(
-    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: MapperConfig
-) -> tuple[MapperInput, FinalMap] | None:
+    problem: MapperInput, partial: SparseModel, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalModel] | None:
     """Both, with own lenses as a coarse search finds them; None where it finds none."""
     scale = float(np.median(problem.scale))
     noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
@@ -636,12 +637,12 @@ def _try_coarse_lenses(
     if not (freed.refuting_views.any() or freed.displaced.any()):
         return None
     problem, partial = self_calibration.split_lenses(problem, partial, freed, config.own_lenses)
-    return _finish_map(problem, partial, images, config)
+    return _finish_model(problem, partial, images, config)
 
 
-def _finish_map(
-    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: MapperConfig
-) -> tuple[MapperInput, FinalMap] | None:
+def _finish_model(
+    problem: MapperInput, partial: SparseModel, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalModel] | None:
     partial = adjust_quickly(problem, partial, SETTLED_TOLERANCE, config.incremental)
     if len(partial.estimate.points) < config.incremental.min_points:
         return None
@@ -650,8 +651,8 @@ def _finish_map(
 
 
 def _try_other_focals(
-    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: MapperConfig
-) -> tuple[MapperInput, FinalMap] | None:
+    problem: MapperInput, partial: SparseModel, images: Sequence[PatchImage], config: MapperConfig
+) -> tuple[MapperInput, FinalModel] | None:
     """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits.
 
     None, too, where all of these lenses come out as the common one: then wrong matches are why the views hardly fit.
@@ -662,13 +663,13 @@ def _try_other_focals(
     common, registered = partial.estimate.lens_of_camera, partial.registered
     for view, lens in zoomed.items():
         problem, partial = self_calibration.add_lens(problem, partial, view, lens.focal, lens.shift)
-    found = _finish_map(problem, partial, images, config)
+    found = _finish_model(problem, partial, images, config)
     if found is None or all(v in registered and _is_same_lens(*found, v, int(common[v])) for v in zoomed):
         return None
     return found
 
 
-def _find_other_focals(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> dict[int, OwnLens]:
+def _find_other_focals(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> dict[int, OwnLens]:
     zoomed = {}
     for view in _find_doubtful_views(problem, partial, config)[:_MAX_DOUBTED]:
         # Points that the view helped to place where it does not belong must not speak for it.
@@ -685,26 +686,26 @@ def _find_other_focals(problem: MapperInput, partial: PartialMap, config: Mapper
     return zoomed
 
 
-def _is_same_lens(problem: MapperInput, finished: FinalMap, view: int, common: int) -> bool:
+def _is_same_lens(problem: MapperInput, finished: FinalModel, view: int, common: int) -> bool:
     """Whether a view's own lens has come out as the common one."""
-    estimate = finished.map.estimate
+    estimate = finished.model.estimate
     own = estimate.lens_of_camera[view]
     apart_px = float(np.linalg.norm(estimate.shifts[own] - estimate.shifts[common]))
     same_focal = abs(estimate.log_focals[own] - estimate.log_focals[common]) < _SAME_LENS
     return bool(
-        view in finished.map.registered and same_focal and apart_px < _SAME_LENS * problem.views[view].longer_side
+        view in finished.model.registered and same_focal and apart_px < _SAME_LENS * problem.views[view].longer_side
     )
 
 
-def _score_of(problem: MapperInput, partial: PartialMap, config: MapperConfig) -> float:
+def _score_of(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> float:
     return score(problem, partial, config.score_px)
 
 
-def _score(attempt: tuple[float, PartialMap]) -> float:
+def _score(attempt: tuple[float, SparseModel]) -> float:
     return attempt[0]
 
 
-def _is_same_map(one: PartialMap, other: PartialMap, config: MapperConfig) -> bool:
+def _is_same_model(one: SparseModel, other: SparseModel, config: MapperConfig) -> bool:
     """Whether two attempts registered the same views with the same poses and focal lengths."""
     if set(one.registered) != set(other.registered):
         return False
@@ -733,13 +734,13 @@ def _first_pairs(pairs: Pairs) -> list[Pair]:
     return sorted(pairs, key=lambda key: (-strength(key), key))
 
 
-def make_map(problem: MapperInput, finished: FinalMap, max_error_px: float, num_common: int) -> Map:
-    """The finished map with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
-    partial, estimate = finished.map, finished.map.estimate
+def make_result(problem: MapperInput, finished: FinalModel, max_error_px: float, num_common: int) -> MapperResult:
+    """The finished model with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
+    partial, estimate = finished.model, finished.model.estimate
     angles = multiview_geometry.largest_angles(
         bundle_adjustment.centres(estimate), estimate.points, estimate.camera_of, estimate.point_of
     )
-    return Map(
+    return MapperResult(
         views=partial.registered,
         estimate=estimate,
         prior=partial.prior,

@@ -1,4 +1,4 @@
-"""The mapping problem (views, lenses, verified pairs, tracks), and a partial map: a solution under way.
+"""The mapping problem (views, lenses, verified pairs, tracks), and the sparse model: a solution under way.
 
 A view enters it by resection.
 """
@@ -20,7 +20,7 @@ from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment, multiview_geometry
 from splatnode.recon.registration.multiview_geometry import Tracks
 
-# The mapping problem (views, lenses, verified pairs, tracks), and a partial map: a solution under way.
+# The mapping problem (views, lenses, verified pairs, tracks), and the sparse model: a solution under way.
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -52,7 +52,7 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class MapperInput:
-    """The input that all attempts at a map share: C views, G lenses, verified pairs and tracks."""
+    """The input that all attempts at a model share: C views, G lenses, verified pairs and tracks."""
 
     views: tuple[MapperView, ...]
     lenses: tuple[Lens, ...]
@@ -63,8 +63,8 @@ class MapperInput:
 
 
 @dataclass(frozen=True, eq=False)
-class PartialMap:
-    """A map under way. Its estimate has all C views of the problem as cameras; only the registered ones are valid."""
+class SparseModel:
+    """A model under way. Its estimate has all C views of the problem as cameras; only the registered ones are valid."""
 
     registered: tuple[int, ...]  # views; the first one is the camera that adjustments fix
     estimate: bundle_adjustment.Problem
@@ -87,11 +87,11 @@ def prepare(
     )
 
 
-def difference(one: PartialMap, other: PartialMap) -> tuple[float, float]:
-    """The largest rotation between the views that both maps have, degrees, and the largest change of a log focal.
+def difference(one: SparseModel, other: SparseModel) -> tuple[float, float]:
+    """The largest rotation between the views that both models have, degrees, and the largest change of a log focal.
 
-    Each map has a world frame of its own: the rotation from one frame to the other, as the first common view gives it,
-    is taken out.
+    Each model has a world frame of its own: the rotation from one frame to the other, as the first common view gives
+    it, is taken out.
     """
     common = sorted(set(one.registered) & set(other.registered))
     if not common:
@@ -102,14 +102,14 @@ def difference(one: PartialMap, other: PartialMap) -> tuple[float, float]:
     return rotation_deg, float(np.abs(one.estimate.log_focals - other.estimate.log_focals).max())
 
 
-# Resection (PnP): the pose of a view from a map's points and from its pairs with registered views.
+# Resection (PnP): the pose of a view from a model's points and from its pairs with registered views.
 #
 # Where structures repeat, the pose with most correspondences is not always the right one. Every neighbour proposes a
 # pose of its own, and the one with most inliers among ALL the evidence, points and pairs, is taken.
 
 Flags = npt.NDArray[np.bool_]
 
-# While a map grows, its points and poses are not exact yet: errors may be this many times `max_error_px` large.
+# While a model grows, its points and poses are not exact yet: errors may be this many times `max_error_px` large.
 _POINT_TOLERANCE = 3.0  # of reprojection errors
 _PAIR_TOLERANCE = 2.0  # of Sampson errors to registered views
 _SCALE_TOLERANCE = 4.0  # of points that fix the length of a translation, whose direction is not exact either
@@ -121,13 +121,13 @@ _FITTING = 0.9  # share of the points that fit, below which displaced principal 
 _SHIFTS = (0.07, 0.14)  # by which principal points are displaced then, shares of the longer side
 _DIRECTIONS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0), (0.7, 0.7), (0.7, -0.7), (-0.7, 0.7), (-0.7, -0.7))
 _NEAR_FACTORS = (1.0, 0.9, 1.1)  # focal lengths that are tried with them, over the best without
-_OWN_FOCAL_TOLERANCE = 1.5  # of reprojection errors then: the map is finished
+_OWN_FOCAL_TOLERANCE = 1.5  # of reprojection errors then: the model is finished
 _MORE_POINTS = 1.1  # times as many points must fit with another focal length
 _MIN_SCALE_RATIO = 0.4  # share of the points that may fix the length of a translation which must agree on it
 
 
 class ResectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Resection (PnP): the pose of a view from a map's points and from its pairs with registered views."""
+    """Resection (PnP): the pose of a view from a model's points and from its pairs with registered views."""
 
     max_error_px: float = 2.5  # largest error of an exact match, pixels at REFERENCE_SIDE
     min_points: int = 15  # 2D-3D inliers that a proposed pose needs
@@ -138,7 +138,7 @@ class ResectionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Resection:
-    """The pose of a view, world to camera, with its inliers among the map's points and all matches."""
+    """The pose of a view, world to camera, with its inliers among the model's points and all matches."""
 
     rotation: Array  # (3, 3)
     translation: Array  # (3,)
@@ -148,14 +148,14 @@ class Resection:
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """2D-3D correspondences: the map's points that a view observes."""
+    """2D-3D correspondences: the model's points that a view observes."""
 
     pixels: Array  # (M, 2) relative to the principal point, without distortion
     points: Array  # (M, 3) world
     tracks: Index  # (M,)
 
 
-def resect(problem: MapperInput, partial: PartialMap, view: int, config: ResectionConfig) -> Resection | None:
+def resect(problem: MapperInput, partial: SparseModel, view: int, config: ResectionConfig) -> Resection | None:
     """The proposed pose of `view` with most inliers, or None when no proposal has enough."""
     correspondences = _correspondences(partial, problem.growing_tracks, view)
     neighbours = {
@@ -185,8 +185,8 @@ class OwnLens:
     shift: Array  # (2,) of the principal point, pixels
 
 
-def find_own_lens(problem: MapperInput, partial: PartialMap, view: int, config: ResectionConfig) -> OwnLens | None:
-    """The lens with which most of the map's points fit a pose of `view`, where it is not the common one.
+def find_own_lens(problem: MapperInput, partial: SparseModel, view: int, config: ResectionConfig) -> OwnLens | None:
+    """The lens with which most of the model's points fit a pose of `view`, where it is not the common one.
 
     None where the common lens, which is tried first, fits nearly as many. Displaced principal points, as of crops and
     keystone corrections, are tried where other focal lengths alone leave many points that do not fit; one counts with
@@ -228,7 +228,7 @@ def _pair(view: int, other: int) -> Pair:
     return min(view, other), max(view, other)
 
 
-def _correspondences(partial: PartialMap, tracks: Tracks, view: int) -> Correspondences:
+def _correspondences(partial: SparseModel, tracks: Tracks, view: int) -> Correspondences:
     own = tracks.camera_of == view
     track_of, pixels = tracks.track_of[own], tracks.pixels[own]
     if len(partial.track_of_point) == 0:
@@ -249,7 +249,7 @@ def _straight(estimate: bundle_adjustment.Problem, view: int, pixels: Array) -> 
 
 def _proposals(
     problem: MapperInput,
-    partial: PartialMap,
+    partial: SparseModel,
     correspondences: Correspondences,
     view: int,
     neighbours: Mapping[int, TwoView],
@@ -305,7 +305,7 @@ def _pnp(
 
 
 def _estimate_by_neighbour(
-    partial: PartialMap,
+    partial: SparseModel,
     view: int,
     other: int,
     pair: TwoView,
@@ -356,10 +356,10 @@ def _length(turned: Array, direction: Array, rays: Array, limit: float, min_poin
     return float(possible[best]) if counts[best] >= max(min_points, _MIN_SCALE_RATIO * len(possible)) else None
 
 
-# Inlier ratios: the share of a pair's matches that agree with the poses of a map, used or not in making it.
+# Inlier ratios: the share of a pair's matches that agree with the poses of a model, used or not in making it.
 
 
-def pair_errors(problem: MapperInput, partial: PartialMap) -> dict[Pair, Array]:
+def pair_errors(problem: MapperInput, partial: SparseModel) -> dict[Pair, Array]:
     """Sampson errors of the matches of all pairs of registered views, pixels at REFERENCE_SIDE."""
     return {
         (i, j): multiview_geometry.sampson_errors(partial.estimate, (i, j), pair) / problem.scale[i]
@@ -368,7 +368,7 @@ def pair_errors(problem: MapperInput, partial: PartialMap) -> dict[Pair, Array]:
     }
 
 
-def inlier_ratios(problem: MapperInput, partial: PartialMap, max_error_px: float) -> dict[Pair, float]:
+def inlier_ratios(problem: MapperInput, partial: SparseModel, max_error_px: float) -> dict[Pair, float]:
     """The share of each pair's matches with Sampson errors below `max_error_px`, pixels at REFERENCE_SIDE."""
     return {pair: float((errors < max_error_px).mean()) for pair, errors in pair_errors(problem, partial).items()}
 

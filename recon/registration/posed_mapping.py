@@ -25,8 +25,9 @@ from splatnode.recon.registration import (
     self_calibration,
 )
 from splatnode.recon.registration.bundle_adjustment import differentiate_by_pose
+from splatnode.recon.registration.incremental_mapper import FinalModel, MapperConfig, MapperResult
 from splatnode.recon.registration.known_poses import Deviation, Drift, Given, GivenWorld, Offset, has_pose
-from splatnode.recon.registration.mapping_problem import MapperInput, PartialMap
+from splatnode.recon.registration.mapping_problem import MapperInput, SparseModel
 from splatnode.recon.registration.registration import (
     Registration,
     RegistrationConfig,
@@ -94,9 +95,9 @@ def offset_of(keyframes: Sequence[Keyframe], registration: Registration) -> Offs
     return Offset(offset(found.x), turn, size * shift)
 
 
-# The map of images whose poses are given: these start it and hold it, and the images still judge each of them.
+# The model of images whose poses are given: these start it and hold it, and the images still judge each of them.
 #
-# Where an image's matches fit another pose, or the adjusted map is farther from a given pose than both sigmas allow,
+# Where an image's matches fit another pose, or the adjusted model is farther from a given pose than both sigmas allow,
 # that pose is let go, the worst first; the images alone place its camera then, where they can.
 
 
@@ -122,14 +123,14 @@ _LEAST_OBSERVATIONS = 15  # of points that two others see, of a camera that imag
 TELLING_MATCHES, _CONSISTENT, _AGREEING = 40, 0.8, 0.3
 # Far from what is given, repeated structure (the other wing of a castle) is likelier than such an error of a pose
 _FAR_DEG, _TELLING_FAR = 15.0, 150
-_ROUNDS = 3  # of tests after a map was finished
+_ROUNDS = 3  # of tests after a model was finished
 
 
 @dataclass(frozen=True, eq=False)
 class PosedMap:
-    """A map in the frame of the given poses."""
+    """A model in the frame of the given poses."""
 
-    map: incremental_mapper.Map
+    model: MapperResult
     deviations: tuple[Deviation, ...]  # of views, the worst first; lengths in metres
 
 
@@ -204,18 +205,18 @@ def deviation(
     return turn, seen + problem.translations[camera], by_pose
 
 
-# The map.
+# The model.
 
 
-def build_map(
+def build_model(
     problem: MapperInput,
     focals: Sequence[float],
     given: Given,
     images: Sequence[PatchImage],
-    config: incremental_mapper.MapperConfig,
+    config: MapperConfig,
     run: RunContext = BACKGROUND,
 ) -> PosedMap | None:
-    """The map of all views with a given pose, and of the others that images place; None where too few poses hold.
+    """The model of all views with a given pose, and of the others that images place; None where too few poses hold.
 
     `focals` (one a lens) are in pixels.
     """
@@ -232,52 +233,52 @@ def build_map(
         return None
     if len(partial.estimate.points) >= config.incremental.min_points:
         partial = incremental_mapper.extend(problem, partial, config.incremental)
-    finished = _finish_map(problem, partial, images, config)
+    finished = _finish_model(problem, partial, images, config)
     for _ in range(_ROUNDS):
         run.pause()
         again = _test_poses(problem, finished, given, config, alike)
         if again is None:
             return None
-        if again is finished.map:
+        if again is finished.model:
             break
-        finished = _finish_map(problem, again, images, config)
+        finished = _finish_model(problem, again, images, config)
     finished = _remove_unseen_cameras(_weigh(problem, finished, alike))
     return PosedMap(
-        incremental_mapper.make_map(
+        incremental_mapper.make_result(
             problem, finished, config.incremental.triangulation.max_error_px, len(problem.lenses)
         ),
         _deviations(finished, given),
     )
 
 
-def _count_each(config: incremental_mapper.MapperConfig) -> incremental_mapper.MapperConfig:
+def _count_each(config: MapperConfig) -> MapperConfig:
     """The configuration under which each observation counts as one of its own."""
     return msgspec.structs.replace(config, finishing=msgspec.structs.replace(config.finishing, correlated=1.0))
 
 
-def _count_as_given(problem: MapperInput, partial: PartialMap) -> incremental_mapper.FinalMap:
-    """The map with the noise that observations have before errors are known."""
+def _count_as_given(problem: MapperInput, partial: SparseModel) -> FinalModel:
+    """The model with the noise that observations have before errors are known."""
     noise_px = _OWN_PX * float(np.median(problem.scale))
-    return incremental_mapper.FinalMap(partial, bundle_adjustment.BundleAdjustmentConfig(noise_px=noise_px), 0.0)
+    return FinalModel(partial, bundle_adjustment.BundleAdjustmentConfig(noise_px=noise_px), 0.0)
 
 
-def _weigh(problem: MapperInput, finished: incremental_mapper.FinalMap, alike: float) -> incremental_mapper.FinalMap:
-    """The map in which given poses and images count as they are unsure; the same points, by the same observations.
+def _weigh(problem: MapperInput, finished: FinalModel, alike: float) -> FinalModel:
+    """The model in which given poses and images count as they are unsure; the same points, by the same observations.
 
     The noise of `finished` is that of an observation; what is alike in many makes each `alike` times less sure.
     """
     scale = float(np.median(problem.scale))
     noise_px = alike * max(finished.loss.noise_px, _LEAST_PX * scale)
     loss = bundle_adjustment.BundleAdjustmentConfig(robust_px=_WIDE_PX * scale, noise_px=noise_px)
-    partial = finished.map
+    partial = finished.model
     if len(partial.estimate.points):
         estimate = bundle_adjustment.adjust(partial.estimate, partial.prior, loss, partial.registered[0])
         partial = replace(partial, estimate=estimate)
-    return replace(finished, map=partial, loss=loss)
+    return replace(finished, model=partial, loss=loss)
 
 
-def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> PartialMap:
-    """The map of the given poses alone, without points."""
+def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> SparseModel:
+    """The model of the given poses alone, without points."""
     poses, log_focals = given.poses, np.log(focals)
     estimate = bundle_adjustment.make_empty_problem(
         rotations=poses.rotations.copy(),
@@ -289,12 +290,10 @@ def _start(problem: MapperInput, focals: Sequence[float], given: Given) -> Parti
     )
     prior = bundle_adjustment.focal_prior(log_focals, np.array([lens.sigma for lens in problem.lenses]))
     known = tuple(np.flatnonzero(poses.is_held).tolist())
-    return PartialMap(known, replace(estimate, given=poses), prior, np.zeros(0, np.int64))
+    return SparseModel(known, replace(estimate, given=poses), prior, np.zeros(0, np.int64))
 
 
-def _first_tolerance(
-    problem: MapperInput, focals: Sequence[float], given: Given, config: incremental_mapper.MapperConfig
-) -> float:
+def _first_tolerance(problem: MapperInput, focals: Sequence[float], given: Given, config: MapperConfig) -> float:
     """Returns how far the poses' sigmas move points in the worst view, as a multiple of the largest error."""
     known = np.flatnonzero(given.poses.is_held)
     lenses = [problem.views[i].lens for i in known]
@@ -307,9 +306,9 @@ def _first_tolerance(
 
 
 def _adjust_until_settled(
-    problem: MapperInput, partial: PartialMap, tolerance: float, config: incremental_mapper.MapperConfig
-) -> PartialMap:
-    """The map with points, adjusted while observations may have smaller and smaller errors."""
+    problem: MapperInput, partial: SparseModel, tolerance: float, config: MapperConfig
+) -> SparseModel:
+    """The model with points, adjusted while observations may have smaller and smaller errors."""
     scale = float(np.median(problem.scale))
     while True:
         robust_px = max(config.incremental.robust_px, tolerance / incremental_mapper.SETTLED_TOLERANCE) * scale
@@ -321,14 +320,14 @@ def _adjust_until_settled(
         tolerance = max(tolerance / 3.0, incremental_mapper.SETTLED_TOLERANCE)
 
 
-def _find_held_views(partial: PartialMap) -> list[int]:
+def _find_held_views(partial: SparseModel) -> list[int]:
     """The views whose given pose holds them."""
     given = partial.estimate.given
     return [] if given is None else [view for view in partial.registered if given.is_held[view]]
 
 
-def _release_poses(partial: PartialMap, views: Sequence[int]) -> PartialMap:
-    """The map in which the given poses of these hold nothing."""
+def _release_poses(partial: SparseModel, views: Sequence[int]) -> SparseModel:
+    """The model in which the given poses of these hold nothing."""
     given = partial.estimate.given
     if given is None:
         raise AssertionError("given poses hold the map")
@@ -336,14 +335,14 @@ def _release_poses(partial: PartialMap, views: Sequence[int]) -> PartialMap:
 
 
 def _release_single(
-    problem: MapperInput, partial: PartialMap, given: Given, config: incremental_mapper.MapperConfig, alike: float
-) -> PartialMap:
-    """The map without the one pose that explains by itself all that is contradicted; without all that may be it.
+    problem: MapperInput, partial: SparseModel, given: Given, config: MapperConfig, alike: float
+) -> SparseModel:
+    """The model without the one pose that explains by itself all that is contradicted; without all that may be it.
 
     As it is where nothing is contradicted, or no single pose explains it.
     """
     doubted, _ = _find_contradictions(problem, partial, given, config, alike)
-    explained: dict[int, tuple[PartialMap, float]] = {}
+    explained: dict[int, tuple[SparseModel, float]] = {}
     for view in sorted(doubted):
         freed = _free(problem, partial, view, config)
         left, squared = _find_contradictions(problem, freed, given, config, alike)
@@ -361,7 +360,7 @@ def _release_single(
 
 
 def _find_contradictions(
-    problem: MapperInput, partial: PartialMap, given: Given, config: incremental_mapper.MapperConfig, alike: float
+    problem: MapperInput, partial: SparseModel, given: Given, config: MapperConfig, alike: float
 ) -> tuple[set[int], float]:
     """The held views that a pair or all images together contradict; the square of the largest residual, in sigmas."""
     refuted = {view for pair, said in _pairs_say(problem, partial, config).items() if said < 0 for view in pair}
@@ -374,8 +373,8 @@ def _find_contradictions(
     return refuted | beyond, max((residual.squared for residual in found.values()), default=0.0)
 
 
-def _free(problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig) -> PartialMap:
-    """The map in which images alone place `view`; without it where they cannot."""
+def _free(problem: MapperInput, partial: SparseModel, view: int, config: MapperConfig) -> SparseModel:
+    """The model in which images alone place `view`; without it where they cannot."""
     rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
     rest = _adjust_until_settled(problem, _release_poses(rest, [view]), incremental_mapper.SETTLED_TOLERANCE, config)
     if len(rest.estimate.points) < config.incremental.min_points:
@@ -388,14 +387,14 @@ def _free(problem: MapperInput, partial: PartialMap, view: int, config: incremen
     return _adjust_until_settled(problem, freed, 2.0 * incremental_mapper.SETTLED_TOLERANCE, config)
 
 
-def _may_release(partial: PartialMap, views: Sequence[int]) -> bool:
+def _may_release(partial: SparseModel, views: Sequence[int]) -> bool:
     """Whether most poses, and enough, hold their cameras without these."""
     num_held = len(_find_held_views(partial))
     return num_held - len(views) >= max(_LEAST_HELD, num_held // 2 + 1)
 
 
-def _let_go(problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig) -> PartialMap:
-    """The map without the poses of views whose matches hardly fit, and fit another pose much better."""
+def _let_go(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> SparseModel:
+    """The model without the poses of views whose matches hardly fit, and fit another pose much better."""
     tried: set[int] = set()
     while len(_find_held_views(partial)) > _LEAST_HELD:
         doubted = [view for view in _find_doubtful_views(problem, partial, config) if view not in tried]
@@ -411,9 +410,7 @@ def _let_go(problem: MapperInput, partial: PartialMap, config: incremental_mappe
     return partial
 
 
-def _find_doubtful_views(
-    problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
-) -> list[int]:
+def _find_doubtful_views(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> list[int]:
     """The views that a given pose holds and few of whose matches fit; those first that fit least."""
     ratios = mapping_problem.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
     of_view = {
@@ -426,9 +423,9 @@ def _find_doubtful_views(
 
 
 def _place_by_matches(
-    problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig
-) -> PartialMap | None:
-    """The map with `view` where its matches place it; None where no more of them fit then."""
+    problem: MapperInput, partial: SparseModel, view: int, config: MapperConfig
+) -> SparseModel | None:
+    """The model with `view` where its matches place it; None where no more of them fit then."""
     freed = _free(problem, partial, view, config)
     if view not in freed.registered:
         return None
@@ -437,9 +434,9 @@ def _place_by_matches(
 
 
 def _place_refuted_view(
-    problem: MapperInput, partial: PartialMap, view: int, config: incremental_mapper.MapperConfig
-) -> PartialMap | None:
-    """The map with `view` where one pair places it, where its pairs with views that others confirm refute its pose.
+    problem: MapperInput, partial: SparseModel, view: int, config: MapperConfig
+) -> SparseModel | None:
+    """The model with `view` where one pair places it, where its pairs with views that others confirm refute its pose.
 
     For views of which too little is seen by two others: nothing but the pair tells how far away they are.
     """
@@ -454,10 +451,8 @@ def _place_refuted_view(
     return replace(_place_by_pair(problem, rest, view, best, config), registered=partial.registered)
 
 
-def _release_undecided_pairs(
-    problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
-) -> PartialMap:
-    """The map without both views of a pair that refutes one of their poses, where nothing tells which.
+def _release_undecided_pairs(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> SparseModel:
+    """The model without both views of a pair that refutes one of their poses, where nothing tells which.
 
     As it is where most of the poses would be gone with them.
     """
@@ -479,9 +474,7 @@ def _release_undecided_pairs(
     return _adjust_until_settled(problem, moved, incremental_mapper.SETTLED_TOLERANCE, config)
 
 
-def _pairs_say(
-    problem: MapperInput, partial: PartialMap, config: incremental_mapper.MapperConfig
-) -> dict[tuple[int, int], int]:
+def _pairs_say(problem: MapperInput, partial: SparseModel, config: MapperConfig) -> dict[tuple[int, int], int]:
     """Judges pairs of held views: 1 where the matches agree with the poses, -1 where with others, else 0."""
     held, found = set(_find_held_views(partial)), {}
     limit = config.incremental.triangulation.max_error_px
@@ -510,7 +503,7 @@ def contradicts_poses(num_matches: int, num_fit: int, apart_deg: float) -> bool:
 
 
 def _relative(
-    problem: MapperInput, partial: PartialMap, pair: tuple[int, int], config: incremental_mapper.MapperConfig
+    problem: MapperInput, partial: SparseModel, pair: tuple[int, int], config: MapperConfig
 ) -> tuple[Array, Array, int]:
     """The pose of the second view of `pair` in the first one, and how many matches agree, by these alone."""
     i, j = pair
@@ -520,9 +513,9 @@ def _relative(
 
 
 def _place_by_pair(
-    problem: MapperInput, partial: PartialMap, view: int, pair: tuple[int, int], config: incremental_mapper.MapperConfig
-) -> PartialMap:
-    """The map with `view` where the matches of `pair` alone place it, as far from the other view as it was."""
+    problem: MapperInput, partial: SparseModel, view: int, pair: tuple[int, int], config: MapperConfig
+) -> SparseModel:
+    """The model with `view` where the matches of `pair` alone place it, as far from the other view as it was."""
     estimate, (first, second) = partial.estimate, pair
     rotation, direction, _ = _relative(problem, partial, pair, config)
     centres = bundle_adjustment.centres(estimate)
@@ -536,23 +529,23 @@ def _place_by_pair(
     return replace(partial, estimate=bundle_adjustment.replace_pose(estimate, view, turned, shifted))
 
 
-def _observations(partial: PartialMap) -> npt.NDArray[np.int64]:
+def _observations(partial: SparseModel) -> npt.NDArray[np.int64]:
     """(C,) how many points each camera observes."""
     return np.bincount(partial.estimate.camera_of, minlength=len(partial.estimate.rotations))
 
 
 def _test_poses(
     problem: MapperInput,
-    finished: incremental_mapper.FinalMap,
+    finished: FinalModel,
     given: Given,
-    config: incremental_mapper.MapperConfig,
+    config: MapperConfig,
     alike: float,
-) -> PartialMap | None:
-    """The map without the given poses that it contradicts; None: too few hold. The map of `finished` if all hold.
+) -> SparseModel | None:
+    """The model without the given poses that it contradicts; None: too few hold. The model of `finished` if all hold.
 
     `alike`: see `_weigh`.
     """
-    partial = finished.map
+    partial = finished.model
     while len(partial.estimate.points):
         weighed = _weigh(problem, finished, alike)
         held, found = set(_find_held_views(partial)), _residuals(weighed, given)
@@ -577,21 +570,21 @@ def _find_contradicted(found: Mapping[int, Residual]) -> list[int]:
     return [view for view in beyond if found[beyond[0]].squared - found[view].squared < _DECIDED]
 
 
-def _most_hold(partial: PartialMap, given: Given) -> bool:
+def _most_hold(partial: SparseModel, given: Given) -> bool:
     return 2 * len(_find_held_views(partial)) > int(given.poses.is_held.sum())
 
 
-def _residuals(finished: incremental_mapper.FinalMap, given: Given) -> dict[int, Residual]:
-    """The residuals of the poses in a map in which these and images are weighed."""
-    partial = finished.map
+def _residuals(finished: FinalModel, given: Given) -> dict[int, Residual]:
+    """The residuals of the poses in a model in which these and images are weighed."""
+    partial = finished.model
     covariance = bundle_adjustment.covariance(partial.estimate, partial.prior, finished.loss, -1)
     return residuals(partial.estimate, given.poses, covariance)
 
 
-def _finish_map(
-    problem: MapperInput, partial: PartialMap, images: Sequence[PatchImage], config: incremental_mapper.MapperConfig
-) -> incremental_mapper.FinalMap:
-    """The map after its last adjustment; as it is where there are too few points for one."""
+def _finish_model(
+    problem: MapperInput, partial: SparseModel, images: Sequence[PatchImage], config: MapperConfig
+) -> FinalModel:
+    """The model after its last adjustment; as it is where there are too few points for one."""
     finished = (
         incremental_mapper.run_final_adjustment(problem, partial, images, config.finishing)
         if len(partial.estimate.points)
@@ -604,9 +597,9 @@ def _finish_map(
     return replace(_count_as_given(problem, partial), rms_px=rms_px)
 
 
-def _remove_unseen_cameras(finished: incremental_mapper.FinalMap) -> incremental_mapper.FinalMap:
-    """The map without cameras that nothing holds: neither a given pose nor enough observations."""
-    partial, held = finished.map, set(_find_held_views(finished.map))
+def _remove_unseen_cameras(finished: FinalModel) -> FinalModel:
+    """The model without cameras that nothing holds: neither a given pose nor enough observations."""
+    partial, held = finished.model, set(_find_held_views(finished.model))
     estimate = partial.estimate
     seen_by = np.bincount(estimate.point_of, minlength=len(estimate.points))
     by_three = estimate.camera_of[seen_by[estimate.point_of] >= 3]
@@ -616,17 +609,17 @@ def _remove_unseen_cameras(finished: incremental_mapper.FinalMap) -> incremental
         return finished
     rest = bundle_adjustment.keep_observations(estimate, np.isin(estimate.camera_of, kept))
     rest = bundle_adjustment.adjust(rest, partial.prior, finished.loss) if len(rest.points) else rest
-    return replace(finished, map=replace(partial, registered=kept, estimate=rest))
+    return replace(finished, model=replace(partial, registered=kept, estimate=rest))
 
 
-def _deviations(finished: incremental_mapper.FinalMap, given: Given) -> tuple[Deviation, ...]:
+def _deviations(finished: FinalModel, given: Given) -> tuple[Deviation, ...]:
     """Lists the given poses that do not hold their cameras."""
-    held, found = set(_find_held_views(finished.map)), []
-    residuals = _residuals(finished, given) if len(finished.map.estimate.points) else {}
+    held, found = set(_find_held_views(finished.model)), []
+    residuals = _residuals(finished, given) if len(finished.model.estimate.points) else {}
     for view in np.flatnonzero(given.poses.is_held).tolist():
         if view in held:
             continue
-        turn, shift, _ = deviation(finished.map.estimate, given.poses, view)
+        turn, shift, _ = deviation(finished.model.estimate, given.poses, view)
         sigmas = residuals[view].sigmas if view in residuals else math.nan
         metres = given.metres * float(np.linalg.norm(shift))
         found.append(Deviation(view, metres, float(np.degrees(np.linalg.norm(turn))), sigmas))
@@ -647,7 +640,7 @@ def register_posed(
 ) -> Registration | None:
     """The cameras of the keyframes whose pose is given and true, and of those that images place beside them.
 
-    None where given poses cannot hold a map: fewer than two have a pose and a lens that are told, or the images
+    None where given poses cannot hold a model: fewer than two have a pose and a lens that are told, or the images
     contradict as many of them as they confirm. `offset` is taken out of all poses. `pairs` and `run`: see `register`.
     """
     order = sort_by_content(keyframes)
@@ -670,11 +663,11 @@ def register_posed(
         settings.max_final_tracks,
     )
     focals, images = [lens.focals[0] for lens in known], patch_images(ordered, grouping, config)
-    built = build_map(problem, focals, given, images, settings, run)
+    built = build_model(problem, focals, given, images, settings, run)
     if built is None:
         return None
-    moved = replace(built, map=built.map.relabel(order))
-    found = make_registration(moved.map, keyframes, [grouping.scales[i] for i in rank], config)
+    moved = replace(built, model=built.model.relabel(order))
+    found = make_registration(moved.model, keyframes, [grouping.scales[i] for i in rank], config)
     return replace(found, given=_world(moved, found, given, order, offset))
 
 
@@ -685,11 +678,11 @@ def _world(
 
     View i of `built.deviations` is keyframe `order[i]`.
     """
-    estimate, views = built.map.estimate, [camera.index for camera in found.cameras]
+    estimate, views = built.model.estimate, [camera.index for camera in found.cameras]
     first, unit = views[0], _unit(built, found)
     to_first, from_first = estimate.rotations[first], estimate.translations[first]
     held = [] if estimate.given is None else [view for view in views if estimate.given.is_held[view]]
-    covariance = bundle_adjustment.covariance(estimate, built.map.prior, built.map.loss, -1)
+    covariance = bundle_adjustment.covariance(estimate, built.model.prior, built.model.loss, -1)
     turns, moves = differentiate_by_pose(estimate.rotations[views], estimate.translations[views])
     rows = (6 * np.array(views)[:, None] + np.arange(6)).ravel()
     joint = covariance.joint[np.ix_(rows, rows)]
@@ -748,4 +741,4 @@ def compute_scale_sigma(given: bundle_adjustment.GivenPoses) -> float:
 
 def _unit(built: PosedMap, found: Registration) -> float:
     """A length in `found` over the same in `built`: the registration scaled it."""
-    return 1.0 / known_poses.distance(built.map.estimate, [camera.index for camera in found.cameras])
+    return 1.0 / known_poses.distance(built.model.estimate, [camera.index for camera in found.cameras])

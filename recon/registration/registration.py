@@ -38,7 +38,7 @@ from splatnode.recon.registration import (
     self_calibration,
 )
 from splatnode.recon.registration.known_poses import GivenWorld
-from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, PartialMap
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, SparseModel
 from splatnode.recon.registration.self_calibration import LEAST_SHIFT, Grouping
 from splatnode.recon.registration.subpixel import PatchImage, patch_image
 from splatnode.recon.threads import BACKGROUND, RunContext
@@ -67,7 +67,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 _DISPLACED = 0.0045  # of the longer side: a wider prior of a principal point was widened by what was found
-_MIN_DEPTH = 1e-9  # median depth of the points, in the map's unit of length, in place of 0
+_MIN_DEPTH = 1e-9  # median depth of the points, in the model's unit of length, in place of 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,32 +195,32 @@ def _build(
     pairs: Mapping[tuple[int, int], TwoView],
     config: RegistrationConfig,
     run: RunContext,
-) -> tuple[incremental_mapper.Map, Grouping] | None:
-    """The map, in the pixels of its lenses, and their grouping: one lens for all sizes unless the map disagrees."""
+) -> tuple[incremental_mapper.MapperResult, Grouping] | None:
+    """The model, in the pixels of its lenses, and their grouping: one lens for all sizes unless the model disagrees."""
     together, apart = (self_calibration.group(keyframes, across_sizes) for across_sizes in (True, False))
-    built = _map(keyframes, pairs, together, config, run)
+    built = _build_model(keyframes, pairs, together, config, run)
     if built is None or together == apart:
         return None if built is None else (built, together)
     if not self_calibration.sizes_disagree(
         built.estimate, built.prior, built.loss, built.views[0], together, config.lenses
     ):
         return built, together
-    built = _map(keyframes, pairs, apart, config, run)
+    built = _build_model(keyframes, pairs, apart, config, run)
     return None if built is None else (built, apart)
 
 
-def _map(
+def _build_model(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
     grouping: Grouping,
     config: RegistrationConfig,
     run: RunContext,
-) -> incremental_mapper.Map | None:
-    """The map of keyframes with the lenses of `grouping`, in the pixels of these."""
+) -> incremental_mapper.MapperResult | None:
+    """The model of keyframes with the lenses of `grouping`, in the pixels of these."""
     images = patch_images(keyframes, grouping, config)
     known = self_calibration.candidates(keyframes, grouping, pairs, config.lenses)
     views, scaled = make_views(keyframes, grouping), convert_to_lens_pixels(pairs, grouping)
-    return incremental_mapper.build_map(views, known, scaled, config.mapper, images, run)
+    return incremental_mapper.build_model(views, known, scaled, config.mapper, images, run)
 
 
 def patch_images(keyframes: Sequence[Keyframe], grouping: Grouping, config: RegistrationConfig) -> list[PatchImage]:
@@ -252,11 +252,14 @@ def convert_to_lens_pixels(
 
 
 def make_registration(
-    found: incremental_mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float], config: RegistrationConfig
+    found: incremental_mapper.MapperResult,
+    keyframes: Sequence[Keyframe],
+    scales: Sequence[float],
+    config: RegistrationConfig,
 ) -> Registration:
-    """The map in the frame of the first registered keyframe, scaled to a median point depth of 1.
+    """The model in the frame of the first registered keyframe, scaled to a median point depth of 1.
 
-    `scales` are those of the keyframes: pixels of their lens, which the map is in, over their own pixels.
+    `scales` are those of the keyframes: pixels of their lens, which the model is in, over their own pixels.
     """
     estimate = found.estimate
     order = sorted(found.views)
@@ -309,7 +312,7 @@ def make_registration(
 
 # Continuation: further keyframes registered beside known cameras, quickly, until all can be registered anew.
 #
-# The known cameras start the map; new views are resected from the points that they share with them, and everything is
+# The known cameras start the model; new views are resected from the points that they share with them, and everything is
 # adjusted. No other first pair or focal length is tried and no patches are aligned, so that errors of the start
 # remain.
 
@@ -343,7 +346,7 @@ def extend_registration(
     if finished is None:
         return None
     problem, finished = incremental_mapper.give_own_lenses(problem, finished, (), config.mapper)
-    found = incremental_mapper.make_map(problem, finished, settings.triangulation.max_error_px, len(known))
+    found = incremental_mapper.make_result(problem, finished, settings.triangulation.max_error_px, len(known))
     return make_registration(found, keyframes, grouping.scales, config)
 
 
@@ -362,8 +365,8 @@ def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) 
 
 def _make_camera_map(
     keyframes: Sequence[Keyframe], grouping: Grouping, known: Sequence[Lens], start: Sequence[RegisteredCamera]
-) -> PartialMap:
-    """A map of the known cameras without points, in the pixels of their lenses; only focal lengths are free."""
+) -> SparseModel:
+    """A model of the known cameras without points, in the pixels of their lenses; only focal lengths are free."""
     count, num_lenses = len(keyframes), len(known)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     log_focals, radials, shifts = np.zeros(num_lenses), np.zeros((num_lenses, 2)), np.zeros((num_lenses, 2))
@@ -381,16 +384,16 @@ def _make_camera_map(
         rotations, translations, np.array(grouping.lens_of), log_focals, radials, shifts
     )
     prior = bundle_adjustment.focal_prior(log_focals, np.array([lens.sigma for lens in known]))
-    return PartialMap(tuple(camera.index for camera in start), estimate, prior, np.zeros(0, np.int64))
+    return SparseModel(tuple(camera.index for camera in start), estimate, prior, np.zeros(0, np.int64))
 
 
 def _add_own_lenses(
     problem: MapperInput,
-    first: PartialMap,
+    first: SparseModel,
     keyframes: Sequence[Keyframe],
     grouping: Grouping,
     start: Sequence[RegisteredCamera],
-) -> tuple[MapperInput, PartialMap]:
+) -> tuple[MapperInput, SparseModel]:
     """Both, with lenses of their own for the known cameras that have one."""
     registered = first.registered
     for camera in start:

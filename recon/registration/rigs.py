@@ -22,7 +22,7 @@ from splatnode.recon.geometry import cross_matrix
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment, known_poses
 from splatnode.recon.registration.bundle_adjustment import RigConstraint
-from splatnode.recon.registration.incremental_mapper import Map
+from splatnode.recon.registration.incremental_mapper import MapperResult
 
 # How the cameras of frame sets stand to each other: single measurements, one a set, and where they change.
 #
@@ -215,7 +215,7 @@ class GivenMounts:
     is_inverse: bool = False  # the images fit the inverses of all given poses
 
     def hold(self, camera: str) -> tuple[Array, Array, tuple[float, float]]:
-        """Rotation, centre and sigmas by which the adjustment holds a mount, in the unit of the map."""
+        """Rotation, centre and sigmas by which the adjustment holds a mount, in the unit of the model."""
         if self.metres_per_unit is None or camera not in self.believed:
             return np.eye(3), np.zeros(3), (np.inf, np.inf)
         rotation, centre, covariance = self.believed[camera]
@@ -223,7 +223,7 @@ class GivenMounts:
         return rotation.T, centre / self.metres_per_unit, (turn, shift / self.metres_per_unit)
 
     def fit_scale(self, mount_poses: MountPoses) -> tuple[float | None, float]:
-        """Metres a unit of the map, and the standard deviation of its logarithm."""
+        """Metres a unit of the model, and the standard deviation of its logarithm."""
         chosen = {camera: mount_poses[camera] for camera in self.believed if camera in mount_poses}
         fitted = _fit(chosen, self.believed, list(chosen)) if self.metres_per_unit is not None and chosen else None
         return (None, np.inf) if fitted is None else fitted[:2]
@@ -488,11 +488,11 @@ def form_sets(keyframes: Sequence[Keyframe], tolerance_s: float) -> tuple[FrameS
 
 
 def adjust_with_rig(
-    found: Map, keyframes: Sequence[Keyframe], rig: Rig | None, tolerance_s: float
-) -> tuple[Map, RigEstimate] | None:
-    """The map whose cameras stand on their rig, and what it tells; None where no two cameras have frame sets.
+    found: MapperResult, keyframes: Sequence[Keyframe], rig: Rig | None, tolerance_s: float
+) -> tuple[MapperResult, RigEstimate] | None:
+    """The model whose cameras stand on their rig, and what it tells; None where no two cameras have frame sets.
 
-    Its views are `keyframes`. A view that only the rig places is no view of the map; its pose is in the estimate.
+    Its views are `keyframes`. A view that only the rig places is no view of the model; its pose is in the estimate.
     """
     frame_sets = form_sets(keyframes, tolerance_s)
     number = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
@@ -521,7 +521,7 @@ def adjust_with_rig(
     return (adjusted, rig_estimate) if rig_estimate.is_finite else None
 
 
-def _measure(found: Map, sets: _Sets, joint: Array, distance: float) -> dict[tuple[str, str], RelativePoses]:
+def _measure(found: MapperResult, sets: _Sets, joint: Array, distance: float) -> dict[tuple[str, str], RelativePoses]:
     """The relative poses of each ordered pair of cameras that are on one rig.
 
     They are as unsure as they scatter, and no surer than rigs are stiff.
@@ -614,7 +614,7 @@ def _constrain(
 
 
 def _describe(
-    adjusted: Map,
+    adjusted: MapperResult,
     sets: _Sets,
     labels: list[tuple[str, tuple[int, ...]]],
     measured: dict[tuple[str, str], RelativePoses],
@@ -646,7 +646,7 @@ def _describe(
     return RigEstimate(tuple(mounts), sets.frame_sets, changes, given.refuted, *again, placed, *contradiction)
 
 
-def _mount_covariances(adjusted: Map) -> Array:
+def _mount_covariances(adjusted: MapperResult) -> Array:
     """(M, 6, 6) of the mounts' turns in the rig's axes and centres, after the best scale of the cameras' centres."""
     problem, views = adjusted.estimate, list(adjusted.views)
     found = bundle_adjustment.covariance(problem, adjusted.prior, adjusted.loss, adjusted.views[0])

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from splatnode.recon.keyframes import Keyframe, longer_side
 from splatnode.recon.matching.pair_matching import TwoView
 from splatnode.recon.registration import bundle_adjustment, multiview_geometry
-from splatnode.recon.registration.mapping_problem import Lens, MapperInput, PartialMap
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, SparseModel
 
 # Focal length before anything is reconstructed: a vote of the pairs of frames.
 
@@ -30,7 +30,7 @@ _TYPICAL_SIGMA = 0.35  # of log focal around it
 _TYPICAL_WEIGHT = 30.0  # matches that it counts as much as: a pair has hundreds
 
 _VOTE_SIGMA = 0.06  # of log focal: the spread of the estimates of single pairs
-_MIN_DISTANCE = 0.15  # between two candidates, of log focal: nearer ones lead to the same map
+_MIN_DISTANCE = 0.15  # between two candidates, of log focal: nearer ones lead to the same model
 
 
 def vote(pairs: Sequence[TwoView], num_candidates: int) -> tuple[float, ...]:
@@ -237,8 +237,8 @@ class OwnLensesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class PerViewLensMap:
-    """A map in which each view has a lens of its own, near the common one of its group."""
+class PerViewLensModel:
+    """A model in which each view has a lens of its own, near the common one of its group."""
 
     estimate: bundle_adjustment.Problem  # with C lenses, one a view
     prior: bundle_adjustment.LensPrior  # of these
@@ -255,15 +255,15 @@ class PerViewLensMap:
 
 def free_lenses(
     problem: MapperInput,
-    partial: PartialMap,
+    partial: SparseModel,
     loss: bundle_adjustment.BundleAdjustmentConfig,
     config: OwnLensesConfig,
     coarse: multiview_geometry.TriangulationConfig | None = None,
-) -> PerViewLensMap:
-    """The map adjusted with a lens for each view, and which views refute that theirs is common.
+) -> PerViewLensModel:
+    """The model adjusted with a lens for each view, and which views refute that theirs is common.
 
     `loss` has the noise of an observation, by which deviations are weighed. With `coarse` points are triangulated anew
-    before each adjustment, with large errors allowed: a map that a wrong common lens has bent lacks those that tell.
+    before each adjustment, with large errors allowed: a model that a wrong common lens has bent lacks those that tell.
     """
     sides = np.array([view.longer_side for view in problem.views], np.float64)
     groups, registered = partial.estimate.lens_of_camera, np.zeros(len(problem.views), bool)
@@ -301,7 +301,7 @@ def free_lenses(
     stays = (sizes > floors) & (own > 0) & registered[:, None]
     widths = _widths(stays, sizes / kept, groups, registered, partial.prior.sigmas == 0)
     displaced = (common > _MORE * least)[:, 3:].any(1)
-    return PerViewLensMap(
+    return PerViewLensModel(
         estimate, prior, stays | (widths > 0), widths, middles, displaced & shared[groups] & registered
     )
 
@@ -317,9 +317,9 @@ def _widths(stays: Flags, sizes: Array, groups: Index, registered: Flags, calibr
 
 
 def split_lenses(
-    problem: MapperInput, partial: PartialMap, freed: PerViewLensMap, config: OwnLensesConfig
-) -> tuple[MapperInput, PartialMap]:
-    """Both, with lenses of their own for the refuted views, and everything where the freed map has it."""
+    problem: MapperInput, partial: SparseModel, freed: PerViewLensModel, config: OwnLensesConfig
+) -> tuple[MapperInput, SparseModel]:
+    """Both, with lenses of their own for the refuted views, and everything where the freed model has it."""
     (views,) = np.nonzero(freed.refuting_views)
     groups, found = partial.estimate.lens_of_camera, freed.estimate
     lens_of = groups.copy()
@@ -371,9 +371,9 @@ def split_lenses(
 
 
 def free_aspects(
-    partial: PartialMap, loss: bundle_adjustment.BundleAdjustmentConfig, config: OwnLensesConfig
-) -> PartialMap | None:
-    """The map adjusted with pixels of any aspect; None where these explain little more or are nearly what they were."""
+    partial: SparseModel, loss: bundle_adjustment.BundleAdjustmentConfig, config: OwnLensesConfig
+) -> SparseModel | None:
+    """The model adjusted with pixels of any aspect; None where these explain little more or hardly differ."""
     before, prior = partial.estimate, free_aspect_prior(partial, config)
     after = bundle_adjustment.adjust(before, prior, loss, partial.registered[0])
     moved = np.abs(np.log(after.aspects / before.aspects)).max()
@@ -383,8 +383,8 @@ def free_aspects(
     return replace(partial, estimate=after, prior=prior)
 
 
-def free_aspect_prior(partial: PartialMap, config: OwnLensesConfig) -> bundle_adjustment.LensPrior:
-    """The prior of the map with pixels of any aspect, one for lenses that are tied; given lenses keep theirs."""
+def free_aspect_prior(partial: SparseModel, config: OwnLensesConfig) -> bundle_adjustment.LensPrior:
+    """The prior of the model with pixels of any aspect, one for lenses that are tied; given lenses keep theirs."""
     prior = partial.prior
     lenses = partial.estimate.lens_of_camera[list(partial.registered)]
     free = np.isin(np.arange(len(prior.sigmas)), lenses) & (prior.sigmas > 0)
@@ -392,8 +392,8 @@ def free_aspect_prior(partial: PartialMap, config: OwnLensesConfig) -> bundle_ad
     return replace(prior, aspect_sigmas=np.where(free, np.maximum(sigmas, config.widest_aspect), sigmas))
 
 
-def is_stretched(partial: PartialMap, config: OwnLensesConfig) -> bool:
-    """Whether a view of the map has pixels that are far from square."""
+def is_stretched(partial: SparseModel, config: OwnLensesConfig) -> bool:
+    """Whether a view of the model has pixels that are far from square."""
     aspects = partial.estimate.aspects[partial.estimate.lens_of_camera[list(partial.registered)]]
     return bool(np.abs(np.log(aspects)).max() > config.least_aspect)
 
@@ -411,7 +411,7 @@ def find_common_lens(prior: bundle_adjustment.LensPrior, lens: int, config: OwnL
 def widen_lens_priors(
     problem: bundle_adjustment.Problem, prior: bundle_adjustment.LensPrior, sides: Array, config: OwnLensesConfig
 ) -> tuple[bundle_adjustment.Problem, bundle_adjustment.LensPrior]:
-    """The same map with what is not known of lenses: each view may deviate from the lens that it shares.
+    """The same model with what is not known of lenses: each view may deviate from the lens that it shares.
 
     `sides` (C,) are the longer sides of the views' pictures. The covariance of the two has that in it.
     """
@@ -433,7 +433,7 @@ def widen_lens_priors(
 
 
 def expand_lenses(estimate: bundle_adjustment.Problem) -> bundle_adjustment.Problem:
-    """The same map with as many lenses as views, in their order; those of a group are alike."""
+    """The same model with as many lenses as views, in their order; those of a group are alike."""
     groups = estimate.lens_of_camera
     return replace(
         estimate,
@@ -502,9 +502,9 @@ def _pool_deviations(deviations: Array) -> Array:
 
 
 def add_lens(
-    problem: MapperInput, partial: PartialMap, view: int, focal: float, shift: Array | None = None
-) -> tuple[MapperInput, PartialMap]:
-    """Both, with a lens of its own for a view, which the map then does not have.
+    problem: MapperInput, partial: SparseModel, view: int, focal: float, shift: Array | None = None
+) -> tuple[MapperInput, SparseModel]:
+    """Both, with a lens of its own for a view, which the model then does not have.
 
     Focal length and shift (2,) of the principal point are in pixels. The view may be a crop: that point is free.
     """

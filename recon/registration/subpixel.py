@@ -1,4 +1,4 @@
-"""Subpixel refinement of observations: patches of the map's points aligned in every view that may show them.
+"""Subpixel refinement of observations: patches of the model's points aligned in every view that may show them.
 
 Feature positions of one point are independent in each image and differ by half a pixel; aligned patches differ by a
 tenth. One observation of a point, the reference, defines the point and is kept; the others are aligned to it. Views in
@@ -151,7 +151,7 @@ _MIN_ALONG_NORMAL = 1e-12  # component of a ray along a surface's normal, in pla
 
 
 class SubpixelConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Subpixel refinement of observations: patches of the map's points aligned in every view that may show them."""
+    """Subpixel refinement of observations: patches of the model's points aligned in every view that may show them."""
 
     patch_alignment: PatchAlignmentConfig = PatchAlignmentConfig()
     patch_image: PatchImageConfig = PatchImageConfig()

@@ -11,7 +11,7 @@ import pytest
 from splatnode.extras.evaluate.dataset import TrueCamera
 from splatnode.extras.evaluate.stability.perturbations import TrialImage
 from splatnode.recon.registration import incremental_mapper, mapping_problem, self_calibration
-from splatnode.recon.registration.incremental_mapper import FinalMap, MapperConfig
+from splatnode.recon.registration.incremental_mapper import FinalModel, MapperConfig
 from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView
 from tests.recon.registration.test_mapper import SIZE, Photographed, built, compared, errors, photographed
 from tests.recon.registration.test_own_lenses import check_within_bounds, estimate, photographs
@@ -73,8 +73,8 @@ def test_zoomed_views_do_not_pass_for_pixels_that_are_not_square():
     assert found.estimate.aspects == pytest.approx(1.0, abs=0.01)
 
 
-def finished(taken: Photographed, num_lenses: int, aspect: float) -> tuple[MapperInput, FinalMap]:
-    """A finished map whose lenses are given another aspect."""
+def finished(taken: Photographed, num_lenses: int, aspect: float) -> tuple[MapperInput, FinalModel]:
+    """A finished model whose lenses are given another aspect."""
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
     pairs, lenses = compared(taken), [Lens((900.0,), 0.3)] * num_lenses
     problem = mapping_problem.prepare(views, lenses, pairs, 100, 100)
@@ -82,8 +82,8 @@ def finished(taken: Photographed, num_lenses: int, aspect: float) -> tuple[Mappe
     assert partial is not None
     found = incremental_mapper.run_final_adjustment(problem, partial, (), CONFIG.finishing)
     assert found is not None
-    estimate = replace(found.map.estimate, log_aspects=np.full(num_lenses, np.log(aspect)))
-    return problem, replace(found, map=replace(found.map, estimate=estimate))
+    estimate = replace(found.model.estimate, log_aspects=np.full(num_lenses, np.log(aspect)))
+    return problem, replace(found, model=replace(found.model, estimate=estimate))
 
 
 @pytest.mark.parametrize(
@@ -92,19 +92,19 @@ def finished(taken: Photographed, num_lenses: int, aspect: float) -> tuple[Mappe
 )
 def test_of_two_explanations_the_better_or_simpler_one_is_kept(monkeypatch, lenses, ratio, kept):
     own, other = finished(photographed(3), lenses, 1.0), finished(photographed(3), 1, 1.2)
-    errors = {id(own[1].map): 1.0, id(other[1].map): ratio}
+    errors = {id(own[1].model): 1.0, id(other[1].model): ratio}
     monkeypatch.setattr(incremental_mapper, "_median_error", lambda _, partial: errors[id(partial)])
     chosen = incremental_mapper._choose_aspect(own, other, CONFIG)
     if kept != "unknown":
         assert chosen is (own if kept == "own" else other)
         return
-    sigmas = chosen[1].map.prior.aspect_sigmas
-    assert chosen[1].map.estimate is own[1].map.estimate and sigmas is not None
+    sigmas = chosen[1].model.prior.aspect_sigmas
+    assert chosen[1].model.estimate is own[1].model.estimate and sigmas is not None
     assert sigmas[0] == CONFIG.own_lenses.widest_aspect
 
 
 def test_what_an_aspect_explains_little_of_frees_none():
     _, found = finished(photographed(3), 1, 1.0)
-    assert self_calibration.free_aspects(found.map, found.loss, CONFIG.own_lenses) is None
-    calibrated = replace(found.map, prior=replace(found.map.prior, sigmas=np.zeros(1)))
+    assert self_calibration.free_aspects(found.model, found.loss, CONFIG.own_lenses) is None
+    calibrated = replace(found.model, prior=replace(found.model.prior, sigmas=np.zeros(1)))
     assert not self_calibration.free_aspect_prior(calibrated, CONFIG.own_lenses).own_sigmas[:, 5].any()

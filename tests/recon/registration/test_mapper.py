@@ -18,7 +18,7 @@ from splatnode.recon.registration import (
     multiview_geometry,
     self_calibration,
 )
-from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, OwnLens, PartialMap
+from splatnode.recon.registration.mapping_problem import Lens, MapperInput, MapperView, OwnLens, SparseModel
 
 FOCAL = 900.0
 SIZE = (1024, 768)
@@ -91,14 +91,14 @@ def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, i
 
 def built(
     taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tuple[float, ...]
-) -> incremental_mapper.Map:
+) -> incremental_mapper.MapperResult:
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
-    found = incremental_mapper.build_map(views, [Lens(focals, 0.3)], pairs, incremental_mapper.MapperConfig())
+    found = incremental_mapper.build_model(views, [Lens(focals, 0.3)], pairs, incremental_mapper.MapperConfig())
     assert found is not None
     return found
 
 
-def errors(taken: Photographed, found: incremental_mapper.Map) -> tuple[float, float]:
+def errors(taken: Photographed, found: incremental_mapper.MapperResult) -> tuple[float, float]:
     """Largest error of a relative rotation, degrees, and the largest of a centre, relative to their spread."""
     members = sorted(found.views)
     state = found.estimate
@@ -218,7 +218,7 @@ def test_a_small_zoom_does_not_pass_for_one_long_lens(zoom, seed):
     votes = self_calibration.vote(list(pairs.values()), num_candidates=3)
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
     lens = Lens(tuple(vote * SIZE[0] for vote in votes), 0.3, typical=float(SIZE[0]))
-    found = incremental_mapper.build_map(views, [lens], pairs, incremental_mapper.MapperConfig())
+    found = incremental_mapper.build_model(views, [lens], pairs, incremental_mapper.MapperConfig())
     assert found is not None and sorted(found.views) == [0, 1, 2]
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 0.15 and centre < 0.03
@@ -235,7 +235,7 @@ def test_a_long_lens_stays_what_it_is(monkeypatch):
     monkeypatch.setattr(incremental_mapper, "grow", lambda *given: tried.append(given[1]) or real(*given))
     views = [MapperView(points, 0, max(SIZE)) for points in long.pixels]
     lens = Lens((3.0 * FOCAL,), 0.3, typical=float(SIZE[0]))
-    found = incremental_mapper.build_map(views, [lens], pairs, incremental_mapper.MapperConfig())
+    found = incremental_mapper.build_model(views, [lens], pairs, incremental_mapper.MapperConfig())
     assert [float(SIZE[0])] in tried
     assert found is not None and np.exp(found.estimate.log_focals[0]) == pytest.approx(3.0 * FOCAL, rel=0.3)
 
@@ -265,7 +265,7 @@ def test_a_lens_of_which_little_is_told_is_taken_for_one_that_bends_no_lines(tak
 
 def test_what_is_known_of_a_lens_stays(taken, pairs):
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
-    found = incremental_mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, incremental_mapper.MapperConfig())
+    found = incremental_mapper.build_model(views, [Lens((FOCAL,), 0.0)], pairs, incremental_mapper.MapperConfig())
     assert found is not None
     assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
     assert not found.estimate.radials.any() and np.abs(found.estimate.shifts).max() == 0.0
@@ -278,7 +278,7 @@ def test_a_pair_that_shows_a_double_does_not_bend_the_map(taken, pairs):
     points = [np.concatenate([own, other]) for own, other in zip(taken.pixels, elsewhere.pixels, strict=True)]
     spoiled = {**pairs, (0, 4): replace(lying, matches=lying.matches + len(taken.pixels[0]))}
     views = [MapperView(of_view, 0, max(SIZE)) for of_view in points]
-    found = incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, incremental_mapper.MapperConfig())
+    found = incremental_mapper.build_model(views, [Lens((FOCAL,), 0.3)], spoiled, incremental_mapper.MapperConfig())
     assert found is not None
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 0.3 and centre < 0.02
@@ -306,7 +306,7 @@ def test_a_view_is_placed_as_well_through_a_lens_that_is_known_to_bend_lines(rad
     still, lens = np.zeros((1, 3)), (np.log([FOCAL]), np.array([[radial, 0.0]]), np.zeros((1, 2)))
     bare = bundle_adjustment.make_empty_problem(np.eye(3)[None], still, np.zeros(1, int), *lens)
     prior = bundle_adjustment.focal_prior(lens[0], np.ones(1))
-    partial = PartialMap((), replace(bare, points=points), prior, np.arange(400))
+    partial = SparseModel((), replace(bare, points=points), prior, np.arange(400))
     observed = multiview_geometry.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
     problem = MapperInput((), (), {}, np.ones(1), observed, observed)
     found = mapping_problem.resect(problem, partial, 0, mapping_problem.ResectionConfig())
@@ -327,7 +327,7 @@ def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
 
 def test_no_pair_gives_no_map(taken):
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
-    assert incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, incremental_mapper.MapperConfig()) is None
+    assert incremental_mapper.build_model(views, [Lens((FOCAL,), 0.3)], {}, incremental_mapper.MapperConfig()) is None
 
 
 def test_tracks_join_matches_and_drop_what_contradicts_itself():
@@ -402,18 +402,18 @@ def test_views_are_placed_on_points_that_the_last_adjustment_has_not_renumbered(
     views = [MapperView(points, 0, max(SIZE)) for points in taken.pixels]
     extended = []
 
-    def free_aspects(partial: PartialMap, *_: object) -> PartialMap:
+    def free_aspects(partial: SparseModel, *_: object) -> SparseModel:
         kept = partial.estimate.point_of >= 10
         return replace(partial, estimate=bundle_adjustment.keep_observations(partial.estimate, kept))
 
-    def extend(problem: MapperInput, partial: PartialMap, config: object) -> PartialMap:
+    def extend(problem: MapperInput, partial: SparseModel, config: object) -> SparseModel:
         extended.append((len(partial.estimate.points), len(partial.track_of_point), len(partial.registered)))
         return real(problem, partial, config)
 
     real = incremental_mapper.extend
     monkeypatch.setattr(self_calibration, "free_aspects", free_aspects)
     monkeypatch.setattr(incremental_mapper, "extend", extend)
-    assert incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], apart, incremental_mapper.MapperConfig())
+    assert incremental_mapper.build_model(views, [Lens((FOCAL,), 0.3)], apart, incremental_mapper.MapperConfig())
     assert extended[-1][2] == 4, "one view is left"
     assert all(points == tracks for points, tracks, _ in extended)
 
@@ -427,7 +427,7 @@ def test_a_lens_of_its_own_that_comes_out_as_the_common_one_is_none(taken, pairs
     monkeypatch.setattr(incremental_mapper, "_find_doubtful_views", lambda *_: [2])
     monkeypatch.setattr(mapping_problem, "find_own_lens", lambda *_: tried)
     monkeypatch.setattr(incremental_mapper, "_score_of", lambda problem, *_: float(len(problem.lenses)))
-    found = incremental_mapper.build_map(views, [Lens((FOCAL,), 0.3)], pairs, incremental_mapper.MapperConfig())
+    found = incremental_mapper.build_model(views, [Lens((FOCAL,), 0.3)], pairs, incremental_mapper.MapperConfig())
     assert found is not None
     focals = np.exp(found.estimate.log_focals[found.estimate.lens_of_camera])
     assert (found.estimate.lens_of_camera[2] == 0) == (zoom == 1.0)

@@ -23,13 +23,13 @@ def texture(height: int = 300, width: int = 400, seed: int = 0) -> np.ndarray:
 
 
 def warped(image: np.ndarray) -> np.ndarray:
-    """The image seen through the affine map, darker and with less contrast."""
+    """The image seen through the affine model, darker and with less contrast."""
     matrix = np.column_stack([MATRIX, SHIFT])
     return cv2.warpAffine(image, matrix, (440, 400), flags=cv2.INTER_CUBIC) * 0.8 + 20.0
 
 
 def true_target(reference: np.ndarray) -> np.ndarray:
-    """OpenCV's map is between pixel centres at whole numbers."""
+    """OpenCV's model is between pixel centres at whole numbers."""
     return (reference - 0.5) @ MATRIX.T + SHIFT + 0.5
 
 

@@ -18,7 +18,7 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.keyframes import Keyframe
 from splatnode.recon.registration import bundle_adjustment, rigs
 from splatnode.recon.registration.bundle_adjustment import RigConstraint
-from splatnode.recon.registration.incremental_mapper import Map
+from splatnode.recon.registration.incremental_mapper import MapperResult
 from splatnode.recon.registration.rigs import Mount, RigEstimate, adjust_with_rig
 from tests.recon.registration.test_bundle import problem
 
@@ -83,7 +83,7 @@ def test_the_adjustment_on_a_rig_is_that_of_scipy() -> None:
     np.testing.assert_allclose(found.rig.set_rotations, set_rotations, atol=1e-3)
 
 
-# Three cameras on a rig that drives past a cloud of points: the map as registration leaves it, image by image.
+# Three cameras on a rig that drives past a cloud of points: the model as registration leaves it, image by image.
 
 PIXEL = 0.4
 IDS = ("front", "left", "right")
@@ -103,12 +103,12 @@ def make_drive(
     num_sets: int = 8,
     moved_at: int | None = None,
     moved: tuple[str, float, float] = ("left", 2.0, 0.0),  # degrees and metres
-    unit: float = 2.0,  # metres that the map's unit has
+    unit: float = 2.0,  # metres that the model's unit has
     late_m: float = 0.0,  # by which a camera's image is taken elsewhere, to and fro
     arm_deg: float = 0.0,  # by which a camera is turned further from set to set
     seed: int = 0,
-) -> tuple[Map, list[Keyframe], np.ndarray]:
-    """The map, its keyframes, and the true T_world_camera of each, metres."""
+) -> tuple[MapperResult, list[Keyframe], np.ndarray]:
+    """The model, its keyframes, and the true T_world_camera of each, metres."""
     generator = np.random.default_rng(seed)
     points = generator.uniform((-4, -1.5, 3), (4, 1.5, 7), (150, 3))
     Ts, keyframes = [], []
@@ -147,12 +147,12 @@ def make_drive(
     prior = bundle_adjustment.LensPrior(start.log_focals, np.zeros(1), np.zeros((1, 2)), np.zeros(1))
     loss = bundle_adjustment.BundleAdjustmentConfig(noise_px=PIXEL)
     estimate = bundle_adjustment.adjust(start, prior, loss)
-    found = Map(tuple(range(len(Ts))), estimate, prior, loss, {}, 10.0, 0.5, 1)
+    found = MapperResult(tuple(range(len(Ts))), estimate, prior, loss, {}, 10.0, 0.5, 1)
     return found, cast("list[Keyframe]", keyframes), worlds
 
 
-def without(found: Map, views: set[int]) -> Map:
-    """The map in which no match places these views."""
+def without(found: MapperResult, views: set[int]) -> MapperResult:
+    """The model in which no match places these views."""
     kept = bundle_adjustment.keep_observations(found.estimate, ~np.isin(found.estimate.camera_of, list(views)))
     return replace(found, views=tuple(v for v in found.views if v not in views), estimate=kept)
 
@@ -164,7 +164,9 @@ def deviate(mount: Mount, true: np.ndarray, unit: float = 2.0) -> tuple[float, f
     return float(np.degrees(Rotation.from_matrix(turned).magnitude())), float(np.linalg.norm(away))
 
 
-def find_rig(found: Map, keyframes: list[Keyframe], rig: Rig | None = None) -> tuple[Map, RigEstimate]:
+def find_rig(
+    found: MapperResult, keyframes: list[Keyframe], rig: Rig | None = None
+) -> tuple[MapperResult, RigEstimate]:
     told = adjust_with_rig(found, keyframes, rig, TOLERANCE_S)
     assert told is not None
     return told
@@ -197,7 +199,7 @@ def test_a_rig_is_estimated_from_all_sets_within_its_bounds() -> None:
     assert np.mean(inside) >= 0.9
 
 
-def scale_of(found: Map, worlds: np.ndarray) -> float:
+def scale_of(found: MapperResult, worlds: np.ndarray) -> float:
     """Metres a unit, by all centres."""
     return align_cameras(world_of(found.estimate), worlds).scale
 

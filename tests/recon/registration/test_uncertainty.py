@@ -80,7 +80,7 @@ def test_ellipsoids_of_cameras_that_know_their_depth_least_lie_along_the_view():
 
 
 def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
-    """A map that was turned and scaled as a whole is the same registration."""
+    """A model that was turned and scaled as a whole is the same registration."""
     true = far_away(0)
     turn = Similarity(3.0, cv2.Rodrigues(np.array([0.5, -1.0, 0.8]))[0], np.array([1.0, 2.0, 3.0]))
     rotations = true.rotations @ turn.rotation.T
@@ -95,7 +95,7 @@ def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
     config = registration.RegistrationConfig(mapper=incremental_mapper.MapperConfig(own_lenses=sure))
     one, other = (
         make_registration(
-            incremental_mapper.Map(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3, 1), keyframes, [1.0] * 4, config
+            incremental_mapper.MapperResult(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3, 1), keyframes, [1.0] * 4, config
         )
         for of in (true, moved)
     )
