@@ -475,7 +475,13 @@ def _finish_best(
     if not attempts:
         return None
     run.pause()
-    finished = run_final_adjustment(problem, max(attempts, key=_score)[1], images, config.finishing)
+    best = max(attempts, key=_score)[1]
+    coherent = mapping_problem.drop_repeated_structures(
+        problem, best, config.max_growing_tracks, config.max_final_tracks
+    )
+    if coherent is not problem:
+        problem, best = coherent, adjust_quickly(coherent, best, SETTLED_TOLERANCE, config.incremental)
+    finished = run_final_adjustment(problem, best, images, config.finishing)
     return None if finished is None else give_own_lenses(problem, finished, images, config, run)
 
 

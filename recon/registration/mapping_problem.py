@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from splatnode.recon import poselib
 from splatnode.recon.geometry import cross
@@ -354,6 +355,93 @@ def _length(turned: Array, direction: Array, rays: Array, limit: float, min_poin
     counts = agree(turned[None] + possible[:, None, None] * direction).sum(1)
     best = int(counts.argmax())
     return float(possible[best]) if counts[best] >= max(min_points, _MIN_SCALE_RATIO * len(possible)) else None
+
+
+# Repeated structures: windows of a facade match other windows beside them, and an epipolar geometry explains both. What
+# such a match shows has another depth than what all pairs of the view show around it. The tracks of the last adjustment
+# are made without these matches; what is judged by matches counts them all.
+
+_NEIGHBOURS = 24  # matches around a match in its image, of all pairs, whose depths are compared with its own
+_MIN_OTHERS = 6  # of them that are of other pairs
+_SAME_FEATURE_PX = 0.5  # largest distance of matches of the same feature
+_MAX_AGREEING = 0.2  # share of those that may have its depth where it is another
+# Difference of inverse depths up to which they are the same: relative, and in standard deviations
+_SAME_DEPTH, _SAME_SIGMAS = 0.15, 3.0
+_MIN_COMPARED = 40  # matches of a pair that loses some
+_MIN_REPEATED = 0.1  # share of a pair's matches at other depths from which on they are left out
+_MATCH_PX = 1.5  # standard deviation of a match, at REFERENCE_SIDE
+_EXACT_DEPTH = 0.1  # largest standard deviation of a neighbour's inverse depth, over the median of the view
+
+
+def drop_repeated_structures(
+    problem: MapperInput, partial: SparseModel, max_growing_tracks: int, max_final_tracks: int
+) -> MapperInput:
+    """The problem with tracks without the matches of repeated structures; itself where no pair has many of them."""
+    pairs = dict(problem.pairs)
+    for key, other in find_other_depths(problem, partial).items():
+        pair = pairs[key]
+        if len(other) >= _MIN_COMPARED and other.mean() >= _MIN_REPEATED:
+            rest = pair.matches[~other], pair.points1[~other], pair.points2[~other]
+            pairs[key] = replace(pair, matches=rest[0], points1=rest[1], points2=rest[2])
+    if all(pairs[key] is pair for key, pair in problem.pairs.items()):
+        return problem
+    less = prepare(problem.views, problem.lenses, pairs, max_growing_tracks, max_final_tracks)
+    return replace(problem, growing_tracks=less.growing_tracks, final_tracks=less.final_tracks)
+
+
+def find_other_depths(problem: MapperInput, partial: SparseModel) -> dict[Pair, Flags]:
+    """(M,) for each pair of registered views, its matches whose depth in a view is not that of the matches around."""
+    estimate, registered = partial.estimate, set(partial.registered)
+    pairs = {key: pair for key, pair in problem.pairs.items() if registered.issuperset(key)}
+    inverse = {key: _inverse_depths(estimate, key, pair) for key, pair in pairs.items()}
+    found = {key: np.zeros(len(pair.matches), bool) for key, pair in pairs.items()}
+    centres = bundle_adjustment.centres(estimate)
+    for view in partial.registered:
+        sides = [(key, key.index(view)) for key in pairs if view in key]
+        if not sides:
+            continue
+        sigma_px = _MATCH_PX * problem.scale[view] / np.exp(estimate.log_focals[estimate.lens_of_camera[view]])
+        apart = [np.linalg.norm(centres[key[0]] - centres[key[1]]) for key, _ in sides]
+        counts = [len(pairs[key].matches) for key, _ in sides]
+        other = _differ_from_neighbours(
+            np.concatenate([(pairs[key].points1, pairs[key].points2)[side] for key, side in sides]),
+            np.concatenate([inverse[key][side] for key, side in sides]),
+            np.repeat(sigma_px / np.maximum(apart, 1e-12), counts),
+            np.repeat(np.arange(len(sides)), counts),
+        )
+        for (key, _), part in zip(sides, np.split(other, np.cumsum(counts)[:-1]), strict=True):
+            found[key] |= part
+    return found
+
+
+def _inverse_depths(estimate: bundle_adjustment.Problem, views: Pair, pair: TwoView) -> Array:
+    """(2, M) the inverse depths of the matches in both views; NaN for what lies behind a camera, or nowhere."""
+    count = len(pair.matches)
+    camera_of, match_of = np.repeat(views, count), np.tile(np.arange(count), 2)
+    rays = bundle_adjustment.normalise(estimate, camera_of, np.concatenate([pair.points1, pair.points2]))
+    matrices = np.concatenate([estimate.rotations, estimate.translations[:, :, None]], 2)
+    points = multiview_geometry.triangulate(matrices, rays, camera_of, match_of, count)
+    depths = estimate.rotations[list(views), 2] @ points.T + estimate.translations[list(views), 2, None]
+    return 1.0 / np.where(depths > 0, depths, np.nan)
+
+
+def _differ_from_neighbours(pixels: Array, inverse: Array, sigmas: Array, pair_of: Index) -> Flags:
+    """(M,) whether hardly any match of other pairs around a pixel (M, 2), and none of it, has its inverse depth (M,).
+
+    Where a near thing stands before a far one, the same feature has the same depth in other pairs.
+    """
+    known = np.isfinite(inverse)
+    exact = known & (sigmas < _EXACT_DEPTH * np.median(inverse[known])) if known.any() else known
+    if exact.sum() < _NEIGHBOURS:
+        return np.zeros(len(inverse), bool)
+    distances, near = cKDTree(pixels[exact]).query(pixels, _NEIGHBOURS)
+    around = inverse[exact][near]
+    others = pair_of[exact][near] != pair_of[:, None]
+    most = np.maximum(_SAME_DEPTH * around, _SAME_SIGMAS * np.hypot(sigmas[:, None], sigmas[exact][near]))
+    agree = (np.abs(inverse[:, None] - around) <= most) & others
+    counts, same_feature = others.sum(1), distances < _SAME_FEATURE_PX
+    is_alone = (counts >= _MIN_OTHERS) & (agree.sum(1) <= _MAX_AGREEING * counts)
+    return is_alone & ~(agree & same_feature).any(1)
 
 
 # Inlier ratios: the share of a pair's matches that agree with the poses of a model, used or not in making it.
