@@ -198,6 +198,20 @@ MUTANTS = (
     ),
     *_list_mutants(
         "registration",
+        "recon/registration/mapping_problem.py",
+        (
+            "windows that match the windows beside them make tracks",
+            "if len(other) >= _MIN_COMPARED and other.mean() >= _MIN_REPEATED:",
+            "if len(other) < 0:",
+        ),
+        (
+            "a thing before a far wall passes for a repeated window",
+            "return is_alone & ~(agree & same_feature).any(1)",
+            "return is_alone",
+        ),
+    ),
+    *_list_mutants(
+        "registration",
         "recon/registration/multiview_geometry.py",
         ("points of a tenth of a degree are kept", "min_angle_deg: float = 1.0", "min_angle_deg: float = 0.1"),
         ("a frame's two features of one track both stay", "unique = count[group] == 1", "unique = count[group] >= 1"),
