@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from pkgutil import iter_modules
 
 from splatnode.capture.process import plugins
 from splatnode.capture.process.arguments import (
@@ -200,8 +199,7 @@ _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
 
 def list_export_formats() -> tuple[str, ...]:
     """The names of all formats, without an import, which would take time."""
-    own = (module.name for module in iter_modules([str(_FORMATS_FOLDER)]))
-    return tuple(sorted({*own, *plugins.entry_points(plugins.EXPORT_FORMATS)}))
+    return plugins.list_names(_FORMATS_FOLDER, plugins.EXPORT_FORMATS)
 
 
 def _recon_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from types import MappingProxyType
 from typing import Any
 
@@ -116,6 +117,11 @@ def entry_points(group: str) -> Mapping[str, EntryPoint]:
     imported.
     """
     return _read_all(tuple(sys.path), os.getcwd()).get(group, MappingProxyType({}))
+
+
+def list_names(folder: Path, group: str) -> tuple[str, ...]:
+    """The names of the modules in a folder of the core and of the entry points of a group, sorted; none is imported."""
+    return tuple(sorted({*(module.name for module in iter_modules([str(folder)])), *entry_points(group)}))
 
 
 def load_all(group: str, try_out: Callable[[Any], object] = ignore) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import os
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 from types import MappingProxyType
 from typing import Protocol, cast
 
@@ -248,18 +247,14 @@ class Format(Protocol):
 
 def list_format_names() -> list[str]:
     """The formats that there are, in the order of the alphabet. None of them is imported."""
-    return sorted({*_list_own_names(), *plugins.entry_points(plugins.EXPORT_FORMATS)})
-
-
-def _list_own_names() -> list[str]:
-    return [module.name for module in iter_modules(formats.__path__)]
+    return list(plugins.list_names(Path(formats.__path__[0]), plugins.EXPORT_FORMATS))
 
 
 def load_format(name: str) -> Format:
     """The format called `name`. Raises ValueError where there is none."""
     if name not in list_format_names():
         raise ValueError(f"the format must be one of {', '.join(list_format_names())}; got {name!r}")
-    if name in _list_own_names():
+    if (Path(formats.__path__[0]) / f"{name}.py").exists():
         return cast(Format, import_module(f"{formats.__name__}.{name}"))
     return plugins.entry_points(plugins.EXPORT_FORMATS)[name].load()
 
