@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"no mutant {args.only or f'in {args.room}'!r}; there are:\n  {names}", file=sys.stderr)
         return 2
     fates = read_fates(args.out) if args.resume else {}
-    killers = {fate.digest: fate.test for fate in read_fates(RECORD).values() if fate.test is not None}
+    killers = {fate.name: fate.test for fate in read_fates(RECORD).values() if fate.test is not None}
     with make_copy(ROOT) as copy:
         trial = Trial(copy, args.seconds, args.whole, killers)
         for mutant in chosen:
@@ -91,7 +91,7 @@ class Trial:
     def try_mutant(self, mutant: Mutant) -> Fate:
         """What becomes of it; a mutant that makes tests hang survives, since nobody was told."""
         near, others = order_tests(self._copy.folder, mutant.file)
-        first = [self._killers[mutant.digest]] if mutant.digest in self._killers else []
+        first = [self._killers[mutant.name]] if mutant.name in self._killers else []
         rounds = [tests for tests in (first, near, others if self._whole else []) if tests]
         spent = 0.0
         for tests in rounds:

@@ -145,7 +145,7 @@ def test_what_killed_it_last_time_comes_first(small, monkeypatch):
     monkeypatch.setattr(copy, "run_tests", lambda tests, *rest: asked.append([*tests]) or ran(tests, *rest))
     same = mutant("a + b", "a * b")
     killer = "tests/recon/test_addition.py::test_sum"
-    assert Trial(copy, 60.0, False, {same.digest: killer}).try_mutant(same).test == killer
+    assert Trial(copy, 60.0, False, {same.name: killer}).try_mutant(same).test == killer
     assert asked == [[killer], [killer]]  # with the mutant, and without
 
 
