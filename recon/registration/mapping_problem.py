@@ -365,10 +365,12 @@ _NEIGHBOURS = 24  # matches around a match in its image, of all pairs, whose dep
 _MIN_OTHERS = 6  # of them that are of other pairs
 _SAME_FEATURE_PX = 0.5  # largest distance of matches of the same feature
 _MAX_AGREEING = 0.2  # share of those that may have its depth where it is another
-# Difference of inverse depths up to which they are the same: relative, and in standard deviations
-_SAME_DEPTH, _SAME_SIGMAS = 0.15, 3.0
+# Difference of inverse depths up to which they are the same: relative, and in standard deviations. A match with the
+# window beside has half or twice the depth; a lens that is not known yet changes depths by less
+_SAME_DEPTH, _SAME_SIGMAS = 0.4, 3.0
 _MIN_COMPARED = 40  # matches of a pair that loses some
-_MIN_REPEATED = 0.1  # share of a pair's matches at other depths from which on they are left out
+# Share of a pair's matches at other depths from which on they are left out; of more, poses or lenses are wrong
+_MIN_REPEATED, _MAX_REPEATED = 0.1, 0.5
 _MATCH_PX = 1.5  # standard deviation of a match, at REFERENCE_SIDE
 _EXACT_DEPTH = 0.1  # largest standard deviation of a neighbour's inverse depth, over the median of the view
 
@@ -380,7 +382,7 @@ def drop_repeated_structures(
     pairs = dict(problem.pairs)
     for key, other in find_other_depths(problem, partial).items():
         pair = pairs[key]
-        if len(other) >= _MIN_COMPARED and other.mean() >= _MIN_REPEATED:
+        if len(other) >= _MIN_COMPARED and _MIN_REPEATED <= other.mean() <= _MAX_REPEATED:
             rest = pair.matches[~other], pair.points1[~other], pair.points2[~other]
             pairs[key] = replace(pair, matches=rest[0], points1=rest[1], points2=rest[2])
     if all(pairs[key] is pair for key, pair in problem.pairs.items()):

@@ -201,7 +201,7 @@ MUTANTS = (
         "recon/registration/mapping_problem.py",
         (
             "windows that match the windows beside them make tracks",
-            "if len(other) >= _MIN_COMPARED and other.mean() >= _MIN_REPEATED:",
+            "if len(other) >= _MIN_COMPARED and _MIN_REPEATED <= other.mean() <= _MAX_REPEATED:",
             "if len(other) < 0:",
         ),
         (
