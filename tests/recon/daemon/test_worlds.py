@@ -96,7 +96,7 @@ def test_writing_the_result_of_a_scene_that_the_camera_left_withdraws_its_poses(
     here = SimpleNamespace(scene_id="scene-0002", identity="0" * 32)
     written = output.Output(DaemonConfig(out=tmp_path), here, lambda shown: None, lambda problem: None, revisions)
     monkeypatch.setattr(output, "write_result_folder", lambda *rest, **more: None)
-    monkeypatch.setattr(output, "_make_submap_record", lambda *rest: None)
+    monkeypatch.setattr(output, "describe_submap", lambda *rest: None)
     for name in ("update", "link_scene"):
         monkeypatch.setattr(written.index, name, lambda *rest: None)
     monkeypatch.setattr(written._metres, "scale_result", lambda snapshot, work: snapshot)
