@@ -322,13 +322,13 @@ class RobotMotion:
         common = next((frame for frame in below if frame in above), None)
         if common is None:
             return None
-        T_common_source = self._climb(below[: below.index(common)], at_ns)
-        T_common_target = self._climb(above[: above.index(common)], at_ns)
+        T_common_source = self._compose(below[: below.index(common)], at_ns)
+        T_common_target = self._compose(above[: above.index(common)], at_ns)
         if T_common_source is None or T_common_target is None:
             return None
         return np.linalg.inv(T_common_target) @ T_common_source
 
-    def _climb(self, frames: Sequence[str], at_ns: int) -> Array | None:
+    def _compose(self, frames: Sequence[str], at_ns: int) -> Array | None:
         """The pose of the first of the frames in the parent of the last, each the child of the next."""
         T = np.eye(4)
         for frame in frames:
