@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from splatnode.recon import poselib
 from splatnode.recon.geometry import cross
@@ -436,7 +436,7 @@ def _differ_from_neighbours(pixels: Array, inverse: Array, sigmas: Array, pair_o
     exact = known & (sigmas < _EXACT_DEPTH * np.median(inverse[known])) if known.any() else known
     if exact.sum() < _NEIGHBOURS:
         return np.zeros(len(inverse), bool)
-    distances, near = cKDTree(pixels[exact]).query(pixels, _NEIGHBOURS)
+    distances, near = KDTree(pixels[exact]).query(pixels, _NEIGHBOURS)
     around = inverse[exact][near]
     others = pair_of[exact][near] != pair_of[:, None]
     most = np.maximum(_SAME_DEPTH * around, _SAME_SIGMAS * np.hypot(sigmas[:, None], sigmas[exact][near]))
