@@ -371,6 +371,7 @@ _SAME_DEPTH, _SAME_SIGMAS = 0.4, 3.0
 _MIN_COMPARED = 40  # matches of a pair that loses some
 # Share of a pair's matches at other depths from which on they are left out; of more, poses or lenses are wrong
 _MIN_REPEATED, _MAX_REPEATED = 0.1, 0.5
+_MIN_OF_ALL = 0.05  # share of all matches at other depths, below which a place does not repeat itself
 _MATCH_PX = 1.5  # standard deviation of a match, at REFERENCE_SIDE
 _EXACT_DEPTH = 0.1  # largest standard deviation of a neighbour's inverse depth, over the median of the view
 
@@ -379,8 +380,11 @@ def drop_repeated_structures(
     problem: MapperInput, partial: SparseModel, max_growing_tracks: int, max_final_tracks: int
 ) -> MapperInput:
     """The problem with tracks without the matches of repeated structures; itself where no pair has many of them."""
-    pairs = dict(problem.pairs)
-    for key, other in find_other_depths(problem, partial).items():
+    pairs, found = dict(problem.pairs), find_other_depths(problem, partial)
+    counts = [(int(other.sum()), len(other)) for other in found.values()]
+    if sum(count for count, _ in counts) < _MIN_OF_ALL * sum(count for _, count in counts):
+        return problem
+    for key, other in found.items():
         pair = pairs[key]
         if len(other) >= _MIN_COMPARED and _MIN_REPEATED <= other.mean() <= _MAX_REPEATED:
             rest = pair.matches[~other], pair.points1[~other], pair.points2[~other]
