@@ -222,9 +222,8 @@ def _estimate_cost(graph: ViewGraph, pair: Pair) -> float:
 AFFINE_SIMULATION = Fallback("stronger tilts", _match_affine)
 
 
-LEARNED_PAIR_COST = (
-    0.48  # with its share of finding the photographs' points: the networks take pictures of one size only
-)
+# With its share of finding the photographs' points: the networks take pictures of one size only
+LEARNED_PAIR_COST = 0.48
 _PART = LearnedPart("xfeat", "matches of wide baselines", xfeat.WEIGHTS, xfeat.PACKAGE)
 
 

@@ -336,7 +336,7 @@ class Store:
         records.remove_rebuild_requests(self.directory, *records.SHOWN)
 
     def finalize(self) -> None:
-        """Takes an inactive submap among the finished ones. Nothing is read or written here afterwards.
+        """Moves an inactive submap to the finished ones. Nothing is read or written here afterwards.
 
         Raises OSError.
         """

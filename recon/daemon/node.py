@@ -275,10 +275,8 @@ class Daemon:
         self._merged_s = -math.inf  # monotonic: when it was last seen at work
         self.finished = False  # as it was asked to, and not stopped
         self.left = ""  # what a node that finishes could not do
-        self._heart, self._service_status = (
-            Unfailing("the heartbeat"),
-            ReconState.LOADING.value,
-        )  # the service manager's
+        self._heart = Unfailing("the heartbeat")
+        self._service_status = ReconState.LOADING.value  # as the service manager shows it
 
     def __enter__(self) -> Daemon:
         return self

@@ -179,7 +179,7 @@ class Output:
         self._write_index(lambda: self.index.update(describe_submap(self._store, state, None, snapshot, kept)))
 
     def add_split_submap(self, scene_id: str, names: Sequence[str]) -> None:
-        """Writes into the index that these keyframes of an inactive submap are one of their own."""
+        """Writes into the index that these keyframes of an inactive submap are a submap of their own."""
         self._write_index(lambda: self.index.update(make_unverified_record(scene_id, names)))
 
     def mark_finished(self, scene_id: str) -> None:

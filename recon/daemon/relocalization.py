@@ -67,7 +67,7 @@ class TrackingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Least rendered opacity at a keyframe's feature; below, its depth is not known well enough
     min_alpha: Internal[float] = 0.8
     min_inliers: Internal[int] = 20  # points from which a camera is resected
-    min_share: Internal[float] = 0.3  # least inlier ratio; matches with another submap reach 0.2
+    min_share: Internal[float] = 0.3  # least inlier ratio; matches with another place reach 0.2
     max_error_px: Internal[float] = 3.0  # reprojection error of an inlier, at `longer_side`
     # Inliers share errors of the scene: more than so many make the position no more certain
     independent: Internal[int] = 50

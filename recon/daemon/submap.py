@@ -113,7 +113,7 @@ def find_separate_groups(work: IncrementalReconstruction, run: RunContext = BACK
 
 
 def is_split(work: IncrementalReconstruction, run: RunContext = BACKGROUND) -> bool:
-    """Whether the keyframes show several submaps: groups that verified pairs join to each other, and to no other."""
+    """Whether the keyframes show several places: groups that verified pairs join to each other, and to no other."""
     work.match_pending_pairs(run)
     return sum(len(group) > 1 for group in work.graph.components()) > 1
 
@@ -234,7 +234,7 @@ def verify_keyframes(work: IncrementalReconstruction, forget: Forget, run: RunCo
 def split_submaps(
     work: IncrementalReconstruction, store: Store, output: Output, run: RunContext, present: bool = False
 ) -> bool:
-    """Makes submaps, which wait, of keyframes that show other submaps; returns whether there were any.
+    """Makes submaps, which wait, of keyframes that show other places; returns whether there were any.
 
     `present`: the camera is in this submap.
     """
@@ -579,7 +579,7 @@ class ActiveSubmap:
             self._refine_verified()
 
     def _verify(self) -> None:
-        """Weighs all evidence; what shows other submaps begins others, or becomes submaps of its own that wait."""
+        """Weighs all evidence; what shows other places begins submaps, or becomes submaps of its own that wait."""
         more = True
         while more:
             fitted = set(self._work.names)

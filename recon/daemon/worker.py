@@ -100,7 +100,7 @@ class Worker:
 
     @property
     def num_unfinished(self) -> int:
-        """inactive submaps and whose scenes are not final yet."""
+        """Counts the inactive submaps whose scenes are not final yet."""
         return self._inactive.num_unfinished
 
     def count_waiting(self) -> int:
@@ -133,7 +133,7 @@ class Worker:
         return self._meter.describe(Backlog(self.count_waiting(), self._inactive.num_unjudged, self.num_unfinished))
 
     def find_inactive_scenes(self, name: str) -> list[str]:
-        """The ids of the scenes, of inactive submaps, that have a camera of this photograph."""
+        """The ids of the scenes of inactive submaps that have a camera of this photograph."""
         return [scene for scene in self._output.index.find_scenes(name) if scene != self._store.scene_id]
 
     def find_frame_set(self, name: str) -> list[str]:

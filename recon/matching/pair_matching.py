@@ -90,6 +90,10 @@ class TwoView:
         """The geometry with the second frame first."""
         return replace(self, matches=self.matches[:, ::-1], points1=self.points2, points2=self.points1)
 
+    def select(self, chosen: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> TwoView:
+        """The same geometry with some of its matches, by their positions or a mask (M,)."""
+        return replace(self, matches=self.matches[chosen], points1=self.points1[chosen], points2=self.points2[chosen])
+
     def rescale(self, scale1: float, scale2: float) -> TwoView:
         """The geometry of the same frames resized by these factors."""
         return replace(self, points1=scale1 * self.points1, points2=scale2 * self.points2)

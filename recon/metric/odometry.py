@@ -1,10 +1,9 @@
 """What a robot knows of its own way: motions from image to image, gravity, and poses whose errors may add up.
 
-The unit by motions comes first, as wheels or an IMU tell them.
-
-Each motion is compared with what the photographs say of the same two cameras, in the frame of the first of them. So an
-error of one motion is in no other, and turns that add up along the way bend nothing. A motion that does not fit is
-named and left out. Neither the photographs' cameras nor the scene are changed by them otherwise.
+Motions, of wheels or an IMU, give the unit. Each of them is compared with what the photographs say of the same two
+cameras, in the frame of the first of them. So an error of one motion is in no other, and turns that add up along the
+way bend nothing. A motion that does not fit is named and left out. Neither the photographs' cameras nor the scene are
+changed by them otherwise.
 """
 
 from __future__ import annotations

@@ -441,7 +441,7 @@ def build_model(
     """
     problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
     attempts: list[tuple[float, SparseModel]] = []
-    for attempt in _attempt_maps(problem, config.max_attempts, config, run):
+    for attempt in _attempt_models(problem, config.max_attempts, config, run):
         found_again = bool(attempts) and _is_same_model(max(attempts, key=_score)[1], attempt[1], config)
         attempts.append(attempt)
         if found_again and len(attempt[1].registered) == len(views):
@@ -453,7 +453,7 @@ def build_model(
     return make_result(*found, config.incremental.triangulation.max_error_px, len(lenses))
 
 
-def _attempt_maps(
+def _attempt_models(
     problem: MapperInput, limit: int, config: MapperConfig, run: RunContext
 ) -> Iterator[tuple[float, SparseModel]]:
     """Models of at most `limit` first pairs and focal lengths, the likeliest first, with their scores."""
@@ -504,7 +504,7 @@ def _try_other_hypotheses(
             for lens, focal in zip(problem.lenses, focals, strict=True)
         ]
         started = replace(problem, lenses=tuple(held))
-        attempts = list(_attempt_maps(started, _OTHER_ATTEMPTS, config, run))
+        attempts = list(_attempt_models(started, _OTHER_ATTEMPTS, config, run))
         other = _finish_best(started, attempts, images, config, run)
         if other is None:
             continue

@@ -358,8 +358,8 @@ def _length(turned: Array, direction: Array, rays: Array, limit: float, min_poin
 
 
 # Repeated structures: windows of a facade match other windows beside them, and an epipolar geometry explains both. What
-# such a match shows has another depth than what all pairs of the view show around it. The tracks of the last adjustment
-# are made without these matches; what is judged by matches counts them all.
+# such a match shows has another depth than what other pairs show around it. Where a place has many of them, the tracks
+# of the last adjustment are made without them; what is judged by matches counts them all.
 
 _NEIGHBOURS = 24  # matches around a match in its image, of all pairs, whose depths are compared with its own
 _MIN_OTHERS = 6  # of them that are of other pairs
@@ -379,16 +379,13 @@ _EXACT_DEPTH = 0.1  # largest standard deviation of a neighbour's inverse depth,
 def drop_repeated_structures(
     problem: MapperInput, partial: SparseModel, max_growing_tracks: int, max_final_tracks: int
 ) -> MapperInput:
-    """The problem with tracks without the matches of repeated structures; itself where no pair has many of them."""
+    """The problem with tracks without the matches of repeated structures; itself where a place has few of them."""
     pairs, found = dict(problem.pairs), find_other_depths(problem, partial)
-    counts = [(int(other.sum()), len(other)) for other in found.values()]
-    if sum(count for count, _ in counts) < _MIN_OF_ALL * sum(count for _, count in counts):
+    if sum(int(other.sum()) for other in found.values()) < _MIN_OF_ALL * sum(map(len, found.values())):
         return problem
     for key, other in found.items():
-        pair = pairs[key]
         if len(other) >= _MIN_COMPARED and _MIN_REPEATED <= other.mean() <= _MAX_REPEATED:
-            rest = pair.matches[~other], pair.points1[~other], pair.points2[~other]
-            pairs[key] = replace(pair, matches=rest[0], points1=rest[1], points2=rest[2])
+            pairs[key] = pairs[key].select(~other)
     if all(pairs[key] is pair for key, pair in problem.pairs.items()):
         return problem
     less = prepare(problem.views, problem.lenses, pairs, max_growing_tracks, max_final_tracks)
@@ -406,13 +403,13 @@ def find_other_depths(problem: MapperInput, partial: SparseModel) -> dict[Pair, 
         sides = [(key, key.index(view)) for key in pairs if view in key]
         if not sides:
             continue
-        sigma_px = _MATCH_PX * problem.scale[view] / np.exp(estimate.log_focals[estimate.lens_of_camera[view]])
+        sigma_rad = _MATCH_PX * problem.scale[view] / np.exp(estimate.log_focals[estimate.lens_of_camera[view]])
         apart = [np.linalg.norm(centres[key[0]] - centres[key[1]]) for key, _ in sides]
         counts = [len(pairs[key].matches) for key, _ in sides]
         other = _differ_from_neighbours(
             np.concatenate([(pairs[key].points1, pairs[key].points2)[side] for key, side in sides]),
             np.concatenate([inverse[key][side] for key, side in sides]),
-            np.repeat(sigma_px / np.maximum(apart, 1e-12), counts),
+            np.repeat(sigma_rad / np.maximum(apart, 1e-12), counts),
             np.repeat(np.arange(len(sides)), counts),
         )
         for (key, _), part in zip(sides, np.split(other, np.cumsum(counts)[:-1]), strict=True):

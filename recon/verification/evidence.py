@@ -160,7 +160,7 @@ def _thin_matches(pair: TwoView, count: int) -> TwoView:
     if len(pair.matches) <= count:
         return pair
     chosen = np.linspace(0, len(pair.matches) - 1, count).astype(int)
-    return replace(pair, matches=pair.matches[chosen], points1=pair.points1[chosen], points2=pair.points2[chosen])
+    return pair.select(chosen)
 
 
 def _compute_angle_between(one: Array, other: Array) -> float:

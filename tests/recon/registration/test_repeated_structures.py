@@ -93,9 +93,7 @@ def test_a_few_matches_at_other_depths_are_edges_and_stay(facade):
     problem, model, wrong = facade
     pair = problem.pairs[REPEATED]
     few = ~wrong | (np.cumsum(wrong) <= 15)
-    pairs = {**problem.pairs, REPEATED: replace(
-        pair, matches=pair.matches[few], points1=pair.points1[few], points2=pair.points2[few]
-    )}  # fmt: skip
+    pairs = {**problem.pairs, REPEATED: pair.select(few)}
     problem = mapping_problem.prepare(problem.views, problem.lenses, pairs, 300, 300)
     assert mapping_problem.find_other_depths(problem, model)[REPEATED].sum() >= 10
     assert mapping_problem.drop_repeated_structures(problem, model, 300, 300) is problem
