@@ -540,9 +540,11 @@ def avoid_zero_depth(depth: Array) -> Array:
 # Standard deviations of the cameras' poses, in whatever world frame they are given.
 #
 # Positions are only known up to a similarity, and errors are measured after the best similarity. So is the covariance
-# here (an S-transformation: Baarda, 1973): it does not depend on which camera the bundle adjustment fixed.
+# here (an S-transformation: Baarda, 1973): it does not depend on which camera the bundle adjustment fixed. The centres
+# of two cameras fix no similarity: there, the orientations say how both are rotated, as where errors are measured.
 
 
+MIN_FOR_CENTRES = 3  # cameras whose centres alone fix a similarity; those of two leave a turn about their line open
 _ROUNDING = 1e-9  # relative error of a variance: a negative one within it is 0, as that of two cameras' distance is
 _MIN_SPREAD = 1e-12  # of the centres, in the problem's unit of length, in place of 0
 _MIN_SINGULAR = 1e-9  # of the largest singular value: what is smaller is no direction of its own
@@ -609,9 +611,13 @@ def _errors(problem: Problem, covariance: Covariance, registered: Sequence[int])
     # The similarity may rotate all cameras alike, and translate, rotate and scale all centres.
     translated = np.tile(np.eye(3), (count, 1))
     rotated = np.concatenate([cross_matrix(centre[None])[0] for centre in centred])
+    free = [translated, centred.reshape(-1, 1) / spread]
+    if count < MIN_FOR_CENTRES:  # the orientations say how all are rotated
+        moves = moves - rotated @ turns.reshape(count, 3, -1).mean(0)
+    else:
+        free.append(rotated / spread)
     turns = _make_null_projection(translated) @ turns
-    moves = _make_null_projection(np.column_stack([translated, rotated / spread, centred.ravel() / spread])) @ moves
-    return _Errors(joint, turns, moves, spread)
+    return _Errors(joint, turns, _make_null_projection(np.column_stack(free)) @ moves, spread)
 
 
 def differentiate_by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:

@@ -30,7 +30,6 @@ SQUARE = 1e-3  # difference of an aspect from 1 from which on they are not
 ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
 ROBUST_PX = (0.4, 1.5)  # least and most width of the Cauchy loss, pixels at REFERENCE_SIDE
 MIN_COST = 1e-12  # pixels squared: a smaller cost counts as this one where ratios are taken; made-up data have none
-MIN_FOR_CENTRES = 3  # cameras whose centres alone fix a similarity; those of two leave a turn about their line open
 MIN_SPREAD = 1e-12  # of centres, as MIN_COST: all in one place
 
 
@@ -224,7 +223,7 @@ def compute_camera_shifts(before: BundleFit, after: BundleFit) -> CameraShifts:
         return CameraShifts(np.full(count, LOST.rotation_deg), np.full(count, LOST.centre_rel), lost)
     common = align_cameras(Ts_after, Ts_before)
     centres, target = Ts_after[:, :3, 3], Ts_before[:, :3, 3]
-    onto = umeyama(centres, target) if count >= MIN_FOR_CENTRES else common
+    onto = umeyama(centres, target) if count >= bundle_adjustment.MIN_FOR_CENTRES else common
     return CameraShifts(
         rotation_deg=angles_deg(common.rotation @ Ts_after[:, :3, :3], Ts_before[:, :3, :3]),
         centre=np.linalg.norm(onto(centres) - target, axis=1),

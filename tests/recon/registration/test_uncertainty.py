@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.geometry import Similarity, umeyama
+from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, umeyama
 from splatnode.recon.registration import bundle_adjustment, incremental_mapper, registration, self_calibration
 from splatnode.recon.registration.registration import make_registration
 from splatnode.recon.result.verdict import compute_axes
@@ -185,7 +185,25 @@ def test_a_point_that_is_not_finite_leaves_nothing_known():
     assert np.isnan(bundle_adjustment.centre_covariances(broken, covariance, ALL)).all()
 
 
-def test_two_cameras_have_no_shape_to_be_wrong_in():
-    found = bundle_adjustment.adjust(problem(), PRIOR, CONFIG)
-    _, positions = bundle_adjustment.camera_sigmas(found, bundle_adjustment.covariance(found, PRIOR, CONFIG), (0, 2))
-    assert positions.max() == pytest.approx(0.0, abs=1e-6)
+def test_orientations_say_how_two_cameras_are_turned():
+    """The centres of two cameras fit any similarity: errors are measured after the common turn, and so is the claim."""
+    pair, true = [0, 2], problem()
+    Ts_true = poses(true, pair)
+    spread = 0.5 * np.linalg.norm(Ts_true[0, :3, 3] - Ts_true[1, :3, 3])
+    estimates = [bundle_adjustment.adjust(problem(seed=seed), PRIOR, CONFIG) for seed in range(60)]
+    covariance = bundle_adjustment.covariance(estimates[0], PRIOR, CONFIG)
+    turned, moved = bundle_adjustment.camera_sigmas(estimates[0], covariance, pair)
+    found = [poses(estimate, pair) for estimate in estimates]
+    onto = [align_cameras(Ts, Ts_true) for Ts in found]
+    turns = [angles_deg(to.rotation @ Ts[:, :3, :3], Ts_true[:, :3, :3]) for to, Ts in zip(onto, found, strict=True)]
+    moves = [to(Ts[:, :3, 3]) - Ts_true[:, :3, 3] for to, Ts in zip(onto, found, strict=True)]
+    np.testing.assert_allclose(turned, np.sqrt(np.mean(np.square(turns), 0)), rtol=0.3)
+    np.testing.assert_allclose(moved, np.sqrt((np.square(moves)).sum(2).mean(0)) / spread, rtol=0.3)
+    assert moved.min() > 1e-4
+
+
+def poses(of: bundle_adjustment.Problem, cameras: list[int]) -> np.ndarray:
+    """(N, 4, 4) of some cameras, camera to world."""
+    Ts = np.tile(np.eye(4), (len(cameras), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = of.rotations[cameras].transpose(0, 2, 1), centres(of)[cameras]
+    return Ts
