@@ -368,7 +368,7 @@ def match_guided(
     """
     assert case.posed is not None
     by, camera, principal = case.by, case.posed.fit.camera, principal_point(photograph.frame)
-    near = PosePrior(camera, (by.width, by.height), REACH * by.side)
+    near = PosePrior(camera, (by.width, by.height), REACH * by.side, case.posed.fit.covariance)
     judged = replace(by, known=match_landmarks(photograph.features, principal, landmarks, config.neighbours, near))
     chosen = choose_lens(judged, [camera], assumed)
     count = 0 if chosen is None else int(chosen.posed.agreeing.sum())

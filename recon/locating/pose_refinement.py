@@ -170,6 +170,7 @@ Flags = npt.NDArray[np.bool_]
 LEAST_COSINE = 0.5  # between two directions from which a feature looks alike: 60 degrees are beyond SIFT's reach
 _NEAREST = 4  # photographs of the scene that one is compared with whose camera is nearly known
 _MARGIN = 0.15  # of the longer side, around the picture: what is there may be in it
+_REACH_SIGMAS = 2.0  # of where a camera sees a landmark, which its reach must hold
 _MIN_LENGTH = 1e-12
 
 
@@ -202,6 +203,9 @@ class PosePrior:
     camera: CameraModel
     size: tuple[int, int]  # (width, height) of its picture, pixels
     reach_px: float | None = None  # a landmark is at most so far from where the camera sees it; None: anywhere
+    # (NUM_PARAMETERS, NUM_PARAMETERS) of the camera: what it leaves open by more than the reach is not looked for.
+    # Else what agrees with it by chance is found, and nothing that speaks against it. None: it is exact
+    covariance: Array | None = None
 
 
 def match_landmarks(
@@ -258,10 +262,19 @@ def _find_visible(landmarks: Landmarks, principal: Array, near: PosePrior) -> tu
     shown, depth = near.camera.project(landmarks.points)
     shown, margin = shown + principal, near.reach_px or _MARGIN * max(near.size)
     inside = (depth > 0) & (shown > -margin).all(1) & (shown < np.array(near.size) + margin).all(1)
+    if near.covariance is not None and near.reach_px is not None:
+        inside &= _REACH_SIGMAS * _predict_sigmas(near.camera, near.covariance, landmarks.points) <= near.reach_px
     points = landmarks.points[landmarks.point_of]
     before = _directions(points - landmarks.Ts_world_camera[landmarks.photograph_of, :3, 3])
     now = _directions(points - near.camera.T_world_camera[:3, 3])
     return inside[landmarks.point_of] & ((before * now).sum(1) > LEAST_COSINE), shown
+
+
+def _predict_sigmas(camera: CameraModel, covariance: Array, points: Array) -> Array:
+    """(P,) standard deviations of where the camera sees points, pixels; infinite where nothing is known of it."""
+    by_parameters, _ = camera.derivatives(points)
+    variances = np.einsum("pij,jk,pik->p", by_parameters, covariance, by_parameters)
+    return np.where(np.isfinite(variances), np.sqrt(np.maximum(variances, 0.0)), np.inf)
 
 
 def _nearest(landmarks: Landmarks, T_world_camera: Array) -> Index:

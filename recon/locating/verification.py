@@ -156,6 +156,8 @@ _SUBSET = 500  # correspondences with which lenses of all focal lengths are trie
 _SUBSET_ITERATIONS = 1_500  # of RANSAC with each of these
 _LONGER_ITERATIONS = 3_000  # and with all correspondences: they do for 13 % inliers
 _REFINED = 3  # cameras that are refined with a free lens, those on which most points agree
+_VAGUE = 0.03  # sigma of log focal from which on a camera is looked for with focal lengths between those tried, too
+_BETWEEN = -0.15, -0.1, -0.05, 0.05, 0.1, 0.15  # log focals from the one that was tried
 _TRIED_APART = 0.1  # log focals of assumed lenses that a camera is looked for with, one by one
 _FOCAL, _RADIAL, _SHIFT, _ASPECT = POSE, POSE + 1, slice(POSE + 2, POSE + 4), POSE + 4  # parameters of the lens
 
@@ -212,17 +214,15 @@ def choose_lens(
     not contradict, else a free one.
     """
     side = judged.side
-    found = [
-        (camera, judged.refine_pose(camera, pose_refinement.free_lens(camera.lens, side)))
-        for camera in cameras[:_REFINED]
-    ]
-    starts = [(int(wide.agreeing.sum()), camera, wide) for camera, wide in found if wide is not None]
-    if not starts:
+    starts = _refine_starts(judged, cameras)
+    best = _choose_start(starts)
+    if best is None:
         return None
-    count, camera, wide = starts[0]
-    for start in starts[1:]:
-        if start[0] > _CLEARLY_MORE * count:
-            count, camera, wide = start
+    if _sigmas(best.wide)[0] > _VAGUE:
+        between = [replace(best.camera.lens, focal=best.camera.lens.focal * math.exp(step)) for step in _BETWEEN]
+        starts += _refine_starts(judged, search_cameras_longer(judged, between))
+        best = _choose_start(starts) or best
+    camera, wide = best.camera, best.wide
     shaped, usual = _test_shape(
         wide, _nearest(assumed, wide) or pose_refinement.make_typical_lens(camera.lens, side), side
     )
@@ -230,7 +230,7 @@ def choose_lens(
     free = judged.refine_pose(camera if usual else wide.fit.camera, prior)
     if free is None:
         return None
-    rivals = tuple(each for _, _, each in starts if each is not wide)
+    rivals = tuple(each.wide for each in starts if each is not best)
     order = sorted(assumed, key=lambda each: (each.source is not LensSource.SCENE, _log_focal_apart(each.lens, free)))
     for each in order if usual else ():
         kept = _keep(each, free, shaped, side)
@@ -239,6 +239,43 @@ def choose_lens(
             return replace(chosen, rivals=rivals)
     chosen = _refine_with_free_lens(judged, free, prior)
     return None if chosen is None else replace(chosen, rivals=rivals)
+
+
+@dataclass(frozen=True, eq=False)
+class _Start:
+    camera: CameraModel
+    wide: PoseEstimate  # refined from it with a free lens
+
+    @property
+    def count(self) -> int:
+        return int(self.wide.agreeing.sum())
+
+
+def _refine_starts(judged: QueryContext, cameras: Sequence[CameraModel]) -> list[_Start]:
+    """The first of the cameras, each refined with a free lens, where that leaves something of it."""
+    found = [
+        (camera, judged.refine_pose(camera, pose_refinement.free_lens(camera.lens, judged.side)))
+        for camera in cameras[:_REFINED]
+    ]
+    return [_Start(camera, wide) for camera, wide in found if wide is not None]
+
+
+def _choose_start(starts: Sequence[_Start]) -> _Start | None:
+    """That on which most correspondences agree; of nearly equal ones a vague one gives way to the best determined.
+
+    Where only far points agree, they leave focal length and position open along a line; those on which near ones agree,
+    too, are another set of as many points.
+    """
+    if not starts:
+        return None
+    best = starts[0]
+    for start in starts[1:]:
+        if start.count > _CLEARLY_MORE * best.count:
+            best = start
+    if _sigmas(best.wide)[0] <= _VAGUE:
+        return best
+    equal = [start for start in starts if _CLEARLY_MORE * start.count >= best.count]
+    return min(equal, key=lambda start: _sigmas(start.wide)[0])
 
 
 def _log_focal_apart(lens: Lens, posed: PoseEstimate) -> float:

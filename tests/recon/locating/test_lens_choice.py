@@ -18,11 +18,14 @@ from splatnode.recon.locating.pose_refinement import (
     Correspondences,
     Lens,
     LensAssumption,
+    PosePrior,
     assume_lenses,
     make_lens_grid,
+    match_landmarks,
     measure_mirror_gain,
 )
 from splatnode.recon.locating.verification import LensChoice, QueryContext, choose_lens, search_cameras
+from splatnode.recon.matching import features as matching_features
 from splatnode.recon.result.snapshot import KnownLenses, Landmarks
 from splatnode.recon.verification import evidence
 from tests.bench.quality import query_warps
@@ -252,3 +255,47 @@ def test_a_given_lens_that_fits_stays_as_it_is_and_is_not_taken_for_exact():
     chosen = chosen_of(seen(lens, 1.0), assume_lenses(nothing, WIDTH, HEIGHT, given))
     assert chosen.source is LensSource.GIVEN and chosen.posed.fit.camera.lens.focal == pytest.approx(FOCAL)
     assert focal_sigmas(chosen, FOCAL)[1] > 0.001
+
+
+def test_a_start_on_which_only_far_points_agree_gives_way_to_one_with_near_points():
+    """The far ones, nearly a plane, leave focal length and distance open; a few near ones tell both."""
+    right = Lens(FOCAL, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
+    far, near = seen(right, 0.02, 300), seen(right, 0.0, 12)
+    near = replace(
+        near, points=0.15 * near.points, feature_of=near.feature_of + 300, landmark_of=near.landmark_of + 300
+    )
+    known = Correspondences(*(np.concatenate([getattr(far, name), getattr(near, name)]) for name in FIELDS))
+    judged = QueryContext(known, WIDTH, HEIGHT, 0.5, 4.0, pose_refinement.PoseSearchConfig())
+    short = replace(right, focal=0.9 * FOCAL)
+    start = pose_refinement.search_pose(judged.known.select(np.arange(300)), short, judged.scale, judged.settings)
+    assert start is not None
+    agreeing = pose_refinement.agreement(start, known, judged.settings.search_px * judged.scale)
+    assert agreeing[:300].mean() > 0.9 and not agreeing[300:].any()
+    chosen = choose_lens(judged, [start], [])
+    assert chosen is not None and chosen.posed.agreeing[300:].all()
+    error, sigma = focal_sigmas(chosen, FOCAL)
+    assert error < 2.0 * sigma < 0.03
+
+
+FIELDS = tuple(Correspondences.__dataclass_fields__)
+
+
+def test_landmarks_are_not_looked_for_where_their_camera_leaves_them_open():
+    """What agrees with it by chance would be found there, and nothing that speaks against it."""
+    landmarks, (image, camera) = known_place().landmarks, photograph(0)
+    T = known_place().to_scene.camera(camera[0])
+    lens = Lens(float(camera[1][0, 0]), PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
+    model, features = CameraModel(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3], lens), prepare_query_image(image).features
+    principal, config = 0.5 * np.array(image.shape[1::-1]), matching_features.NearestNeighbourConfig()
+    depths = model.project(landmarks.points)[1]
+    found = []
+    middle = 5.0 * float(np.median(depths)) / lens.focal  # two of them are the reach at the median depth
+    for sigma in (0.0, 0.1 * middle, middle, 100.0 * middle):
+        covariance = np.diag([0.0, 0.0, 0.0, sigma, 0.0, 0.0, *[0.0] * 5]) ** 2  # to its right
+        near = PosePrior(model, image.shape[1::-1], 10.0, covariance)
+        found.append(match_landmarks(features, principal, landmarks, config, near))
+    exact = match_landmarks(features, principal, landmarks, config, PosePrior(model, image.shape[1::-1], 10.0))
+    assert np.array_equal(found[0].landmark_of, exact.landmark_of)
+    assert [len(each) for each in found] == sorted((len(each) for each in found), reverse=True)
+    assert len(found[1]) > 0.9 * len(exact) and len(found[3]) == 0
+    assert 0 < len(found[2]) < len(exact) and depths[found[2].landmark_of].min() >= 0.999 * np.median(depths)
