@@ -115,7 +115,8 @@ class MetricConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.02
     # Standard deviation of the error that all motions share, as a share of their length, as of the wheels' radius
     odometry_scale_sigma: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.01
-    # Standard deviation of a motion that comes without one: in each direction, as a share of its length
+    # Standard deviation of a motion that comes without one, as in Python's Session (a Publisher sends one with each):
+    # in each direction, as a share of its length
     odometry_drift: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = MOTION_DRIFT
     odometry_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = MOTION_SIGMA_DEG  # and about each axis, degrees
     # Metres between the cameras of given stereo pairs; nothing: none are given

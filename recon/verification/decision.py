@@ -25,8 +25,9 @@ from splatnode.recon.verification.error_model import (
     VerdictModels,
     VerificationCase,
     compute_log_odds,
+    measure_flat_patch,
 )
-from splatnode.recon.verification.evidence import Evidence, find_non_finite
+from splatnode.recon.verification.evidence import MAX_PIECES, CameraEvidence, Evidence, find_non_finite
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.input_kinds import refuse_stereo_or_panorama
 from splatnode.recon.verification.refit import FreedLens
@@ -248,6 +249,14 @@ def check_moving_plane(case: EvidenceCase) -> Verdict | None:
     return refuse(verification.MOVING, case.names, inliers=100 * evidence.inlier_ratio)
 
 
+def check_montage(case: EvidenceCase) -> Verdict | None:
+    """What two cameras share was moved in a few pieces, as wholes."""
+    share = case.evidence.shifted_share
+    if share <= case.config.max_shifted_share:
+        return None
+    return refuse(verification.MONTAGE, case.names, percent=100 * share, pieces=MAX_PIECES)
+
+
 def check_weakest_link(case: EvidenceCase) -> Verdict | None:
     """Two groups of frames share almost no points."""
     link = case.evidence.weakest_link
@@ -272,6 +281,16 @@ def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
     if len(cameras) == 2 or weakest.confirmed >= case.config.min_confirmed:
         return None
     return refuse(verification.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
+
+
+def check_flat_patch(case: EvidenceCase) -> Verdict | None:
+    """All that a camera shares with the others is one flat thing, which fills little of its picture."""
+    patch = max(case.evidence.cameras, key=measure_flat_patch)
+    return _refuse_flat_patch(patch) if measure_flat_patch(patch) > case.config.max_flat_patch else None
+
+
+def _refuse_flat_patch(camera: CameraEvidence) -> Verdict:
+    return refuse(verification.FLAT_PATCH, (camera.name,), name=camera.name, percent=100 * camera.coverage)
 
 
 def check_own_lenses(case: EvidenceCase) -> Verdict | None:
@@ -569,9 +588,7 @@ def _refuse_wrong_poses(case: VerificationCase, against: str) -> Verdict:
         mirrored = case.evidence.reflection.frames
         return refuse(verification.MIRRORED_PHOTOGRAPHS, mirrored, count=len(mirrored))
     if against == "flat_patch":
-        smallest = min(cameras, key=lambda camera: camera.coverage)
-        percent = 100 * smallest.coverage
-        return refuse(verification.FLAT_PATCH, (smallest.name,), name=smallest.name, percent=percent)
+        return _refuse_flat_patch(max(cameras, key=measure_flat_patch))
     if against == "coverage":
         smallest = min(cameras, key=lambda camera: camera.coverage)
         percent = 100 * smallest.coverage
@@ -675,6 +692,7 @@ WORDS = {  # what each field of the evidence says, for the user
     "travel": "how far the camera moved",
     "freed": "whether the given focal length is right",
     "distortion": "whether the lens bends the picture",
+    "shifted_share": "whether pieces of the pictures only shifted",
 }
 
 
@@ -698,9 +716,11 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
     check_given_focal,
     check_distortion,
     check_moving_plane,
+    check_montage,
     check_weakest_link,
     check_connectivity,
     check_confirmed_points,
+    check_flat_patch,
     check_own_lenses,
     check_mirrored_images,
     check_mirrored_scene,

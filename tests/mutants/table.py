@@ -186,6 +186,11 @@ MUTANTS = (
             "return np.linalg.norm(predicted - problem.pixels, axis=1)",
         ),
         (
+            "the centres of a pair are turned until they fit",
+            "    if count < MIN_FOR_CENTRES:",
+            "    if count < 0:",
+        ),
+        (
             "centres are R t instead of -R^T t",
             'return -np.einsum("cji,cj->ci", problem.rotations, problem.translations)',
             'return -np.einsum("cij,cj->ci", problem.rotations, problem.translations)',
@@ -227,9 +232,21 @@ MUTANTS = (
     ),
     *_list_mutants(
         "verification",
+        "recon/locating/pose_refinement.py",
+        ("landmarks are looked for where their camera leaves them open", "_REACH_SIGMAS = 2.0", "_REACH_SIGMAS = 0.0"),
+    ),
+    *_list_mutants(
+        "verification",
+        "recon/locating/verification.py",
+        ("a vague start is kept", "_VAGUE = 0.03", "_VAGUE = 9.0"),
+    ),
+    *_list_mutants(
+        "verification",
         "recon/verification/decision.py",
         ("undetermined numbers are not asked for", "    check_finite,\n    *LIMITS", "    *LIMITS"),
         ("a strongly bent lens is not asked for", "    check_strong_distortion,\n", ""),
+        ("a montage of two is a scene", "    check_montage,\n", ""),
+        ("one small flat thing is enough for a camera", "    check_flat_patch,\n", ""),
         (
             "the odds are asked the wrong way round",
             "if found.total >= case.config.min_log_odds:",

@@ -160,6 +160,19 @@ def test_a_flat_thing_that_moves_is_not_taken_for_the_scene():
     assert verdict(4, flatness=0.97, inlier_ratio=0.85).code == Code.OK  # a facade in relief
 
 
+def test_a_camera_that_shares_one_small_flat_thing_is_refused_whatever_else_fits():
+    given = refused(verdict(5, {3: {"coverage": 0.1, "flat_share": 0.98}}), Code.MOVING_SCENE)
+    assert given.frames == names(3) and "10 % of its picture" in given.message
+    assert verdict(5, {3: {"coverage": 0.3, "flat_share": 0.98}}).publishable
+    assert verdict(5, {3: {"coverage": 0.1, "flat_share": 0.7}}).publishable
+
+
+def test_what_two_montages_share_is_no_scene():
+    given = refused(verdict(2, shifted_share=0.97), Code.MOVING_SCENE)
+    assert "97 %" in given.message and "montages" in given.message
+    assert verdict(2, shifted_share=0.5).code == Code.OK
+
+
 def test_different_exposures_are_noted():
     given = verdict(4, {2: {"gain": 0.6}})
     assert given.code == Code.EXPOSURE_SHIFT and given.publishable

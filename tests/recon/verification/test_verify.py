@@ -18,7 +18,7 @@ from splatnode.recon.verification import evidence as verification_evidence
 from splatnode.recon.verification.error_model import predict_bounds
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
-from tests.support.synthetic import photographs, view_graph
+from tests.support.synthetic import photographs, renumbered, view_graph
 
 CONFIG = verification_evidence.VerificationConfig()
 VIEWS = 4
@@ -138,3 +138,21 @@ def test_the_share_of_points_on_a_plane():
     relief = wall + (0.0, 0.0, 1.0) * rng.choice([0.0, 0.2], (300, 1), p=[0.7, 0.3])
     assert verification_evidence.compute_share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
     assert verification_evidence.compute_share_on_plane(wall[:2]) == 0.0
+
+
+def test_pieces_that_were_shifted_as_wholes_are_told_from_a_camera_that_moved():
+    """Two pieces of one photograph, each elsewhere in the other one, look like two walls before a camera beside it."""
+    first, second = (frame.image for frame in photographs()[:2])
+    montage = second[::-1, ::-1].copy()  # all else is of nothing that the first shows
+    montage[20:120, 10:200], montage[130:230, 150:310] = first[40:140, 30:220], first[120:220, 155:315]
+    assert measure_share([first, montage]) > 0.95
+    assert measure_share([first, second]) < 0.2
+    graph, found = placed()
+    assert verification_evidence.measure_shifted_share(graph.keyframes, found) == 0.0
+
+
+def measure_share(images: list[np.ndarray]) -> float:
+    graph = view_graph(renumbered(images))
+    found = registration.register(graph.keyframes, graph.pairs, registration.RegistrationConfig())
+    assert found is not None
+    return verification_evidence.measure_shifted_share(graph.keyframes, found)
