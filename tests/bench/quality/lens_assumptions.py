@@ -97,8 +97,8 @@ class Trial:
     evidence: Mapping[str, object] | None
 
 
-def window(place: TrialScene, count: int) -> list[TrialImage]:
-    """Consecutive photographs that overlap well; all the same in every run. Empty where the scene has too few."""
+def window(place: TrialScene, count: int, draw: int = 0) -> list[TrialImage]:
+    """Consecutive photographs that overlap well; the same in every run of a `draw`. Empty where a scene has too few."""
     starts, stride = find_neighbour_sets(place.Ts_world_camera, count, STEP_DEG)
     if not starts:
         starts, stride = find_parallel_sets(place.Ts_world_camera, count)
@@ -107,7 +107,7 @@ def window(place: TrialScene, count: int) -> list[TrialImage]:
         starts = list(range(len(place.names) - stride * (count - 1)))
     if not starts:
         return []
-    generator = np.random.default_rng([count, zlib.crc32(place.name.encode())])
+    generator = np.random.default_rng([count, zlib.crc32(place.name.encode()), *([draw] if draw else [])])
     start = int(generator.choice(starts))
     return place.load_images([start + stride * index for index in range(count)])
 
@@ -170,19 +170,24 @@ def run_scene(
     settings: Sequence[str],
     journal: Path | None,
     sample: int | None = None,
+    draw: int = 0,
 ) -> list[Trial]:
-    """`sample`: at most so many kinds for each number of images and setting, drawn at random, besides the clean set."""
+    """`sample`: at most so many kinds for each number of images and setting, drawn at random, besides the clean set.
+
+    Windows and kinds of another `draw` are others.
+    """
     scene = load_scene(folder)
     place = TrialScene(scene, tuple(name for name in scene.paths if name in scene.cameras))
     config, found = ReconstructionConfig(), []
     for count in counts:
-        photos = window(place, count)
+        photos = window(place, count, draw)
         if not photos:
             continue
         caches: dict[str, dict[PieceKey, bytes]] = defaultdict(dict)
         for setting in settings:
             possible = [name for name in kinds if setting in KINDS[name].settings and name != "clean"]
-            drawn = np.random.default_rng([count, zlib.crc32(f"{place.name} {setting}".encode())]).permutation(possible)
+            seeds = [count, zlib.crc32(f"{place.name} {setting}".encode()), *([draw] if draw else [])]
+            drawn = np.random.default_rng(seeds).permutation(possible)
             for name in [*(["clean"] if "clean" in kinds else []), *drawn[:sample].tolist()]:
                 cache = caches["given" if setting == "given" else "centred"]
                 trial = run_trial(photos, KINDS[name], setting, cache, config)
@@ -274,6 +279,9 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--settings", nargs="+", default=SETTINGS)
     parser.add_argument("--sample", type=int, help="kinds for each scene, number of images and setting, at most")
+    parser.add_argument(
+        "--draw", type=int, default=0, help="of windows and kinds; 0 is that which numbers are fitted to"
+    )
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     if arguments.judge:
@@ -286,6 +294,7 @@ def main() -> None:
         settings=arguments.settings,
         journal=journal,
         sample=arguments.sample,
+        draw=arguments.draw,
     )
     with ProcessPoolExecutor(arguments.processes) as pool:
         trials = [trial for found in pool.map(of_scene, arguments.scenes) for trial in found]
