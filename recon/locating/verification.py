@@ -243,6 +243,8 @@ def choose_lens(
 
 @dataclass(frozen=True, eq=False)
 class _Start:
+    """Describes a camera from which the pose and a lens of its own are sought."""
+
     camera: CameraModel
     wide: PoseEstimate  # refined from it with a free lens
 
@@ -252,7 +254,7 @@ class _Start:
 
 
 def _refine_starts(judged: QueryContext, cameras: Sequence[CameraModel]) -> list[_Start]:
-    """The first of the cameras, each refined with a free lens, where that leaves something of it."""
+    """Refines the first few cameras, each with a free lens, and leaves out those of which nothing is left."""
     found = [
         (camera, judged.refine_pose(camera, pose_refinement.free_lens(camera.lens, judged.side)))
         for camera in cameras[:_REFINED]
@@ -261,7 +263,7 @@ def _refine_starts(judged: QueryContext, cameras: Sequence[CameraModel]) -> list
 
 
 def _choose_start(starts: Sequence[_Start]) -> _Start | None:
-    """That on which most correspondences agree; of nearly equal ones a vague one gives way to the best determined.
+    """Chooses the start on which most correspondences agree; a vague one gives way to the best determined of equals.
 
     Where only far points agree, they leave focal length and position open along a line; those on which near ones agree,
     too, are another set of as many points.

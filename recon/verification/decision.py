@@ -235,7 +235,9 @@ def _is_contradicted(freed: FreedLens, config: DecisionConfig) -> bool:
 def check_distortion(case: EvidenceCase) -> Verdict | None:
     """The lens distorts the picture by more than registration found."""
     found, config = case.evidence.distortion, case.config
-    if found.cost_ratio >= config.focal_gain or found.corner_shift <= config.corner_shift:
+    much = found.cost_ratio < config.focal_gain and found.corner_shift > config.corner_shift
+    surely = found.cost_ratio < config.sure_gain and found.corner_shift > config.sure_corner_shift
+    if not (much or surely):
         return None
     return refuse(verification.DISTORTED, case.names, further=100 * found.corner_shift)
 
@@ -250,7 +252,7 @@ def check_moving_plane(case: EvidenceCase) -> Verdict | None:
 
 
 def check_montage(case: EvidenceCase) -> Verdict | None:
-    """What two cameras share was moved in a few pieces, as wholes."""
+    """Rejects two cameras whose common points moved in a few pieces, as wholes."""
     share = case.evidence.shifted_share
     if share <= case.config.max_shifted_share:
         return None
@@ -284,7 +286,7 @@ def check_confirmed_points(case: EvidenceCase) -> Verdict | None:
 
 
 def check_flat_patch(case: EvidenceCase) -> Verdict | None:
-    """All that a camera shares with the others is one flat thing, which fills little of its picture."""
+    """Rejects a camera that shares but one flat thing with the others, which fills little of its picture."""
     patch = max(case.evidence.cameras, key=measure_flat_patch)
     return _refuse_flat_patch(patch) if measure_flat_patch(patch) > case.config.max_flat_patch else None
 

@@ -136,6 +136,8 @@ def test_a_lens_that_bends_the_picture():
     given = refused(verdict(3, distortion=Distortion(0.1, 0.1)), Code.FOCAL_SUSPECT)
     assert "10 %" in given.message and "coefficients" in given.advice
     assert verdict(3, distortion=Distortion(0.01, 0.5)).code == Code.OK
+    refused(verdict(3, distortion=Distortion(0.02, 0.5)), Code.FOCAL_SUSPECT)  # less, and surely
+    assert verdict(3, distortion=Distortion(0.02, 0.7)).code == Code.OK
 
 
 def test_two_places_that_almost_no_point_joins():

@@ -144,9 +144,11 @@ def test_pieces_that_were_shifted_as_wholes_are_told_from_a_camera_that_moved():
     """Two pieces of one photograph, each elsewhere in the other one, look like two walls before a camera beside it."""
     first, second = (frame.image for frame in photographs()[:2])
     montage = second[::-1, ::-1].copy()  # all else is of nothing that the first shows
-    montage[20:120, 10:200], montage[130:230, 150:310] = first[40:140, 30:220], first[120:220, 155:315]
+    montage[:120, :290], montage[120:, :312] = first[:120, 30:], first[120:, 8:]
     assert measure_share([first, montage]) > 0.95
     assert measure_share([first, second]) < 0.2
+    aside = np.roll(first, (3, 7), axis=(0, 1))
+    assert measure_share([first, aside]) == 0.0  # one shift: nothing moved but the crop
     graph, found = placed()
     assert verification_evidence.measure_shifted_share(graph.keyframes, found) == 0.0
 

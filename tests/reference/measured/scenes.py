@@ -117,27 +117,6 @@ def recipe_losses() -> str:
     )
 
 
-def pose_starts() -> str:
-    """Scores with held-out poses that were searched from the true ones, and from between their neighbours."""
-    between = {(row["scene"], row["method"]): row for row in ends("bench_interpolated")}
-    require(raw("bench_interpolated")["settings"]["start"] == "interpolated", "starts between neighbours")
-    require(len({scene for scene, _ in between}) == 5, "five sets")
-    rows, lead = [], {}
-    for (scene, method), row in between.items():
-        (true,) = ends("bench_7sets", scene=scene, method=method, seed=0)
-        rows.append((f"{scene}, {row['views']} views", f"`{method}`", *(scores(r, "lpips_alex") for r in (true, row))))
-        lead[scene, method] = true["psnr"], row["psnr"]
-    ahead = [
-        mean(lead[scene, "balanced"][start] - lead[scene, "instantsplat-xl"][start] for scene, _ in between)
-        for start in (0, 1)
-    ]
-    note = (
-        f"Mean lead of `balanced` over `instantsplat-xl` in PSNR: {change(ahead[0], 2)} dB from the true poses, "
-        f"{change(ahead[1], 2)} dB from between the neighbours."
-    )
-    return f"{table(('set', 'method', 'from the true pose', 'from between'), rows)}\n\n{bullets(note)}"
-
-
 def black_rim() -> str:
     """What a black rim changes, and by how much splatnode is behind where it stands on a choice of views."""
     (row,) = ends("bench_7sets", scene="llff_fern", method="balanced", seed=0)
@@ -366,7 +345,6 @@ BLOCKS = (
     single_runs,
     recipes,
     recipe_losses,
-    pose_starts,
     black_rim,
     pose_free_rivals,
     long_rivals,
