@@ -18,7 +18,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -95,6 +95,7 @@ class Trial:
     note: str
     errors: tuple[CameraError, ...]  # of the published cameras; of a refusal, of those that were registered
     evidence: Mapping[str, object] | None
+    draw: int = 0  # of the window
 
 
 def window(place: TrialScene, count: int, draw: int = 0) -> list[TrialImage]:
@@ -191,10 +192,10 @@ def run_scene(
             for name in [*(["clean"] if "clean" in kinds else []), *drawn[:sample].tolist()]:
                 cache = caches["given" if setting == "given" else "centred"]
                 trial = run_trial(photos, KINDS[name], setting, cache, config)
-                found.append(trial)
+                found.append(replace(trial, draw=draw))
                 if journal is not None:
                     with journal.open("a") as lines:
-                        lines.write(json.dumps(asdict(trial)) + "\n")
+                        lines.write(json.dumps(asdict(found[-1])) + "\n")
     return found
 
 
@@ -253,7 +254,7 @@ def judge_without_scene(trials: Sequence[dict[str, Any]], samples: Sequence[Samp
                 known[key] = fit_models(others)
             published = is_published(sample, known[key])
             wrong = published and exceeds_bounds(sample, known[key])
-        names = {name: trial[name] for name in ("scene", "count", "kind", "setting")}
+        names = {name: trial[name] for name in ("scene", "count", "kind", "setting", "draw") if name in trial}
         judged.append({**names, "published": published, "wrong": wrong})
     return judged
 

@@ -119,15 +119,20 @@ def lens_assumptions() -> str:
     groups.append(("all", lambda t: True))
     rows = [_lens_row(words, [t for t in changed if chosen(t)], clean) for words, chosen in groups]
     rows.append(_lens_row("unchanged", [t for t in trials if t["kind"] == "clean"], clean))
-    require(len({t["scene"] for t in trials}) == 11, "eleven scenes")
+    later = raw("lens_assumptions_draws_judged")["trials"]
+    same = {_key(t) for t in later if t["kind"] == "clean" and t["published"] and not t["wrong"]}
+    for setting, words in (("nothing", "no lens told"), ("exif", "EXIF"), ("given", "lens given")):
+        drawn = [t for t in later if t["kind"] != "clean" and t["setting"] == setting]
+        rows.append(_lens_row(f"drawn afterwards, 3 images, {words}", drawn, same))
+    require(len({t["scene"] for t in trials}) == len({t["scene"] for t in later}) == 11, "eleven scenes")
     return table(("images", "sets", "published", "wrong", "right, of those right unchanged"), rows)
 
 
-def _key(trial: dict[str, Any]) -> tuple[str, int, str]:
-    return trial["scene"], trial["count"], trial["setting"]
+def _key(trial: dict[str, Any]) -> tuple[str, int, str, int]:
+    return trial["scene"], trial["count"], trial["setting"], trial.get("draw", 0)
 
 
-def _lens_row(words: str, trials: list[dict[str, Any]], clean: set[tuple[str, int, str]]) -> tuple[object, ...]:
+def _lens_row(words: str, trials: list[dict[str, Any]], clean: set[tuple[str, int, str, int]]) -> tuple[object, ...]:
     compared = [t for t in trials if _key(t) in clean]
     good = sum(t["published"] and not t["wrong"] for t in compared)
     published, wrong = (sum(t[key] for t in trials) for key in ("published", "wrong"))

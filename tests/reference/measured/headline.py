@@ -18,7 +18,8 @@ def headline() -> str:
 
 
 def _damaged() -> list[tuple[str, str, str]]:
-    trials = [each for each in raw("lens_assumptions_judged")["trials"] if each["kind"] != "clean"]
+    judged = [*raw("lens_assumptions_judged")["trials"], *raw("lens_assumptions_draws_judged")["trials"]]
+    trials = [each for each in judged if each["kind"] != "clean"]
     matrix = raw("fit")["many"]["cross_validated"]["matrix"]
     return [
         (
