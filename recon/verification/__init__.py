@@ -80,7 +80,7 @@ class DecisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     corner_shift: Internal[float] = 0.03
     # The same where the cost falls so far; of 1100 right answers the lowest ratio is .72
     sure_gain: Internal[float] = 0.6
-    sure_corner_shift: Internal[float] = 0.01
+    sure_corner_shift: Internal[float] = 0.01  # least shift of a corner then
 
     # What explains poses that are unlikely.
     blurred_px: Internal[float] = 5.0  # width of edges, at 640 pixels, that explains why frames do not fit
