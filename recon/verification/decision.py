@@ -18,6 +18,7 @@ from splatnode.recon.keyframes import Rejected, longer_side
 from splatnode.recon.matching.pair_matching import TwoView, median_motion_px
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.registration import RegisteredCamera, Registration
+from splatnode.recon.result.snapshot import format_rounded_up
 from splatnode.recon.result.verdict import Bounds, Code, Verdict
 from splatnode.recon.verification import DecisionConfig, Refusal, refit, refuse
 from splatnode.recon.verification.error_model import (
@@ -483,10 +484,12 @@ def _describe_roughness(case: VerificationCase) -> str:
     if case.is_exact:
         return ""
     worst = case.widest_bounds
+    centre, travel, rotation, focal = map(
+        format_rounded_up, (worst.centre_percent, case.travel_percent, worst.rotation_deg, worst.focal_percent)
+    )
     return (
-        f"positions are known to {worst.centre_percent:.2g} % of the distance to the scene "
-        f"({case.travel_percent:.2g} % of how far the camera moved), directions to {worst.rotation_deg:.2g} degrees, "
-        f"the focal length to {worst.focal_percent:.2g} %"
+        f"positions are known to {centre} % of the distance to the scene ({travel} % of how far the camera moved), "
+        f"directions to {rotation} degrees, the focal length to {focal} %"
     )
 
 
